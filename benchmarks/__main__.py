@@ -18,15 +18,22 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     parser.add_argument("cases", nargs="*", metavar="CASE", help=", ".join(ORDER))
     parser.add_argument(
-        "--readme", action="store_true", help="run all, write results.md and the README's tables"
+        "--readme",
+        action="store_true",
+        help="run all, write results.md and the README's tables",
     )
     arguments = parser.parse_args()
     wrong = [case for case in arguments.cases if case not in ORDER]
     if wrong or (arguments.cases and arguments.readme):
-        parser.error(f"CASE is one of {', '.join(ORDER)}; --readme takes none, it runs all")
+        parser.error(
+            f"CASE is one of {', '.join(ORDER)}; --readme takes none, it runs all"
+        )
     # Before a case loads BLAS or OpenMP: one thread, for all alike.
-    os.environ |= {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL", "NUMBA")}
-    warnings.simplefilter("ignore")  # of robots whose inertias are not rigid, told once is enough
+    os.environ |= {
+        f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL", "NUMBA")
+    }
+    # of robots whose inertias are not rigid, told once is enough
+    warnings.simplefilter("ignore")
     logging.getLogger("drake").setLevel(logging.ERROR)
     made = []
     for case in arguments.cases or ORDER:

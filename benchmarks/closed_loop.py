@@ -12,7 +12,8 @@ import fflin
 from benchmarks.peers import WrongResultError
 from benchmarks.robots import Array, Point, load
 
-FREQUENCY, DAMPING = 0.3, 0.7  # [rad/s] of every coordinate alone, slow enough to end in motion
+# [rad/s] of every coordinate alone, slow enough to end in motion
+FREQUENCY, DAMPING = 0.3, 0.7
 WHEEL = 3e-6  # [kg m^2]
 
 
@@ -53,7 +54,9 @@ class Loop:
 
     def at_rest(self) -> "Loop":
         """Return the loop with a start without velocities."""
-        return self.but(x0=np.where(np.arange(len(self.x0)) < 6 + self.robot.n, self.x0, 0.0))
+        return self.but(
+            x0=np.where(np.arange(len(self.x0)) < 6 + self.robot.n, self.x0, 0.0)
+        )
 
     def but(self, **changes: object) -> "Loop":
         return replace(self, **changes)
@@ -67,7 +70,9 @@ class Loop:
 
     @cached_property
     def policy(self) -> fflin.StateFeedback:
-        return fflin.StateFeedback(fflin.linearize(self.robot, frame=self.frame), self.K)
+        return fflin.StateFeedback(
+            fflin.linearize(self.robot, frame=self.frame), self.K
+        )
 
     @property
     def options(self) -> dict[str, object]:
@@ -86,7 +91,9 @@ class Loop:
         M = fflin.linearize(self.robot, self.point.q).M
         apart = np.abs(found - M).max() / np.abs(M).max()
         if not apart < 1e-10:
-            raise WrongResultError(f"{whose} on {self.robot.name}: M differs by {apart:.1e}")
+            raise WrongResultError(
+                f"{whose} on {self.robot.name}: M differs by {apart:.1e}"
+            )
 
 
 def driven(name: str, dt: float, duration: float) -> Loop:
@@ -94,7 +101,8 @@ def driven(name: str, dt: float, duration: float) -> Loop:
     robot = load(name)
     n = 6 + robot.n
     inertia = fflin.linearize(robot).M
-    stiffness = np.diag([2.0] * 3 + [1.0] * (n - 3)) * FREQUENCY**2  # q_b is half the turn
+    # q_b is half the turn
+    stiffness = np.diag([2.0] * 3 + [1.0] * (n - 3)) * FREQUENCY**2
     K = inertia @ np.hstack((stiffness, 2.0 * DAMPING * FREQUENCY * np.eye(n)))
     return Loop(robot, K, _start(n), dt, duration)
 
@@ -152,7 +160,9 @@ class Equations:
     def __init__(self, loop: Loop) -> None:
         self.loop, self.model = loop, loop.robot.model
         self.data, self.n = self.model.createData(), loop.robot.n
-        joints = [self.model.joints[self.model.getJointId(j.name)] for j in loop.robot.joints]
+        joints = [
+            self.model.joints[self.model.getJointId(j.name)] for j in loop.robot.joints
+        ]
         self._joints = [(joint.idx_q, joint.nq) for joint in joints]
         self._order = np.array([3, 4, 5, 0, 1, 2, *(joint.idx_v for joint in joints)])
 
@@ -169,7 +179,9 @@ class Equations:
         rates = turned @ y[n : n + 3], R @ y[n + 3 : n + 6], y[n + 6 :]
         return np.concatenate((np.sign(y[3]) * y[:3], y[4:n], *rates))
 
-    def rate(self, command: Callable[[Array], Array]) -> Callable[[float, Array], Array]:
+    def rate(
+        self, command: Callable[[Array], Array]
+    ) -> Callable[[float, Array], Array]:
         """Return dy/dt of y under a command u of the state."""
         model, order, n = self.model, self._order, 7 + self.n
         q, v, tau = np.zeros(model.nq), np.zeros(model.nv), np.zeros(model.nv)
@@ -179,7 +191,9 @@ class Equations:
             u, R = command(self.state(y)), _rotation(y)
             q[:3], q[3:7] = y[4:7], y[:4] / np.linalg.norm(y[:4])
             for (at, width), angle in zip(self._joints, y[7:n], strict=True):
-                q[at : at + width] = angle if width == 1 else (np.cos(angle), np.sin(angle))
+                q[at : at + width] = (
+                    angle if width == 1 else (np.cos(angle), np.sin(angle))
+                )
             v[order] = y[n:]
             if self.loop.wheels:
                 tau[order[6:]] = u
@@ -187,7 +201,9 @@ class Equations:
                 torque = R.T @ u[:3] if world else u[:3]
                 tau[order] = np.concatenate((torque, R.T @ u[3:6], u[6:]))
             omega, vector = y[n : n + 3], y[:3]
-            turning = 0.5 * np.append(y[3] * omega + np.cross(vector, omega), -vector @ omega)
+            turning = 0.5 * np.append(
+                y[3] * omega + np.cross(vector, omega), -vector @ omega
+            )
             moving = R @ y[n + 3 : n + 6]
             a = pin.aba(model, self.data, q, v, tau)[order]
             return np.concatenate((turning, moving, y[n + 6 :], a))

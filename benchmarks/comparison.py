@@ -41,7 +41,9 @@ def compare(
     for point in points:
         found, said = methods(what, point, too_slow(point))
         notes |= dict.fromkeys(said)
-        calls = {FFLIN: fflin_call(point)} | {method.name: method.call for method in found}
+        calls = {FFLIN: fflin_call(point)} | {
+            method.name: method.call for method in found
+        }
         times = interleaved(calls)
         own = times.pop(FFLIN)
         row = {"robot": point.robot.name, "n": str(point.robot.n)}
@@ -51,5 +53,7 @@ def compare(
         row |= {name: figure(each.ratio(own)) for name, each in times.items()}
         columns += [name for name in row if name not in columns]
         rows.append(row)
-    cells = tuple(tuple(row.get(name, figure(None)) for name in columns) for row in rows)
+    cells = tuple(
+        tuple(row.get(name, figure(None)) for name in columns) for row in rows
+    )
     return Table(title, about, tuple(columns), cells, tuple(notes), in_readme)

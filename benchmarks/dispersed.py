@@ -13,7 +13,9 @@ SPREADS = {"q_b": 0.05, "base.density": (-0.1, 0.1)}
 def draws(loop: Loop, runs: int) -> Array:
     """Return what is added to q_b and to the mass of each run (runs, 4)."""
     brief = loop.but(duration=loop.dt)
-    return fflin.monte_carlo(brief.robot, brief.policy, SPREADS, runs=runs, **brief.options).drawn
+    return fflin.monte_carlo(
+        brief.robot, brief.policy, SPREADS, runs=runs, **brief.options
+    ).drawn
 
 
 def started(loop: Loop, drawn: Array) -> Array:
@@ -26,7 +28,12 @@ def started(loop: Loop, drawn: Array) -> Array:
 def fflin_campaign(name: str, loop: Loop, runs: int, **how: int) -> Contender:
     """Return fflin's runs, on one thread but where `how` has threads or workers."""
     kept: dict[str, fflin.Campaign] = {}
-    options = {"runs": runs, "engine": "compiled", **(how or {"threads": 1}), **loop.options}
+    options = {
+        "runs": runs,
+        "engine": "compiled",
+        **(how or {"threads": 1}),
+        **loop.options,
+    }
 
     def call() -> None:
         kept["last"] = fflin.monte_carlo(loop.robot, loop.policy, SPREADS, **options)

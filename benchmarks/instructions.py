@@ -74,7 +74,15 @@ def ratios() -> dict[str, float]:
         # A count is written at each call of this function, which nothing else calls.
         valgrind += ["--dump-before=getppid"]
         done = subprocess.run(
-            [*valgrind, sys.executable, "-W", "ignore", "-m", "benchmarks.instructions", _COUNT],
+            [
+                *valgrind,
+                sys.executable,
+                "-W",
+                "ignore",
+                "-m",
+                "benchmarks.instructions",
+                _COUNT,
+            ],
             cwd=ROOT,
             env=os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
             capture_output=True,

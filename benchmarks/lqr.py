@@ -48,7 +48,10 @@ def bench(robot: fflin.Robot) -> None:
     weights = {
         "identity": (np.eye(nx), np.eye(nu)),
         "Bryson": (np.diag(rng.uniform(0.05, 0.2, nx) ** -2), np.diag(inertia**-2)),
-        "random": (np.diag(10 ** rng.uniform(-1, 1, nx)), np.diag(10 ** rng.uniform(-1, 1, nu))),
+        "random": (
+            np.diag(10 ** rng.uniform(-1, 1, nx)),
+            np.diag(10 ** rng.uniform(-1, 1, nu)),
+        ),
     }
     for label, (Q, R) in weights.items():
         found = solve(lin.A, lin.B, Q, R)
@@ -72,13 +75,19 @@ def main() -> None:
     cpu = platform.processor() or platform.machine()
     try:
         with open("/proc/cpuinfo", encoding="utf-8") as file:
-            cpu = next(line.split(":")[1].strip() for line in file if "model name" in line)
+            cpu = next(
+                line.split(":")[1].strip() for line in file if "model name" in line
+            )
     except (OSError, StopIteration):
         pass
     print(f"{cpu}; Python {platform.python_version()}, ", end="")
     print(f"numpy {np.__version__}, scipy {scipy.__version__}, one thread")
-    print("general: scipy.linalg.solve_continuous_are; half: fflin's Riccati solver with poles,")
-    print("residual and refinement; shortest times [ms]; ratios of the solver and of fflin.lqr\n")
+    print(
+        "general: scipy.linalg.solve_continuous_are; half: fflin's Riccati solver with poles,"
+    )
+    print(
+        "residual and refinement; shortest times [ms]; ratios of the solver and of fflin.lqr\n"
+    )
     print(
         f"{'robot':<16}{'n':>3}  {'weights':<9}{'general':>8}{'half':>8}{'ratio':>7}{'lqr':>7}"
         f"{'residual':>10}{'half':>9}"

@@ -47,7 +47,9 @@ class Point:
     @cached_property
     def order(self) -> Array:
         """Index in Pinocchio's v of each velocity of state order."""
-        return np.array([3, 4, 5, 0, 1, 2, *(joint.idx_v for joint in self.robot.joints)])
+        return np.array(
+            [3, 4, 5, 0, 1, 2, *(joint.idx_v for joint in self.robot.joints)]
+        )
 
 
 def load(name: str) -> fflin.Robot:
@@ -89,7 +91,9 @@ def generated(kind: str, n: int) -> fflin.Robot:
 
 def is_rigid(robot: fflin.Robot) -> bool:
     """Whether no principal moment of any body is more than the sum of the others."""
-    moments = [np.linalg.eigvalsh(item.inertia) for item in robot.model.inertias.tolist()[1:]]
+    moments = [
+        np.linalg.eigvalsh(item.inertia) for item in robot.model.inertias.tolist()[1:]
+    ]
     return all(2.0 * each.max() <= each.sum() * (1.0 + 1e-9) for each in moments)
 
 
@@ -99,7 +103,10 @@ def plain_urdf(robot: fflin.Robot) -> str:
     pin.computeJointJacobians(model, data, pin.neutral(model))
     lines = [f'<robot name="{robot.name}">', link_urdf(BASE, model.inertias[1])]
     for joint in robot.joints:
-        index, kind = model.getJointId(joint.name), "prismatic" if joint.prismatic else "continuous"
+        index, kind = (
+            model.getJointId(joint.name),
+            "prismatic" if joint.prismatic else "continuous",
+        )
         axis = pin.getJointJacobian(model, data, index, pin.LOCAL)[:, joint.idx_v]
         axis = axis[:3] if joint.prismatic else axis[3:]
         parent = model.parents[index]

@@ -12,7 +12,9 @@ import time
 import warnings
 from collections.abc import Callable
 
-os.environ |= {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL", "NUMBA")}
+os.environ |= {
+    f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL", "NUMBA")
+}
 
 import numpy as np
 from scipy.linalg import solve_continuous_are
@@ -33,7 +35,10 @@ def tasks(kind: str, n: int) -> Tasks:
     """Return the tasks on a robot of n revolute joints, each a call without arguments."""
     robot = generated(kind, n)
     springs = dict.fromkeys(robot.joint_names, STIFFNESS)
-    lin, sprung = fflin.linearize(robot), fflin.linearize(robot.replace(stiffness=springs))
+    lin, sprung = (
+        fflin.linearize(robot),
+        fflin.linearize(robot.replace(stiffness=springs)),
+    )
     Q, R = np.eye(len(lin.A)), np.eye(lin.B.shape[1])
     q = np.tile(robot.neutral(), (POINTS, 1))
     q[:, 7] = np.linspace(-0.5, 0.5, POINTS)
@@ -41,7 +46,12 @@ def tasks(kind: str, n: int) -> Tasks:
     v[3:6] = 0.05, -0.02, 0.03
 
     def motion() -> object:
-        options = {"duration": 1e-3 * STEPS, "dt": 1e-3, "engine": "python", "linear": False}
+        options = {
+            "duration": 1e-3 * STEPS,
+            "dt": 1e-3,
+            "engine": "python",
+            "linear": False,
+        }
         return fflin.simulate(robot, v0=v, **options)
 
     def riccati() -> object:
@@ -79,11 +89,14 @@ def exponent(sizes: list[int], seconds: list[float]) -> float:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.scaling", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.scaling", description=__doc__
+    )
     parser.add_argument("--sizes", type=int, nargs="+", default=SIZES)
     parser.add_argument("--kind", choices=("chain", "tree"), default="chain")
     arguments = parser.parse_args()
-    warnings.simplefilter("ignore")  # long chains are ill-conditioned, which is the subject here
+    # long chains are ill-conditioned, which is the subject here
+    warnings.simplefilter("ignore")
     for call in tasks(arguments.kind, 5).values():
         call()  # imports and compiles what is needed
     times: dict[str, list[float]] = {}
@@ -91,7 +104,9 @@ def main() -> None:
     for n in sizes:
         for name, call in tasks(arguments.kind, n).items():
             times.setdefault(name, []).append(shortest(call))
-    print(f"{arguments.kind} of n revolute joints: CPU time [ms], one thread, exponent of n\n")
+    print(
+        f"{arguments.kind} of n revolute joints: CPU time [ms], one thread, exponent of n\n"
+    )
     heads = [f"{n:>9}" for n in sizes]
     print(f"{'n':<24}{''.join(heads)}{'all':>8}{'last':>8}")
     for name, seconds in times.items():

@@ -72,7 +72,9 @@ def machine() -> str:
     cpu = platform.processor() or platform.machine()
     try:
         with open("/proc/cpuinfo", encoding="utf-8") as file:
-            cpu = next(line.split(":")[1].strip() for line in file if "model name" in line)
+            cpu = next(
+                line.split(":")[1].strip() for line in file if "model name" in line
+            )
     except (OSError, StopIteration):
         pass
     from fflin.base import __version__

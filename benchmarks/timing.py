@@ -38,7 +38,10 @@ class Times:
 def interleaved(functions: Mapping[str, Callable[[], object]]) -> dict[str, Times]:
     """Time functions in turns, so that a machine that is busy for a while is so for all."""
     once = {name: _once(function) for name, function in functions.items()}
-    loops = {name: max(1, min(2000, round(SAMPLE_SECONDS / each))) for name, each in once.items()}
+    loops = {
+        name: max(1, min(2000, round(SAMPLE_SECONDS / each)))
+        for name, each in once.items()
+    }
     round_seconds = sum(loops[name] * once[name] for name in functions)
     # What takes seconds is measured by three rounds.
     fewest = FEWEST_ROUNDS if round_seconds < CASE_SECONDS else 3
@@ -51,7 +54,9 @@ def interleaved(functions: Mapping[str, Callable[[], object]]) -> dict[str, Time
 
 
 def beside(
-    floor: Callable[[], object], functions: Mapping[str, Callable[[], object]], rounds: int
+    floor: Callable[[], object],
+    functions: Mapping[str, Callable[[], object]],
+    rounds: int,
 ) -> dict[str, tuple[Times, Times]]:
     """Time functions that take long, once a round, and a floor before and after each of them.
 

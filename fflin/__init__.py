@@ -107,7 +107,9 @@ for _title, _modules in _PUBLIC.items():
     _names = " ".join(_modules.values()).split()
     _rows = [", ".join(_names[at : at + 4]) for at in range(0, len(_names), 4)]
     __doc__ = "\n    ".join((f"{__doc__}\n\n{_title}", *_rows))
-    _MODULES |= {name: module for module, names in _modules.items() for name in names.split()}
+    _MODULES |= {
+        name: module for module, names in _modules.items() for name in names.split()
+    }
 
 __all__ = sorted(_MODULES)  # noqa: PLE0605
 
@@ -128,11 +130,16 @@ def _untyped(function: object) -> None:
 
     shown = signature(function)
     plain = [
-        parameter.replace(annotation=Parameter.empty) for parameter in shown.parameters.values()
+        parameter.replace(annotation=Parameter.empty)
+        for parameter in shown.parameters.values()
     ]
-    function.__signature__ = shown.replace(parameters=plain, return_annotation=Parameter.empty)
+    function.__signature__ = shown.replace(
+        parameters=plain, return_annotation=Parameter.empty
+    )
 
 
 def __dir__() -> list[str]:
-    special = (name for name in globals() if name.startswith("__") and name.endswith("__"))
+    special = (
+        name for name in globals() if name.startswith("__") and name.endswith("__")
+    )
     return sorted({*special, *_MODULES})

@@ -25,7 +25,8 @@ def main() -> int:
     if not same_file(os.path.join(os.path.dirname(__file__), os.pardir), ""):
         sys.path[:] = import_path_without("")
     listen()
-    gc.set_threshold(50_000)  # search rarely for cycles, because most objects live until the end
+    # search rarely for cycles, because most objects live until the end
+    gc.set_threshold(50_000)
     try:
         from fflin.commands import cli
 

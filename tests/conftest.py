@@ -17,8 +17,12 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # What these packages keep stays in the checkout, and out of the home directory.
-os.environ.setdefault("MPLCONFIGDIR", str(Path(__file__).parents[1] / ".pytest_cache/matplotlib"))
-os.environ.setdefault("DASK_CONFIG", str(Path(__file__).parents[1] / ".pytest_cache/dask"))
+os.environ.setdefault(
+    "MPLCONFIGDIR", str(Path(__file__).parents[1] / ".pytest_cache/matplotlib")
+)
+os.environ.setdefault(
+    "DASK_CONFIG", str(Path(__file__).parents[1] / ".pytest_cache/dask")
+)
 os.environ.setdefault("DASK_TEMPORARY_DIRECTORY", os.environ["DASK_CONFIG"])
 
 import pytest
@@ -36,7 +40,9 @@ pytest_plugins = ["tests.support.messages"]
 def pytest_terminal_summary(terminalreporter):
     """Say for which processor the linear algebra was made, where its last digits come from."""
     pools = threadpool_info()
-    cores = sorted({pool["architecture"] for pool in pools if pool["internal_api"] == "openblas"})
+    cores = sorted(
+        {pool["architecture"] for pool in pools if pool["internal_api"] == "openblas"}
+    )
     terminalreporter.write_line(f"OpenBLAS ran its kernels for {', '.join(cores)}")
 
 
@@ -93,7 +99,9 @@ def pytest_runtest_call(item):
     _started.clear()
     result = yield
     if _started and not STARTING & _kinds(item):
-        pytest.fail(f"starts a process, expected the mark `process`: {_started[0][:200]}")
+        pytest.fail(
+            f"starts a process, expected the mark `process`: {_started[0][:200]}"
+        )
     return result
 
 

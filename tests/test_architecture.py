@@ -13,7 +13,9 @@ DOCS = Path(__file__).parents[1] / "docs"
 def test_the_picture_is_made_from_the_code_and_no_import_runs_up():
     rooms = runpy.run_path(str(DOCS / "rooms.py"))
     picture = rooms["drawing"]()
-    assert (DOCS / "rooms.svg").read_text(encoding="utf-8") == picture, "run python docs/rooms.py"
+    assert (DOCS / "rooms.svg").read_text(encoding="utf-8") == picture, (
+        "run python docs/rooms.py"
+    )
     assert 'class="up"' not in picture
     assert len(rooms["rooms"]()) == 14
 
@@ -24,21 +26,32 @@ def test_the_page_names_modules_and_files_that_exist():
     rooms = "|".join(runpy.run_path(str(DOCS / "rooms.py"))["rooms"]())
     modules = set(re.findall(rf"`((?:{rooms})(?:\.\w+)+)`", page))
     assert len(modules) > 80
-    assert not [m for m in modules if not (package / f"{m.replace('.', '/')}.py").is_file()]
+    assert not [
+        m for m in modules if not (package / f"{m.replace('.', '/')}.py").is_file()
+    ]
     files = set(re.findall(r"`([\w./]+/\w*\.?(?:pyi?|toml)?)`", page))
     assert len(files) > 40
     places = package, DOCS.parent
-    assert not [f for f in files - {"tests/ROOM"} if not any((p / f).exists() for p in places)]
+    assert not [
+        f for f in files - {"tests/ROOM"} if not any((p / f).exists() for p in places)
+    ]
 
 
 def test_the_stub_has_the_names_and_modules_of_the_package():
     tree = ast.parse(Path(fflin.__file__).with_suffix(".pyi").read_text())
     imports = [node for node in tree.body if isinstance(node, ast.ImportFrom)]
     # In a stub a name is public where it is imported as itself.
-    names = {alias.asname for node in imports for alias in node.names if alias.asname == alias.name}
+    names = {
+        alias.asname
+        for node in imports
+        for alias in node.names
+        if alias.asname == alias.name
+    }
     assert names == set(fflin.__all__)
     modules = {alias.name: node.module for node in imports for alias in node.names}
-    assert modules == {name: f"fflin.{module}" for name, module in fflin._MODULES.items()}
+    assert modules == {
+        name: f"fflin.{module}" for name, module in fflin._MODULES.items()
+    }
     for name, module in modules.items():
         assert getattr(fflin, name).__module__ == module
 

@@ -39,7 +39,11 @@ def made(name):
 
 
 def ways(names=("cubesat", "ets_vii", "servicer_7dof")):
-    pairs = [*itertools.product(names, LAWS), ("wheels", "at all times"), ("wheels", "held")]
+    pairs = [
+        *itertools.product(names, LAWS),
+        ("wheels", "at all times"),
+        ("wheels", "held"),
+    ]
     return [pytest.param(*pair, id=", ".join(pair)) for pair in pairs]
 
 
@@ -49,7 +53,9 @@ def test_truth_is_the_same_motion_by_another_route(name, law):
     loop = made(name).but(**LAWS[law])
     fine = loop.but(dt=STEP / 10.0)
     motion = fflin.simulate(
-        loop.robot, loop.policy, **fine.options | ({"sample": STEP} if loop.held else {})
+        loop.robot,
+        loop.policy,
+        **fine.options | ({"sample": STEP} if loop.held else {}),
     )
     assert error(loop, motion.x[-1], true_end(loop)) < 1e-8
     moved = error(loop, loop.x0, true_end(loop))
@@ -135,7 +141,9 @@ def without_peers(monkeypatch):
         return there(name, *rest)
 
     monkeypatch.setattr(builtins, "__import__", without)
-    for module in [each for each in sys.modules if each.startswith("benchmarks.peers.")]:
+    for module in [
+        each for each in sys.modules if each.startswith("benchmarks.peers.")
+    ]:
         monkeypatch.delitem(sys.modules, module)
 
 
@@ -157,8 +165,13 @@ def campaign(loop, scale=None):
         ends.clear()
         for row in drawn * scale:
             body = loop.robot.model.inertias[1]
-            heavy = {"mass": (1.0 + row[3]) * body.mass, "inertia": (1.0 + row[3]) * body.inertia}
-            robot = loop.robot.with_mass_properties({"base": heavy | {"com": body.lever}})
+            heavy = {
+                "mass": (1.0 + row[3]) * body.mass,
+                "inertia": (1.0 + row[3]) * body.inertia,
+            }
+            robot = loop.robot.with_mass_properties(
+                {"base": heavy | {"com": body.lever}}
+            )
             options = loop.but(x0=started(loop, row)).options
             ends.append(fflin.simulate(robot, loop.policy, **options).x[-1])
 

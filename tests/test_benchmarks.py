@@ -51,14 +51,20 @@ def test_peer_with_another_result_is_not_timed(what, at_rest):
     (right,) = getattr(pinocchio_peer, what)(point)
     right.call()
     slopes = right.slopes()
-    rows, columns = np.nonzero(np.abs(slopes) > 1e-2 * np.abs(slopes).max(axis=1)[:, None])
+    rows, columns = np.nonzero(
+        np.abs(slopes) > 1e-2 * np.abs(slopes).max(axis=1)[:, None]
+    )
     rng = np.random.default_rng(0)
     for k in rng.choice(len(rows), 20, replace=False):
         for factor in (-1.0, np.nan):
             wrong = slopes.copy()
             wrong[rows[k], columns[k]] *= factor
             with pytest.raises(WrongResultError, match=r"on ur5: differs"):
-                check(replace(right, slopes=lambda wrong=wrong: wrong), point, at_rest=at_rest)
+                check(
+                    replace(right, slopes=lambda wrong=wrong: wrong),
+                    point,
+                    at_rest=at_rest,
+                )
 
 
 def test_peer_in_another_frame_is_found_out():
@@ -80,7 +86,9 @@ def test_peers_that_are_not_there_are_named(monkeypatch):
 
     monkeypatch.setattr(builtins, "__import__", without)
     for name in peers.MODULES[1:]:
-        monkeypatch.delitem(peers.importlib.sys.modules, f"benchmarks.peers.{name}", raising=False)
+        monkeypatch.delitem(
+            peers.importlib.sys.modules, f"benchmarks.peers.{name}", raising=False
+        )
     found, notes = methods("at_rest", random_point(load("cubesat")))
     assert [method.name for method in found] == [pinocchio_peer.FLOOR]
     assert len(notes) == 4 and all("not installed" in note for note in notes)
@@ -97,7 +105,9 @@ def test_urdf_for_all_peers_is_the_same_robot(robot, tmp_path):
     lin = fflin.linearize(same, fflin.configuration(same, joints))
     index = [same.joint_names.index(name) for name in robot.joint_names]
     order = [*range(6), *(6 + i for i in index)]
-    assert lin.M[np.ix_(order, order)] == pytest.approx(M, rel=1e-12, abs=1e-12 * np.abs(M).max())
+    assert lin.M[np.ix_(order, order)] == pytest.approx(
+        M, rel=1e-12, abs=1e-12 * np.abs(M).max()
+    )
 
 
 def test_inertias_that_no_rigid_body_has_are_told():
@@ -124,12 +134,16 @@ def test_what_else_the_machine_does_is_not_counted(monkeypatch):
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
 def test_command_prints_a_case():
     command = [sys.executable, "-m", "benchmarks"]
-    done = finished([*command, "memory"], cwd=tables.ROOT, capture_output=True, text=True)
+    done = finished(
+        [*command, "memory"], cwd=tables.ROOT, capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr
     row = next(line for line in done.stdout.splitlines() if line.startswith("| fflin "))
     imported, first = (float(cell) for cell in row.split("|")[2:4])
     assert 5.0 < imported < first
-    done = finished([*command, "speed"], cwd=tables.ROOT, capture_output=True, text=True)
+    done = finished(
+        [*command, "speed"], cwd=tables.ROOT, capture_output=True, text=True
+    )
     assert done.returncode == 2 and "CASE is one of at_rest, " in done.stderr
 
 
@@ -140,7 +154,13 @@ def test_table_lands_between_the_markers(monkeypatch, tmp_path):
     rows = (("ur5", "1.50"), ("talos", tables.figure(None)))
     shown = tables.Table("Title", "About.", ("robot", "peer"), rows, in_readme=True)
     for _ in range(2):
-        tables.insert_in_readme([shown, replace(shown, title="Hidden", in_readme=False)], "cmd")
+        tables.insert_in_readme(
+            [shown, replace(shown, title="Hidden", in_readme=False)], "cmd"
+        )
     text = readme.read_text()
     assert text.startswith("before\n") and text.endswith("after\n")
-    assert "old" not in text and "Hidden" not in text and text.count("| ur5   | 1.50 |") == 1
+    assert (
+        "old" not in text
+        and "Hidden" not in text
+        and text.count("| ur5   | 1.50 |") == 1
+    )

@@ -30,7 +30,10 @@ ERRORS = [
     ('fflin.bryson(lin, {"q_x": 0.1})', "q_x"),
     ('fflin.linearize(robot.replace(outputs=[fflin.FramePose("tool")]))', "tool"),
     ('fflin.load("none.urdf")', "none.urdf"),
-    ('Path("a.urdf").write_text("<robot name=\'a\'/>"); fflin.load("a.urdf")', "<link>"),
+    (
+        'Path("a.urdf").write_text("<robot name=\'a\'/>"); fflin.load("a.urdf")',
+        "<link>",
+    ),
     (
         'Path("b.urdf").write_text("<robot name=\'b\'><link name=\'l\'>"); fflin.load("b.urdf")',
         "b.urdf",
@@ -68,7 +71,10 @@ ERRORS = [
         "fflin.simulate(robot, fflin.StateFeedback(lin, K), duration=1.0, dt=0.1, sample=0.25)",
         "sample",
     ),
-    ("fflin.simulate(robot, fflin.StateFeedback(lin, 1e6 * K), duration=1.0, dt=0.5)", "dt"),
+    (
+        "fflin.simulate(robot, fflin.StateFeedback(lin, 1e6 * K), duration=1.0, dt=0.5)",
+        "dt",
+    ),
     (
         'fflin.simulate(fflin.load("ets_vii"), fflin.StateFeedback(lin, K), duration=1.0)',
         "planar_detumble",
@@ -79,7 +85,9 @@ ERRORS = [
 
 
 @pytest.mark.parametrize("k", range(len(ERRORS)), ids="row_{:02d}".format)
-def test_an_error_of_the_table_reads_as_it_stands_there(k, tmp_path, monkeypatch, request):
+def test_an_error_of_the_table_reads_as_it_stands_there(
+    k, tmp_path, monkeypatch, request
+):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(sys.modules, "control", sys.modules.get("control"))
     known = {"fflin": fflin, "np": np, "pin": pin, "Path": Path, "sys": sys}
@@ -89,8 +97,12 @@ def test_an_error_of_the_table_reads_as_it_stands_there(k, tmp_path, monkeypatch
     with pytest.raises(getattr(fflin, row[0]), match=re.escape(keyword)) as caught:
         exec(code, known)
     said = type(caught.value).__name__, str(caught.value)
-    if not (errors_page.agrees(row, *said) or request.config.getoption("write_messages")):
-        pytest.fail(f"`{COMMAND}` writes to docs/errors.md: {': '.join(said)}", pytrace=False)
+    if not (
+        errors_page.agrees(row, *said) or request.config.getoption("write_messages")
+    ):
+        pytest.fail(
+            f"`{COMMAND}` writes to docs/errors.md: {': '.join(said)}", pytrace=False
+        )
 
 
 def test_every_error_of_the_table_is_tried():

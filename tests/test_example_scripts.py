@@ -35,7 +35,9 @@ def test_the_page_shows_every_example():
     assert re.findall(r"^## (\w+)\.py$", page, re.MULTILINE) == re.findall(
         r"\]\((\w+)\.png\)", page
     )
-    assert sorted(re.findall(r"\]\((\w+)\.png\)", page)) == SCRIPTS and len(SCRIPTS) <= 10
+    assert (
+        sorted(re.findall(r"\]\((\w+)\.png\)", page)) == SCRIPTS and len(SCRIPTS) <= 10
+    )
     for name in SCRIPTS:
         text = (FOLDER / f"{name}.py").read_text(encoding="utf-8")
         assert text.split('"""')[1] in page

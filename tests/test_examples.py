@@ -14,7 +14,15 @@ FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
 
 
 # Examples that fly many runs or search long.
-LONG = {"plot_funnel", "Funnel", "funnel", "plan", "plot_validity", "validity", "Validity"}
+LONG = {
+    "plot_funnel",
+    "Funnel",
+    "funnel",
+    "plan",
+    "plot_validity",
+    "validity",
+    "Validity",
+}
 LONG |= {"plot_campaign", "monte_carlo"}
 COMPILED = {"CLaw"}  # examples that call a C compiler
 NAMES = [
@@ -31,10 +39,16 @@ def test_the_example_of_a_public_name_runs(name, tmp_path, monkeypatch):
     text = inspect.getdoc(getattr(fflin, name))
     assert "\nExamples\n--------\n" in text, f"{name} has no section Examples"
     example = doctest.DocTestParser().get_doctest(
-        text, {"fflin": fflin, "np": np}, name, inspect.getsourcefile(getattr(fflin, name)), 0
+        text,
+        {"fflin": fflin, "np": np},
+        name,
+        inspect.getsourcefile(getattr(fflin, name)),
+        0,
     )
     # Nothing may be skipped, and an example that begins nowhere shows nothing.
-    assert example.examples and not any("doctest:" in each.source for each in example.examples)
+    assert example.examples and not any(
+        "doctest:" in each.source for each in example.examples
+    )
     assert any("fflin" in each.source for each in example.examples)
     said = []
     failed, _ = doctest.DocTestRunner(optionflags=FLAGS).run(example, out=said.append)

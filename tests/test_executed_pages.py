@@ -44,9 +44,17 @@ def build(source, site):
 
 def written(site):
     """Return {address: text} of what pages wrote, having seen that each is shown by its page."""
-    found = {str(path.relative_to(site)): path.read_text() for path in site.glob("pages/**/*.html")}
-    shown = "".join(path.read_text() for path in [site / "plain.html", *site.glob("inner/*.html")])
-    assert all(f'src="{address}"' in shown or f'src="../{address}"' in shown for address in found)
+    found = {
+        str(path.relative_to(site)): path.read_text()
+        for path in site.glob("pages/**/*.html")
+    }
+    shown = "".join(
+        path.read_text() for path in [site / "plain.html", *site.glob("inner/*.html")]
+    )
+    assert all(
+        f'src="{address}"' in shown or f'src="../{address}"' in shown
+        for address in found
+    )
     return found
 
 

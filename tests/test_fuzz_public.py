@@ -90,7 +90,9 @@ def call(name, arguments):
 
 
 def test_every_public_name_is_called(calls):
-    assert set(fflin.__all__) - set(calls) == {name for name in fflin.__all__ if results(name)}
+    assert set(fflin.__all__) - set(calls) == {
+        name for name in fflin.__all__ if results(name)
+    }
 
 
 def fault(name, arguments):
@@ -116,7 +118,9 @@ def test_each_light_function_refuses_one_odd_value_or_accepts_it(monkeypatch, tm
     wrong, turn = [], 0
     made = light(tmp_path)
     for name in sorted(made):
-        taken = [argument for argument in made[name] if argument not in ("self", *CALLED)]
+        taken = [
+            argument for argument in made[name] if argument not in ("self", *CALLED)
+        ]
         if not taken:
             continue
         # Each call takes the next value and another argument than the call before.
@@ -187,7 +191,9 @@ def test_costs_over_long_times_do_not_overflow():
 
 
 @pytest.mark.parametrize("part", range(8))
-def test_odd_arguments_are_refused_in_one_line_or_accepted(calls, part, monkeypatch, tmp_path):
+def test_odd_arguments_are_refused_in_one_line_or_accepted(
+    calls, part, monkeypatch, tmp_path
+):
     monkeypatch.chdir(tmp_path)
     wrong = []
     every = [
@@ -208,7 +214,20 @@ def test_odd_arguments_are_refused_in_one_line_or_accepted(calls, part, monkeypa
     assert not [path for path in tmp_path.iterdir() if path.stat().st_size == 0]
 
 
-NUMBERS = ("nan", "inf", "1e300", "-1e300", "1e-300", "-1", "0", "x", "", "9" * 20, "1,5", "0x10")
+NUMBERS = (
+    "nan",
+    "inf",
+    "1e300",
+    "-1e300",
+    "1e-300",
+    "-1",
+    "0",
+    "x",
+    "",
+    "9" * 20,
+    "1,5",
+    "0x10",
+)
 OPTIONS = {
     "linearize": ("--dt", "--stiffness", "--damping", "--gravity"),
     "check": ("--stiffness", "--damping", "--rpy", "--position", "--tolerance"),
@@ -216,9 +235,24 @@ OPTIONS = {
     "modes": ("--stiffness", "--damping"),
     "sensitivity": ("--dt", "--top"),
     "uncertain": ("--vary",),
-    "simulate": ("--duration", "--dt", "--delay", "--limit", "--rpy", "--q", "--sample"),
+    "simulate": (
+        "--duration",
+        "--dt",
+        "--delay",
+        "--limit",
+        "--rpy",
+        "--q",
+        "--sample",
+    ),
     "sweep": ("--random", "--seed", "--grid", "--range"),
-    "montecarlo": ("--runs", "--seed", "--width", "--confidence", "--worst", "--duration"),
+    "montecarlo": (
+        "--runs",
+        "--seed",
+        "--width",
+        "--confidence",
+        "--worst",
+        "--duration",
+    ),
 }
 NAMED = {"--limit": "tau_m=", "--q": "q_b=", "--r": "tau_b=", "--range": "joint_1=0:"}
 NAMED |= {"--grid": "joint_1=0:1:", "--vary": "base.mass="}
@@ -234,9 +268,12 @@ def arguments_of(command, option, value):
 
 
 @pytest.mark.parametrize(
-    ("command", "option"), [(name, option) for name, many in OPTIONS.items() for option in many]
+    ("command", "option"),
+    [(name, option) for name, many in OPTIONS.items() for option in many],
 )
-def test_odd_options_end_in_one_line(command, option, capsys, recwarn, tmp_path, monkeypatch):
+def test_odd_options_end_in_one_line(
+    command, option, capsys, recwarn, tmp_path, monkeypatch
+):
     wrong = []
     monkeypatch.chdir(tmp_path)
     (tmp_path / "uncertain.toml").write_text("[dispersions]\nq_b = 0.01\n")

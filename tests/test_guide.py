@@ -32,7 +32,9 @@ def read(page):
 def script(text, folder):
     """Write the TOML blocks of a page under the names before them; return all else as a script."""
     code = ["from fflin.commands.cli import main"]
-    for block in re.finditer(r"^```(python|sh|toml)\n(.*?)^```", text, re.DOTALL | re.MULTILINE):
+    for block in re.finditer(
+        r"^```(python|sh|toml)\n(.*?)^```", text, re.DOTALL | re.MULTILINE
+    ):
         language, body = block.groups()
         if language == "toml":
             name = re.findall(r"`(\w+\.toml)`", text[: block.start()])[-1]
@@ -41,7 +43,11 @@ def script(text, folder):
             code.append(body)
         else:
             commands = [shlex.split(line, comments=True) for line in body.splitlines()]
-            code += [f"assert main({words[1:]}) == 0" for words in commands if words[0] == "fflin"]
+            code += [
+                f"assert main({words[1:]}) == 0"
+                for words in commands
+                if words[0] == "fflin"
+            ]
     return "\n".join(code)
 
 
@@ -53,7 +59,9 @@ def check_controllers(folder, out):
 def check_monte_carlo(folder, out):
     """The campaign is complete, its report narrow and its page small."""
     assert max(map(len, out.splitlines())) <= 80
-    assert (folder / "runs.png").exists() and (folder / "worst.html").stat().st_size < 6e6
+    assert (folder / "runs.png").exists() and (
+        folder / "worst.html"
+    ).stat().st_size < 6e6
     campaign = fflin.Campaign.load(folder / "runs.h5")
     assert len(campaign) == 400 and campaign.goals == ("attitude < 0.1 deg",)
 
@@ -80,7 +88,10 @@ CHECKS = {
 @pytest.mark.docs
 @pytest.mark.parametrize(
     "page",
-    [pytest.param(page, marks=[pytest.mark.sample] * (page == "outputs")) for page in PAGES],
+    [
+        pytest.param(page, marks=[pytest.mark.sample] * (page == "outputs"))
+        for page in PAGES
+    ],
 )
 def test_a_page_runs(page, tmp_path):
     if page in NEEDS:
@@ -111,7 +122,9 @@ def test_pages_are_short():
 @pytest.mark.docs
 @pytest.mark.skipif(not which("octave"), reason="needs Octave")
 def test_octave_makes_a_system_of_a_saved_model(tmp_path):
-    (block,) = re.findall(r"^```octave\n(.*?)^```", read("files"), re.DOTALL | re.MULTILINE)
+    (block,) = re.findall(
+        r"^```octave\n(.*?)^```", read("files"), re.DOTALL | re.MULTILINE
+    )
     lin = fflin.linearize(fflin.load("servicer_7dof"))
     lin.save(tmp_path / "model.mat")
     (tmp_path / "read.m").write_text(
@@ -134,7 +147,9 @@ def test_octave_makes_a_system_of_a_saved_model(tmp_path):
 @pytest.mark.docs
 @pytest.mark.skipif(not which("octave"), reason="needs Octave")
 def test_octave_reads_a_saved_model(tmp_path):
-    block, _ = re.findall(r"^```matlab\n(.*?)^```", read("files"), re.DOTALL | re.MULTILINE)
+    block, _ = re.findall(
+        r"^```matlab\n(.*?)^```", read("files"), re.DOTALL | re.MULTILINE
+    )
     robot = fflin.load("servicer_7dof")
     lin = fflin.linearize(robot, v=fflin.velocity(robot, {"joint_1": 0.1}))
     lin.save(tmp_path / "model.mat")

@@ -11,7 +11,9 @@ from benchmarks.instructions import BASELINE, TOLERANCE, ratios
 pytestmark = [pytest.mark.process, pytest.mark.exhaustive]
 
 
-@pytest.mark.skipif(shutil.which("valgrind") is None, reason="valgrind is not installed")
+@pytest.mark.skipif(
+    shutil.which("valgrind") is None, reason="valgrind is not installed"
+)
 @pytest.mark.skipif(
     sys.implementation.name != "cpython" or platform.machine() != "x86_64",
     reason="the baseline is of CPython on x86-64",

@@ -22,7 +22,11 @@ HEAR = "from tests.support.messages import hear\n"
         ("drift -1.23e-16 of 4,010 m", "drift 7.1e-15 of 4.0 m", True),
         ("dt is 0, expected 1,000 or 2", "dt is 1e-3, expected 4 or 5", True),
         ("no joint 'a' of 6", "no joint 'b_1' of 7", True),
-        ("the robot's base and the arm's tip", "the robot's base or the arm's tip", False),
+        (
+            "the robot's base and the arm's tip",
+            "the robot's base or the arm's tip",
+            False,
+        ),
         ("12 states", "12 states, 3 inputs", False),
         ("dt is 0.5 s", "dt was 0.5 s", False),
         ("InputError: dt is 1 s", "FileError: dt is 1 s", False),
@@ -33,7 +37,9 @@ def test_a_template_has_neither_figures_nor_quoted_names(one, other, agree):
 
 
 def test_folders_of_this_machine_are_not_noted(tmp_path):
-    messages.hear(f"{tmp_path / 'a.npz'}: cannot be read; {messages.ROOT}/b", "FileError")
+    messages.hear(
+        f"{tmp_path / 'a.npz'}: cannot be read; {messages.ROOT}/b", "FileError"
+    )
     assert messages.HEARD.pop() == "FileError: TMP/a.npz: cannot be read; ROOT/b"
 
 
@@ -65,10 +71,14 @@ def test_sentences_are_added_and_removed_only_after_all_tests(tmp_path):
 
 def test_a_row_of_the_page_takes_the_new_sentence(tmp_path, monkeypatch):
     page = tmp_path / "errors.md"
-    page.write_text("| `InputError`: dt is ... s | why | do |\n| `FileError`: old | why | do |\n")
+    page.write_text(
+        "| `InputError`: dt is ... s | why | do |\n| `FileError`: old | why | do |\n"
+    )
     monkeypatch.setattr(errors_page, "PAGE", page)
     test = "tests/test_errors_page.py::test_row[row_{:02d}]".format
-    errors_page.write({test(0): ["InputError: dt is 3 s"], test(1): ["FileError: a|b: no <link>"]})
+    errors_page.write(
+        {test(0): ["InputError: dt is 3 s"], test(1): ["FileError: a|b: no <link>"]}
+    )
     first, second = page.read_text().splitlines()
     assert first == "| `InputError`: dt is ... s | why | do |"
     assert second == r"| `FileError`: a\|b: no \<link> | why | do |"
@@ -92,7 +102,10 @@ def test_a_command_writes_what_the_tests_hear_on_all_workers(tmp_path):
         return done.returncode, done.stdout + done.stderr
 
     def tests(**sentences):
-        each = [f"def test_{name}():\n    hear({said!r})\n" for name, said in sentences.items()]
+        each = [
+            f"def test_{name}():\n    hear({said!r})\n"
+            for name, said in sentences.items()
+        ]
         (tmp_path / "tests" / "test_it.py").write_text(HEAR + "".join(each))
 
     def noted():
@@ -108,7 +121,9 @@ def test_a_command_writes_what_the_tests_hear_on_all_workers(tmp_path):
     tests(one="InputError: dt is one", other="L is 3")
     code, out = run()
     assert code == 1 and messages.COMMAND in out
-    assert "  InputError: dt is one" in out and "  L is 3" in out and "K is 2" not in out
+    assert (
+        "  InputError: dt is one" in out and "  L is 3" in out and "K is 2" not in out
+    )
     assert run("--write-messages", "-k", "one")[0] == 0
     assert noted() == ["InputError: dt is 1", "InputError: dt is one", "K is 2"]
     assert run("--write-messages")[0] == 0

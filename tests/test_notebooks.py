@@ -9,7 +9,9 @@ from pathlib import Path
 import pytest
 
 DOCS = Path(__file__).parents[1] / "docs"
-PAGES = sorted(path.stem for path in (DOCS / "tutorials").glob("*.md") if path.stem != "index")
+PAGES = sorted(
+    path.stem for path in (DOCS / "tutorials").glob("*.md") if path.stem != "index"
+)
 
 pytest.importorskip("sphinx", reason="the extra docs is not installed")
 nbformat = pytest.importorskip("nbformat", reason="the extra docs is not installed")
@@ -17,7 +19,9 @@ nbformat = pytest.importorskip("nbformat", reason="the extra docs is not install
 
 @pytest.fixture(scope="module")
 def notebook():
-    spec = importlib.util.spec_from_file_location("notebooks", DOCS / "_ext" / "notebooks.py")
+    spec = importlib.util.spec_from_file_location(
+        "notebooks", DOCS / "_ext" / "notebooks.py"
+    )
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module.notebook

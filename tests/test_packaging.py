@@ -15,7 +15,9 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))[
+    "project"
+]
 # Names on conda-forge of what has another name on PyPI.
 CONDA = {
     "pin": "pinocchio",
@@ -42,18 +44,31 @@ def test_the_conda_recipe_has_the_version_and_the_dependencies():
 
 def test_the_workflows_run_parts_that_exist_on_the_pythons_of_the_package():
     jobs = read(".github/workflows/ci.yml")["jobs"]
-    pythons = [each.rpartition(" ")[2] for each in PROJECT["classifiers"] if ":: 3." in each]
+    pythons = [
+        each.rpartition(" ")[2] for each in PROJECT["classifiers"] if ":: 3." in each
+    ]
     assert jobs["tests"]["strategy"]["matrix"]["python"] == pythons
-    parts = re.search(r'^known="(.*)"$', (ROOT / ".ci/run").read_text(), re.MULTILINE)[1].split()
-    run = [step["run"] for job in jobs.values() for step in job["steps"] if "run" in step]
+    parts = re.search(r'^known="(.*)"$', (ROOT / ".ci/run").read_text(), re.MULTILINE)[
+        1
+    ].split()
+    run = [
+        step["run"] for job in jobs.values() for step in job["steps"] if "run" in step
+    ]
     run += jobs["complete"]["strategy"]["matrix"]["parts"]
     named = re.sub(r"\$\{\{.*?\}\}|\.ci/run", "", " ".join(run)).split()
     assert set(named) == set(parts)
-    listed = re.search(r"all parts are (.*?) \|", (ROOT / "CONTRIBUTING.md").read_text())[1]
+    listed = re.search(
+        r"all parts are (.*?) \|", (ROOT / "CONTRIBUTING.md").read_text()
+    )[1]
     assert re.findall(r"`(\w+)`", listed) == parts
     assert read(".github/workflows/release.yml")["jobs"].keys() == {"build", "publish"}
 
 
 def test_an_unknown_part_is_refused_before_anything_runs():
-    done = subprocess.run([ROOT / ".ci/run", "lin"], capture_output=True, text=True, check=False)
-    assert done.returncode == 2 and "'lin' is not a part; give some of: readme" in done.stderr
+    done = subprocess.run(
+        [ROOT / ".ci/run", "lin"], capture_output=True, text=True, check=False
+    )
+    assert (
+        done.returncode == 2
+        and "'lin' is not a part; give some of: readme" in done.stderr
+    )

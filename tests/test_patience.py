@@ -56,7 +56,10 @@ def test_a_condition_that_never_holds_is_named():
 
 @pytest.mark.parametrize(
     ("code", "watch"),
-    [("import time; time.sleep(9999)", {"stall": 0.3}), ("while True: pass", {"limit": 0.2})],
+    [
+        ("import time; time.sleep(9999)", {"stall": 0.3}),
+        ("while True: pass", {"limit": 0.2}),
+    ],
 )
 def test_a_process_that_never_ends_is_killed_and_named(code, watch):
     command = [sys.executable, "-S", "-c", code]
@@ -77,6 +80,9 @@ def test_what_reads_from_a_process_that_hangs_comes_to_an_end():
 def test_what_a_command_says_and_takes_comes_as_from_subprocess():
     code = "import sys; print(input()); sys.exit('no')"
     done = finished(
-        [sys.executable, "-S", "-c", code], input="yes\n", capture_output=True, text=True
+        [sys.executable, "-S", "-c", code],
+        input="yes\n",
+        capture_output=True,
+        text=True,
     )
     assert (done.returncode, done.stdout, done.stderr) == (1, "yes\n", "no\n")

@@ -14,7 +14,9 @@ pytestmark = pytest.mark.process
 def imported_by(code: str) -> set[str]:
     """Modules that a new interpreter holds after running the code."""
     code += "\nimport sys; print('modules:', *sys.modules)"
-    done = finished([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    done = finished(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
     return set(done.stdout.rpartition("modules:")[2].split())
 
 
@@ -38,16 +40,26 @@ def test_every_public_name_resolves_and_is_documented():
 def test_import_pays_for_nothing_heavy():
     heavy = {"scipy", "meshcat", "matplotlib", "control", "example_robot_data"}
     assert not imported_by("import fflin") & (heavy | {"numpy", "pinocchio"})
-    main_job = "import fflin; fflin.check(r := fflin.load('ets_vii'), fflin.linearize(r))"
+    main_job = (
+        "import fflin; fflin.check(r := fflin.load('ets_vii'), fflin.linearize(r))"
+    )
     assert not imported_by(main_job) & heavy
     assert not after("--help") & (heavy | {"numpy", "pinocchio"})
     # Neither does a command pay for what others need; each of these takes a millisecond and more.
-    heavy |= {"numpy.ma", "numpy.testing", "numpy.typing", "subprocess", "tempfile", "html"}
+    heavy |= {
+        "numpy.ma",
+        "numpy.testing",
+        "numpy.typing",
+        "subprocess",
+        "tempfile",
+        "html",
+    }
     heavy |= {"numba", "fflin.commands.control"}
     moving = "linearize servicer_7dof --stiffness panel_left=9 --velocity omega_b.z=0.1"
     for words in ("linearize ets_vii", moving, "check ets_vii", "info ets_vii"):
         assert after(words) & (heavy | {"pinocchio"}) == {"pinocchio"}, words
-    assert "fflin.analysis.modes" not in after("linearize ets_vii")  # at rest nothing vibrates
+    # at rest nothing vibrates
+    assert "fflin.analysis.modes" not in after("linearize ets_vii")
     assert not after("robots") & (heavy - {"example_robot_data", "subprocess", "html"})
 
 
@@ -58,12 +70,18 @@ def test_help_begins_with_the_public_names_each_under_one_title():
     listed = [name for line in first.splitlines() for name in line.strip().split(", ")]
     for name in fflin.__all__:
         assert listed.count(name) == 1, name
-    titles = [line.strip() for line in fflin.__doc__.splitlines()[1:] if line[:1].strip()]
+    titles = [
+        line.strip() for line in fflin.__doc__.splitlines()[1:] if line[:1].strip()
+    ]
     assert titles[0] == "Robots" and {"Control", "Figures", "Errors"} <= set(titles)
 
 
 def test_completion_offers_public_names_alone():
-    offered = {name for name in dir(fflin) if not (name.startswith("__") and name.endswith("__"))}
+    offered = {
+        name
+        for name in dir(fflin)
+        if not (name.startswith("__") and name.endswith("__"))
+    }
     assert offered == set(fflin.__all__)
 
 

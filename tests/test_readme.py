@@ -25,7 +25,11 @@ def test_python_examples_run(tmp_path, page):
     text = (ROOT / page).read_text(encoding="utf-8")
     (tmp_path / "example.py").write_text("\n".join(code_blocks("python", text)))
     done = subprocess.run(
-        [sys.executable, "example.py"], cwd=tmp_path, capture_output=True, text=True, check=False
+        [sys.executable, "example.py"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert done.returncode == 0, done.stderr
     assert "undecided" not in done.stderr
@@ -38,7 +42,9 @@ def test_links_lead_somewhere():
         for path in (ROOT / folder).glob("*.md")
     ]
     for page in (*pages, *(ROOT / "docs").glob("**/*.md")):
-        prose = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+        prose = re.sub(
+            r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL
+        )
         for link in re.findall(r"\]\((?!http)([^)#]+)", prose):
             assert (page.parent / link).exists(), f"{page.name}: {link}"
 
@@ -46,7 +52,9 @@ def test_links_lead_somewhere():
 @pytest.mark.docs
 def test_commands_run(tmp_path):
     commands = [
-        shlex.split(line) for block in code_blocks("sh", COMMANDS) for line in block.splitlines()
+        shlex.split(line)
+        for block in code_blocks("sh", COMMANDS)
+        for line in block.splitlines()
     ]
     assert len(commands) >= 4
     for command in commands:
@@ -63,16 +71,26 @@ def test_commands_run(tmp_path):
 @pytest.mark.docs
 def test_two_commands_set_up_from_nothing():
     """One for the main job, one for the tests; what they install is what the project declares."""
-    setups = [line for block in code_blocks("sh") for line in block.splitlines() if "venv" in line]
+    setups = [
+        line
+        for block in code_blocks("sh")
+        for line in block.splitlines()
+        if "venv" in line
+    ]
     assert len(setups) == 2
     job, tests = setups
     # With matplotlib, so that every command further down runs after it.
-    assert job.startswith("python3 -m venv .venv && .venv/bin/pip install -q -e '.[plot]' && ")
+    assert job.startswith(
+        "python3 -m venv .venv && .venv/bin/pip install -q -e '.[plot]' && "
+    )
     # The part behind the installation, in this environment.
     for step in job.split(" && ")[2:]:
         arguments = shlex.split(step.removeprefix(".venv/bin/fflin "))
         done = subprocess.run(
-            [sys.executable, "-m", "fflin", *arguments], capture_output=True, text=True, check=False
+            [sys.executable, "-m", "fflin", *arguments],
+            capture_output=True,
+            text=True,
+            check=False,
         )
         assert done.returncode == 0 and done.stdout
     assert tests.endswith(".venv/bin/pytest")
@@ -83,4 +101,6 @@ def test_every_bundled_robot_is_named():
 
     for name in fflin.list_robots():
         if find_robot(name).origin == "fflin":
-            assert f"`{name}`" in (ROOT / "robots" / "README.md").read_text(encoding="utf-8")
+            assert f"`{name}`" in (ROOT / "robots" / "README.md").read_text(
+                encoding="utf-8"
+            )

@@ -47,7 +47,9 @@ def _build(folder):
     part = folder.with_suffix(".part")
     command = [sys.executable, "-m", "sphinx", "-q", "-W", "docs", part]
     # Where the kernels are not compiled yet, that takes a processor some minutes.
-    done = finished(command, cwd=ROOT, capture_output=True, text=True, watch={"limit": 1200.0})
+    done = finished(
+        command, cwd=ROOT, capture_output=True, text=True, watch={"limit": 1200.0}
+    )
     assert done.returncode == 0, done.stderr
     part.rename(folder)
 
@@ -66,8 +68,19 @@ class Page(HTMLParser):
         led = tag == "a" or given.get("rel") in ("next", "prev", "search", "index")
         if led and given.get("href"):
             self.links.append(given["href"])
-        elif tag in ("script", "img", "iframe", "link", "source", "video", "object", "embed"):
-            self.loads += [given[key] for key in ("src", "href", "data") if given.get(key)]
+        elif tag in (
+            "script",
+            "img",
+            "iframe",
+            "link",
+            "source",
+            "video",
+            "object",
+            "embed",
+        ):
+            self.loads += [
+                given[key] for key in ("src", "href", "data") if given.get(key)
+            ]
 
 
 @pytest.fixture(scope="module")
@@ -83,8 +96,12 @@ def test_nothing_is_loaded_from_elsewhere_and_all_that_is_loaded_is_there(site, 
         for address in page.loads:
             parts = urlsplit(address)
             if parts.scheme != "data":
-                assert not parts.scheme and not parts.netloc, f"{path.name} loads {address}"
-                assert (path.parent / unquote(parts.path)).exists(), f"{path.name}: {address}"
+                assert not parts.scheme and not parts.netloc, (
+                    f"{path.name} loads {address}"
+                )
+                assert (path.parent / unquote(parts.path)).exists(), (
+                    f"{path.name}: {address}"
+                )
     for path in site.rglob("*.css"):
         text = path.read_text(encoding="utf-8")
         assert not re.search(r"url\(\s*['\"]?(https?:)?//|@import[^;]*//", text), path
@@ -100,7 +117,9 @@ def test_links_lead_somewhere(site, pages):
             goal = (path.parent / unquote(parts.path)).resolve() if parts.path else path
             assert goal.is_file(), f"{path.name} links to {address}"
             if parts.fragment and goal in pages:
-                assert unquote(parts.fragment) in pages[goal].places, f"{path.name}: {address}"
+                assert unquote(parts.fragment) in pages[goal].places, (
+                    f"{path.name}: {address}"
+                )
 
 
 @pytest.mark.process
@@ -108,7 +127,9 @@ def test_the_site_is_small_and_has_a_page_for_every_public_name(site):
     size = sum(path.stat().st_size for path in site.rglob("*") if path.is_file())
     assert size < 30e6
     for name in fflin.__all__:
-        text = (site / "reference" / "names" / f"fflin.{name}.html").read_text(encoding="utf-8")
+        text = (site / "reference" / "names" / f"fflin.{name}.html").read_text(
+            encoding="utf-8"
+        )
         assert f'id="fflin.{name}"' in text and "Examples" in text
 
 
@@ -119,7 +140,9 @@ def test_formulas_search_and_pages_that_play_work_from_disk(site, browser):
     @contextlib.contextmanager
     def opened(page, ready):
         page, _, query = page.partition("?")
-        with Watched(browser, f"{(site / page).as_uri()}?{query}", ready=ready) as watched:
+        with Watched(
+            browser, f"{(site / page).as_uri()}?{query}", ready=ready
+        ) as watched:
             yield watched
         asked.extend(watched.requests)
 
@@ -134,7 +157,9 @@ def test_formulas_search_and_pages_that_play_work_from_disk(site, browser):
         element = watched.page.query_selector("iframe.fflin-page")
         element.scroll_into_view_if_needed()
         watched.wait("window.fflin && fflin.ready", element.content_frame())
-    assert all(url.startswith(("file:", "data:", "blob:", "about:")) for url in asked), asked
+    assert all(
+        url.startswith(("file:", "data:", "blob:", "about:")) for url in asked
+    ), asked
 
 
 # Words that people type, and pages of which one must be among the first three hits.
@@ -181,9 +206,13 @@ def served(site):
 
 
 @pytest.mark.browser
-def test_the_search_finds_the_page_of_a_task_first_and_shows_an_excerpt(served, browser):
+def test_the_search_finds_the_page_of_a_task_first_and_shows_an_excerpt(
+    served, browser
+):
     missed = {}
-    with Watched(browser, f"{served}/search.html", ready="typeof Search === 'object'") as watched:
+    with Watched(
+        browser, f"{served}/search.html", ready="typeof Search === 'object'"
+    ) as watched:
         for word, pages in SOUGHT.items():
             watched.page.fill("input[name=q]", word)
             with watched.page.expect_navigation():

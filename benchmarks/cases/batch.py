@@ -35,7 +35,9 @@ def run() -> Table:
             fflin.sweep(robot, q, threads=2)
 
         def bare(
-            model: pin.Model = model, data: pin.Data = data, points: list[np.ndarray] = points
+            model: pin.Model = model,
+            data: pin.Data = data,
+            points: list[np.ndarray] = points,
         ) -> None:
             for point in points:
                 pin.computeMinverse(model, data, point)
@@ -74,7 +76,11 @@ def _checked(robot: fflin.Robot, q: np.ndarray) -> int:
         exact = linearizer(q[row])
         lower, sizes = exact.B[6 + robot.n :], np.sqrt(exact.M.diagonal())
         mobility = np.sqrt(lower.diagonal())
-        error = np.abs((batch.B_lower[row] - lower) / np.outer(mobility, mobility)).max()
+        error = np.abs(
+            (batch.B_lower[row] - lower) / np.outer(mobility, mobility)
+        ).max()
         if not error < 1e-12 * np.linalg.cond(exact.M / np.outer(sizes, sizes)):
-            raise WrongResultError(f"sweep of {robot.name}: row {row} differs by {error:.1e}")
+            raise WrongResultError(
+                f"sweep of {robot.name}: row {row} differs by {error:.1e}"
+            )
     return int(batch.B_lower.nbytes)

@@ -27,7 +27,9 @@ def run() -> Table:
         notes |= dict.fromkeys(line for line in said if "too slow" not in line)
         calls = {method.name: method.call for method in found}
 
-        def batch(robot: fflin.Robot = robot, q: Array = q, v: Array = v, u: Array = u) -> None:
+        def batch(
+            robot: fflin.Robot = robot, q: Array = q, v: Array = v, u: Array = u
+        ) -> None:
             fflin.sweep(robot, q, v, u, threads=1)
 
         def one(linearizer: fflin.Linearizer = linearizer) -> None:
@@ -61,6 +63,9 @@ def _check(robot: fflin.Robot, q: Array, v: Array, u: Array) -> None:
     for row in range(0, COUNT, COUNT // CHECKED):
         one = linearizer(q[row], v[row], u[row])
         allowed = 1e-12 * one.certificate.condition
-        for found, exact in ((batch.A[row], one.A), (batch.B_lower[row], one.B[6 + robot.n :])):
+        for found, exact in (
+            (batch.A[row], one.A),
+            (batch.B_lower[row], one.B[6 + robot.n :]),
+        ):
             if not np.abs(found - exact).max() < allowed * np.abs(exact).max():
                 raise WrongResultError(f"sweep of {robot.name}: row {row} differs")

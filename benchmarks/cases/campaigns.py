@@ -24,7 +24,8 @@ ROUNDS = {10: 5, 100: 5, 1_000: 3, 10_000: 2}
 OF_PEERS = (10, 100)  # runs; one after the other, more of them take as long each
 OF_WHEELS = (10, 100, 1_000)
 FLOORS = 10  # times that the floor goes through the steps of a run
-CHECKED, BRIEF, WORST = 8, 5.0, 1e-5  # runs and [s] of the check, and the errors it allows
+# runs and [s] of the check, and the errors it allows
+CHECKED, BRIEF, WORST = 8, 5.0, 1e-5
 ALONE, HELD = "fflin", "fflin, held"
 THREADS, WORKERS = f"fflin, {CORES} threads", f"fflin, {CORES} workers"
 
@@ -72,10 +73,14 @@ def peers_of(loop: Loop) -> tuple[list[Callable[[int], Contender]], list[str]]:
             check(module.campaign(*_brief(loop)))
         except module.REFUSALS as refusal:
             robot = f"{loop.robot.name} with wheels" if loop.wheels else loop.robot.name
-            notes.append(f"{peer}: not on {robot}: {' '.join(str(refusal).split())[:80]}")
+            notes.append(
+                f"{peer}: not on {robot}: {' '.join(str(refusal).split())[:80]}"
+            )
             continue
         drawn = draws(loop, max(OF_PEERS))
-        found.append(lambda runs, of=module.campaign, drawn=drawn: of(loop, drawn[:runs]))
+        found.append(
+            lambda runs, of=module.campaign, drawn=drawn: of(loop, drawn[:runs])
+        )
     return found, notes
 
 
@@ -97,7 +102,9 @@ def check(contender: Contender) -> float:
         own.run()
         apart = max(error(loop, *pair) for pair in zip(ends, own.end(), strict=True))
     if not apart < WORST:
-        raise WrongResultError(f"{contender.name} on {loop.robot.name}: runs end {apart:.1e} apart")
+        raise WrongResultError(
+            f"{contender.name} on {loop.robot.name}: runs end {apart:.1e} apart"
+        )
     return apart
 
 
@@ -111,7 +118,9 @@ def _measured(
         for _ in range(FLOORS):
             once()
 
-    for each, (taken, aba) in beside(floor, {e.name: e.run for e in found}, ROUNDS[runs]).items():
+    for each, (taken, aba) in beside(
+        floor, {e.name: e.run for e in found}, ROUNDS[runs]
+    ).items():
         ratios = (figure(FLOORS * ratio / runs) for ratio in taken.ratios(aba))
         told = each not in (HELD, THREADS, WORKERS) and runs in (100, max(ROUNDS))
         peak = figure(peak_memory(name, each, runs) if told else None)

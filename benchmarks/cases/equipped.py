@@ -28,10 +28,14 @@ def run() -> Table:
     v, u = rng.normal(size=model.nv), rng.normal(size=len(robot.inputs))
     linearizer = fflin.Linearizer(robot)
     if not fflin.check(robot, linearizer(q, v, u)).ok:
-        raise WrongResultError(f"fflin on {ROBOT} with thrusters and wheels: check fails")
+        raise WrongResultError(
+            f"fflin on {ROBOT} with thrusters and wheels: check fails"
+        )
     a, wrenches = np.zeros(model.nv), pin.StdVec_Force(model.njoints, pin.Force.Zero())
     tool = model.frames[model.getFrameId("tool", pin.FrameType.BODY)]
-    carriers = {model.frames[model.getFrameId(item.frame)].parentJoint for item in thrusters}
+    carriers = {
+        model.frames[model.getFrameId(item.frame)].parentJoint for item in thrusters
+    }
     place = tool.parentJoint, tool.placement, pin.ReferenceFrame.LOCAL
 
     def bare() -> None:
@@ -56,5 +60,12 @@ def run() -> Table:
         "wheels, and the pose and velocity of the tool as outputs. The columns are the time and "
         "its ratio to the Pinocchio calls in it.",
         ("robot", "n", "fflin [us]", "fflin / Pinocchio calls"),
-        ((ROBOT, str(robot.n), figure(own.least * 1e6), figure(own.ratio(times["bare"]))),),
+        (
+            (
+                ROBOT,
+                str(robot.n),
+                figure(own.least * 1e6),
+                figure(own.ratio(times["bare"])),
+            ),
+        ),
     )

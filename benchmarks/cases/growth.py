@@ -7,7 +7,11 @@ from benchmarks.tables import Table
 
 SIZES = (10, 30, 100, 300)
 BEYOND_30 = ("adam",)
-BEYOND_100 = (*BEYOND_30, "MuJoCo mjd_transitionFD", "Drake FirstOrderTaylorApproximation")
+BEYOND_100 = (
+    *BEYOND_30,
+    "MuJoCo mjd_transitionFD",
+    "Drake FirstOrderTaylorApproximation",
+)
 
 
 def run() -> Table:

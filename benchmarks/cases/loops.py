@@ -65,7 +65,9 @@ def contenders(loop: Loop) -> tuple[list[Contender], list[str]]:
             found += module.contenders(loop)
         except module.REFUSALS as refusal:
             robot = f"{loop.robot.name} with wheels" if loop.wheels else loop.robot.name
-            notes.append(f"{peer}: not on {robot}: {' '.join(str(refusal).split())[:80]}")
+            notes.append(
+                f"{peer}: not on {robot}: {' '.join(str(refusal).split())[:80]}"
+            )
     return found, notes
 
 
@@ -116,7 +118,9 @@ def checked(contender: Contender) -> float | None:
     loop = contender.loop
     apart = error(loop, contender.end(), true_end(loop))
     if not apart < WORST:
-        raise WrongResultError(f"{contender.name} on {loop.robot.name}: ends {apart:.1e} apart")
+        raise WrongResultError(
+            f"{contender.name} on {loop.robot.name}: ends {apart:.1e} apart"
+        )
     return apart
 
 

@@ -25,12 +25,17 @@ def run() -> Table:
         point = random_point(load(name))
         lin = fflin.linearize(point.robot, point.q)
         Q = np.eye(len(lin.A))
-        R = np.diag(np.maximum(lin.M.diagonal(), 1e-3) ** -2.0)  # a weight on torque over inertia
+        # a weight on torque over inertia
+        R = np.diag(np.maximum(lin.M.diagonal(), 1e-3) ** -2.0)
         gains = {key: solve(lin, Q, R) for key, solve in solvers.items()}
         for key, gain in gains.items():
-            error = np.abs(gain - gains[reference]).max() / np.abs(gains[reference]).max()
+            error = (
+                np.abs(gain - gains[reference]).max() / np.abs(gains[reference]).max()
+            )
             if not error < 1e-6:
-                raise WrongResultError(f"{key} on {name}: the gain differs by {error:.1e}")
+                raise WrongResultError(
+                    f"{key} on {name}: the gain differs by {error:.1e}"
+                )
         calls = {
             key: (lambda solve=solve, lin=lin, Q=Q, R=R: solve(lin, Q, R))
             for key, solve in solvers.items()
@@ -49,7 +54,12 @@ def run() -> Table:
         "LQR",
         "The gain of the model at rest with weights on every state and input. The first column is "
         f"the time of {reference}; the times of the others are divided by it.",
-        ("robot", "n", f"{reference} [ms]", *(key for key in solvers if key != reference)),
+        (
+            "robot",
+            "n",
+            f"{reference} [ms]",
+            *(key for key in solvers if key != reference),
+        ),
         tuple(rows),
         tuple(notes),
     )
@@ -74,7 +84,9 @@ def _solvers() -> tuple[dict[str, Solver], list[str]]:
         notes.append(f"control: not installed ({error})")
     try:
         drake = importlib.import_module("pydrake.systems.controllers")
-        solvers["Drake"] = lambda lin, Q, R: drake.LinearQuadraticRegulator(lin.A, lin.B, Q, R)[0]
+        solvers["Drake"] = lambda lin, Q, R: drake.LinearQuadraticRegulator(
+            lin.A, lin.B, Q, R
+        )[0]
     except ImportError as error:
         notes.append(f"drake: not installed ({error})")
     return solvers, notes

@@ -8,7 +8,8 @@ def run() -> Table:
     names, notes = programs()
     with urdf_file() as path:
         peaks = {
-            name: [run_process(name, until, path)[1] for until in (IMPORT, FIRST)] for name in names
+            name: [run_process(name, until, path)[1] for until in (IMPORT, FIRST)]
+            for name in names
         }
     own = peaks["fflin"][1]
     rows = tuple(

@@ -55,6 +55,11 @@ def run() -> Table:
         f"Linearisations of {ROBOT} at rest with a new Linearizer, including its construction. The "
         "columns are the time per point, the time per call of `linearize` divided by it, and its "
         "ratio to pin.computeMinverse.",
-        ("points", "fflin [us a point]", "linearize, each afresh", "fflin / computeMinverse"),
+        (
+            "points",
+            "fflin [us a point]",
+            "linearize, each afresh",
+            "fflin / computeMinverse",
+        ),
         tuple(rows),
     )

@@ -49,14 +49,26 @@ def run() -> Table:
                 taken.append(1e3 * (time.perf_counter() - start))
             done = [k for k, d in enumerate(found) if d is not None]
             best = found if best is None else best
-            apart = max(np.abs(found[k] - best[k]).max() / np.abs(best[k]).max() for k in done)
+            apart = max(
+                np.abs(found[k] - best[k]).max() / np.abs(best[k]).max() for k in done
+            )
             if key == "PIQP" and not apart < 1e-4:
-                raise WrongResultError(f"{key} on {name}: the inputs differ by {apart:.1e}")
+                raise WrongResultError(
+                    f"{key} on {name}: the inputs differ by {apart:.1e}"
+                )
             times = (taken[0], np.median(taken), np.quantile(taken, 0.99))
-            cells = (name, key, str(robot.n), *map(figure, times), str(len(found) - len(done)))
+            cells = (
+                name,
+                key,
+                str(robot.n),
+                *map(figure, times),
+                str(len(found) - len(done)),
+            )
             rows.append((*cells, f"{apart:.0e}" if key != "fflin" else "–"))
         if own.unfinished:
-            raise WrongResultError(f"fflin on {name}: {own.unfinished} plans are not found")
+            raise WrongResultError(
+                f"fflin on {name}: {own.unfinished} plans are not found"
+            )
     return Table(
         "Plans of a receding horizon",
         f"A slew at the limits of torques, speeds and joint positions, at {1 / STEP:.0f} Hz over "
@@ -82,8 +94,14 @@ def run() -> Table:
 
 def _errors(robot: fflin.Robot, policy: Any, turn: float, limits: Any) -> list[Any]:
     """Return the deviations of the state at the samples of the flown slew."""
-    base = pin.SE3(pin.AngleAxis(np.radians(turn), np.array([0.8, 0.6, 0.0])).matrix(), np.zeros(3))
-    options = {"q0": fflin.configuration(robot, None, base), "dt": STEP / 4, "limits": limits}
+    base = pin.SE3(
+        pin.AngleAxis(np.radians(turn), np.array([0.8, 0.6, 0.0])).matrix(), np.zeros(3)
+    )
+    options = {
+        "q0": fflin.configuration(robot, None, base),
+        "dt": STEP / 4,
+        "limits": limits,
+    }
     motion = fflin.simulate(robot, policy, duration=DURATION, **options)
     return list(motion.error[:-1:4])
 
@@ -122,7 +140,9 @@ def _osqp(policy: Any) -> Solver:
     solver, nu = osqp.OSQP(), len(policy.lin.u0)
     low, high = m.low * rows, m.high * rows
     H, G = size[:, None] * m.H * size, rows[:, None] * m.G * size
-    solver.setup(sp.csc_matrix(np.triu(H)), m.g, sp.csc_matrix(G), low, high, verbose=False)
+    solver.setup(
+        sp.csc_matrix(np.triu(H)), m.g, sp.csc_matrix(G), low, high, verbose=False
+    )
 
     def solve(_: float, e: Any) -> Any:
         solver.update(q=e @ of_g, l=low + e @ moved, u=high + e @ moved)

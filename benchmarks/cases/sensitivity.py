@@ -18,11 +18,15 @@ def run() -> Table:
     for name in ROBOTS:
         robot = load(name)
         model, data = robot.model, robot.create_data()
-        q = pin.integrate(model, pin.neutral(model), np.random.default_rng(0).normal(size=model.nv))
+        q = pin.integrate(
+            model, pin.neutral(model), np.random.default_rng(0).normal(size=model.nv)
+        )
         lin = fflin.linearize(robot, q)
         found = fflin.sensitivity(lin)
         if max(found.check(["base.mass", "link_2.com.y"]).values()) > 1e-7:
-            raise WrongResultError(f"fflin on {name}: the derivatives do not pass their check")
+            raise WrongResultError(
+                f"fflin on {name}: the derivatives do not pass their check"
+            )
         slopes, parameters = found._derivatives, list(found.parameters.values())
         times = interleaved(
             {

@@ -36,9 +36,14 @@ def run() -> Table:
         expected = _reference(point)
         for key, simulation in simulations.items():
             simulation.run()
-            error = np.abs(simulation.velocities() - expected).max() / np.abs(expected).max()
+            error = (
+                np.abs(simulation.velocities() - expected).max()
+                / np.abs(expected).max()
+            )
             if not error < 1e-6:
-                raise WrongResultError(f"{key} on {name}: velocities differ by {error:.1e}")
+                raise WrongResultError(
+                    f"{key} on {name}: velocities differ by {error:.1e}"
+                )
         calls = {key: each.run for key, each in simulations.items()}
         times = interleaved(calls | {BARE: _bare(point)})
         own = times.pop("fflin")
@@ -60,7 +65,11 @@ def run() -> Table:
 
 
 def _bare(point: Point) -> Callable[[], None]:
-    model, data, tau = point.robot.model, point.robot.create_data(), np.zeros(point.robot.nv)
+    model, data, tau = (
+        point.robot.model,
+        point.robot.create_data(),
+        np.zeros(point.robot.nv),
+    )
     q, v = point.q, point.v
 
     def call() -> None:
@@ -77,7 +86,11 @@ def _reference(point: Point) -> Array:
 
 
 def _midpoint(point: Point, steps: int) -> Array:
-    model, data, tau = point.robot.model, point.robot.create_data(), np.zeros(point.robot.nv)
+    model, data, tau = (
+        point.robot.model,
+        point.robot.create_data(),
+        np.zeros(point.robot.nv),
+    )
     q, v, h = point.q.copy(), point.v.copy(), STEP * STEPS / steps
     for _ in range(steps):
         q_half = pin.integrate(model, q, 0.5 * h * v)

@@ -36,7 +36,9 @@ def run() -> Table:
         )
 
     ends = {dt: flies(dt) for dt in (*_STEPS, _STEPS[-1] / 4.0)}
-    *errors, _ = (_apart(_end(each), _end(ends[_STEPS[-1] / 4.0])) for each in ends.values())
+    *errors, _ = (
+        _apart(_end(each), _end(ends[_STEPS[-1] / 4.0])) for each in ends.values()
+    )
     notes = []
     try:
         drake = importlib.import_module("benchmarks.peers.drake_trajectory")
@@ -47,17 +49,24 @@ def run() -> Table:
             if design_error <= own_error:
                 break
         if not design_error < 1e-3:
-            raise WrongResultError(f"Drake's regulator is another: gains {design_error:.1e} apart")
+            raise WrongResultError(
+                f"Drake's regulator is another: gains {design_error:.1e} apart"
+            )
         loop = peer.loop(peer.regulator(1e-4, system=True), peer.state(q0, v0))
         peer_error = _apart(loop.run(), loop.run(1e-9))
-        best = max((dt for dt, e in zip(_STEPS, errors, strict=True) if e <= peer_error), default=0)
+        best = max(
+            (dt for dt, e in zip(_STEPS, errors, strict=True) if e <= peer_error),
+            default=0,
+        )
         dt = best or _STEPS[-1]
         drake_calls: dict[str, tuple[Callable[[], object], float]] = {
             "linear": (peer.linearize, 0.0),
             "gains": (lambda: peer.regulator(accuracy), design_error),
             "loop": (loop.run, peer_error),
         }
-        notes.append(f"Drake's regulator is designed at accuracy {accuracy:g}, its loop at 1e-4")
+        notes.append(
+            f"Drake's regulator is designed at accuracy {accuracy:g}, its loop at 1e-4"
+        )
     except ImportError as error:
         notes, drake_calls, dt = [f"drake: not installed ({error})"], {}, _STEPS[0]
     notes.append(f"fflin's loop takes steps of {1e3 * dt:g} ms")
@@ -77,7 +86,15 @@ def run() -> Table:
         if key == "linear":  # both exact
             sizes = [None, None]
         shown = [figure(None) if size is None else f"{size:.0e}" for size in sizes]
-        cells.append((title, figure(times["fflin"].least * 1e3), shown[0], figure(ratio), shown[1]))
+        cells.append(
+            (
+                title,
+                figure(times["fflin"].least * 1e3),
+                shown[0],
+                figure(ratio),
+                shown[1],
+            )
+        )
     return Table(
         "Along a trajectory",
         f"planar_detumble over {KNOTS} knots of a motion of {DURATION:g} s: its linear models with "
@@ -102,7 +119,9 @@ def flown() -> fflin.Trajectory:
     run = fflin.simulate(
         robot,
         lambda time, q, v: np.array([np.interp(time, t, each) for each in u.T]),
-        q0=fflin.configuration(robot, {"joint_1": 0.6, "joint_2": 0.5, "joint_3": -0.8}),
+        q0=fflin.configuration(
+            robot, {"joint_1": 0.6, "joint_2": 0.5, "joint_3": -0.8}
+        ),
         v0=fflin.velocity(robot, start),
         duration=DURATION,
         dt=0.005,
@@ -128,7 +147,12 @@ def _reference(along: fflin.LinearTrajectory) -> Array:
 
     found = solve_ivp(
         *(rate, (0.0, DURATION), np.diag(_Q).ravel()),
-        **{"method": "LSODA", "rtol": 1e-9, "atol": 1e-8, "t_eval": DURATION - along.t[::-1]},
+        **{
+            "method": "LSODA",
+            "rtol": 1e-9,
+            "atol": 1e-8,
+            "t_eval": DURATION - along.t[::-1],
+        },
     )
     P = found.y.T[::-1].reshape(KNOTS, len(_Q), -1)
     return along.B.transpose(0, 2, 1) @ P / _R[:, None]

@@ -98,10 +98,13 @@ def check(method: Method, point: Point, *, at_rest: bool) -> float:
         block = expected[:, columns]
         if block.size:
             scale = np.abs(block).max(axis=1)
-            scale = np.maximum(scale, 1e-3 * scale.max() or 1.0)  # of rows that are zero in truth
+            # of rows that are zero in truth
+            scale = np.maximum(scale, 1e-3 * scale.max() or 1.0)
             difference = np.abs(slopes[:, columns] - block).max(axis=1)
             errors.append(float((difference / scale).max()))
     worst = max(errors) if np.isfinite(slopes).all() else np.inf
     if not worst < method.tolerance:
-        raise WrongResultError(f"{method.name} on {robot.name}: differs from fflin by {worst:.1e}")
+        raise WrongResultError(
+            f"{method.name} on {robot.name}: differs from fflin by {worst:.1e}"
+        )
     return worst

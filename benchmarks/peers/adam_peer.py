@@ -30,17 +30,23 @@ def at_rest(point: Point) -> list[Method]:
     def call() -> None:
         kept["inverse"] = function(unturned, q_m).full()
 
-    return [Method(NAME, call, lambda: kept["inverse"][np.ix_(order, order)], frame="world")]
+    return [
+        Method(NAME, call, lambda: kept["inverse"][np.ix_(order, order)], frame="world")
+    ]
 
 
 def at_point(point: Point) -> list[Method]:
     dynamics, n = _dynamics(point), point.robot.n
     nv, order, q_m = 6 + n, _order(n), point.q_m
     pose = casadi.SX.sym("pose", 6)
-    positions, nu, a = (casadi.SX.sym(*each) for each in (("s", n), ("nu", nv), ("a", nv)))
+    positions, nu, a = (
+        casadi.SX.sym(*each) for each in (("s", n), ("nu", nv), ("a", nv))
+    )
     # About the unturned base, to first order.
     turned = casadi.SX.eye(3) + casadi.skew(pose[:3])
-    placement = casadi.vertcat(casadi.horzcat(turned, pose[3:]), casadi.SX([[0, 0, 0, 1]]))
+    placement = casadi.vertcat(
+        casadi.horzcat(turned, pose[3:]), casadi.SX([[0, 0, 0, 1]])
+    )
     M = dynamics.mass_matrix(placement, positions)
     bias = dynamics.bias_force(placement, positions, nu[:6], nu[6:])
     forces = casadi.Function("forces", [pose, positions, nu], [M, bias])

@@ -6,7 +6,12 @@ spacecraft; the torques are held until the next. The feedback is of modified Rod
 
 import numpy as np
 from Basilisk.architecture import bskLogging, messaging
-from Basilisk.fswAlgorithms import attTrackingError, inertial3D, mrpFeedback, rwMotorTorque
+from Basilisk.fswAlgorithms import (
+    attTrackingError,
+    inertial3D,
+    mrpFeedback,
+    rwMotorTorque,
+)
 from Basilisk.simulation import reactionWheelStateEffector, simpleNav, spacecraft
 from Basilisk.utilities import SimulationBaseClass, macros, simIncludeRW
 
@@ -36,7 +41,8 @@ class BasiliskLoop:
     """A simulation with its spacecraft and wheels, from the loop's start to its end."""
 
     def __init__(self, loop: Loop) -> None:
-        bskLogging.setDefaultLogLevel(bskLogging.BSK_ERROR)  # of states made anew at each start
+        # of states made anew at each start
+        bskLogging.setDefaultLogLevel(bskLogging.BSK_ERROR)
         self.loop, self.craft = loop, spacecraft.Spacecraft()
         self.simulation = SimulationBaseClass.SimBaseClass()
         process = self.simulation.CreateNewProcess("process")
@@ -63,7 +69,10 @@ class BasiliskLoop:
         hub.r_BcB_B = inertia.lever[:, None].tolist()
         parameters = x0[:3] / (1.0 + np.sqrt(1.0 - x0[:3] @ x0[:3]))
         rates = x0[6 + self.loop.robot.n :][:3]
-        hub.sigma_BNInit, hub.omega_BN_BInit = parameters[:, None].tolist(), rates[:, None].tolist()
+        hub.sigma_BNInit, hub.omega_BN_BInit = (
+            parameters[:, None].tolist(),
+            rates[:, None].tolist(),
+        )
 
     def _software(self) -> list[object]:
         """Add the flight software, and return what must outlive it."""
@@ -73,7 +82,10 @@ class BasiliskLoop:
         for module in (navigation, target, error, feedback, torques):
             self.simulation.AddModelToTask(TASK, module)
         target.sigma_R0N = [0.0, 0.0, 0.0]
-        feedback.K, feedback.P = -self.loop.K[0, 0], -self.loop.K[0, 6 + self.loop.robot.n]
+        feedback.K, feedback.P = (
+            -self.loop.K[0, 0],
+            -self.loop.K[0, 6 + self.loop.robot.n],
+        )
         feedback.Ki = -1.0  # none
         torques.controlAxes_B = np.eye(3).ravel().tolist()
         vehicle = messaging.VehicleConfigMsgPayload()

@@ -38,6 +38,8 @@ def campaign(loop: Loop, drawn: Array) -> Contender:
             ends.append(here.seen(context.get_continuous_state_vector().CopyToVector()))
             return 0.0
 
-        MonteCarloSimulation(make, output, loop.duration, len(drawn), RandomGenerator(0))
+        MonteCarloSimulation(
+            make, output, loop.duration, len(drawn), RandomGenerator(0)
+        )
 
     return Contender("Drake, held", here.loop, call, lambda: ends)

@@ -27,7 +27,9 @@ def contenders(loop: Loop) -> list[Contender]:
         "Drake, held": DrakeLoop(own.but(held=True)),
         "Drake, in Python": DrakeLoop(loop.but(held=False)),
     }
-    return [Contender(name, each.loop, each.run, each.end) for name, each in ways.items()]
+    return [
+        Contender(name, each.loop, each.run, each.end) for name, each in ways.items()
+    ]
 
 
 class DrakeLoop:
@@ -35,12 +37,15 @@ class DrakeLoop:
 
     def __init__(self, loop: Loop) -> None:
         if loop.wheels:
-            raise RuntimeError("a wheel is a body without mass, which Drake does not support")
+            raise RuntimeError(
+                "a wheel is a body without mass, which Drake does not support"
+            )
         self.loop = loop
         self.here = here = DrakePoint(loop.point, rest=True)
         M = here.plant.CalcMassMatrix(here.context)
         loop.require_same_inertia("Drake", M[np.ix_(here.order, here.order)])
-        self.places = np.append(here.turns, here.nq + here.order)  # of x in Drake's state
+        # of x in Drake's state
+        self.places = np.append(here.turns, here.nq + here.order)
         self.simulator, self.plant = self.closed(here.plant.Clone())
         self.start = self.state(loop.x0)
 

@@ -17,14 +17,18 @@ class DrakePoint:
 
     def __init__(self, point: Point, *, rest: bool) -> None:
         if not is_rigid(point.robot):
-            raise RuntimeError("Drake replaces inertias that are not physically realisable")
+            raise RuntimeError(
+                "Drake replaces inertias that are not physically realisable"
+            )
         self.plant = plant = free_plant(plain_urdf(point.robot))
         self.context = plant.CreateDefaultContext()
         base = plant.GetBodyByName(BASE)
         start = base.floating_velocities_start_in_v()
         joints = [plant.GetJointByName(name) for name in point.robot.joint_names]
         # Angular before linear, as in the state.
-        self.order = np.array([*range(start, start + 6), *(j.velocity_start() for j in joints)])
+        self.order = np.array(
+            [*range(start, start + 6), *(j.velocity_start() for j in joints)]
+        )
         self.nq, self.nv = plant.num_positions(), plant.num_velocities()
         w = base.floating_positions_start()
         q = np.zeros(self.nq)
@@ -63,7 +67,10 @@ def _taylor(here: DrakePoint) -> Method:
 
     def call() -> None:
         kept["system"] = FirstOrderTaylorApproximation(
-            here.plant, here.context, here.port.get_index(), OutputPortSelection.kNoOutput
+            here.plant,
+            here.context,
+            here.port.get_index(),
+            OutputPortSelection.kNoOutput,
         )
 
     def slopes() -> Array:

@@ -31,10 +31,16 @@ class DrakeTrajectory:
 
     def __init__(self, traj: fflin.Trajectory, q: Array, r: Array) -> None:
         zero = np.zeros(6 + traj.robot.n)
-        self.here = here = DrakePoint(Point(traj.robot, zero[6:], zero, zero), rest=True)
+        self.here = here = DrakePoint(
+            Point(traj.robot, zero[6:], zero, zero), rest=True
+        )
         self.traj, self.plant, self.context = traj, here.plant, here.context
-        self.states = np.array([self.state(*row) for row in zip(traj.q, traj.v, strict=True)])
-        self.states[:, here.turns[6:]] = np.unwrap(self.states[:, here.turns[6:]], axis=0)
+        self.states = np.array(
+            [self.state(*row) for row in zip(traj.q, traj.v, strict=True)]
+        )
+        self.states[:, here.turns[6:]] = np.unwrap(
+            self.states[:, here.turns[6:]], axis=0
+        )
         self.inputs = traj.u_base[:, np.argsort(here.order)]
         n = len(here.order)
         self.Q, self.R = np.zeros(here.nq + here.nv), np.diag(r[np.argsort(here.order)])
@@ -42,9 +48,12 @@ class DrakeTrajectory:
         self.Q[here.nq + here.order] = q[n:]
         self.Q = np.diag(self.Q)
         rates = [
-            self._at(*row).CopyToVector() for row in zip(self.states, self.inputs, strict=True)
+            self._at(*row).CopyToVector()
+            for row in zip(self.states, self.inputs, strict=True)
         ]
-        self.reference = PiecewisePolynomial.CubicHermite(traj.t, self.states.T, np.array(rates).T)
+        self.reference = PiecewisePolynomial.CubicHermite(
+            traj.t, self.states.T, np.array(rates).T
+        )
         self.feedforward = PiecewisePolynomial.FirstOrderHold(traj.t, self.inputs.T)
 
     def _at(self, x: Array, u: Array):
@@ -56,7 +65,11 @@ class DrakeTrajectory:
         """Return Drake's state of a configuration and velocity in Pinocchio's order."""
         robot, here = self.traj.robot, self.here
         x = np.zeros(here.nq + here.nv)
-        x[here.turns[0] - 1], x[here.turns[:3]], x[here.turns[3:6]] = q[6], q[3:6], q[:3]
+        x[here.turns[0] - 1], x[here.turns[:3]], x[here.turns[3:6]] = (
+            q[6],
+            q[3:6],
+            q[:3],
+        )
         x[here.turns[6:]] = fflin.StateMap(robot).joint_positions(q[None])[0]
         R = pin.XYZQUATToSE3(q[:7]).rotation
         joints = [v[joint.idx_v] for joint in robot.joints]
@@ -71,7 +84,9 @@ class DrakeTrajectory:
             self.here.port.FixValue(self.context, u)
             port = self.here.port.get_index()
             none = OutputPortSelection.kNoOutput
-            found.append(FirstOrderTaylorApproximation(self.plant, self.context, port, none))
+            found.append(
+                FirstOrderTaylorApproximation(self.plant, self.context, port, none)
+            )
         return found
 
     def regulator(self, accuracy: float, *, system: bool = False):

@@ -20,7 +20,10 @@ def campaign(loop: Loop, drawn: Array) -> Contender:
 
     def call() -> None:
         for row, end in zip(drawn, ends, strict=True):
-            base.mass[:], base.inertia[:] = (1.0 + row[3]) * mass, (1.0 + row[3]) * inertia
+            base.mass[:], base.inertia[:] = (
+                (1.0 + row[3]) * mass,
+                (1.0 + row[3]) * inertia,
+            )
             mujoco.mj_setConst(here.model, here.data)
             here.start(started(loop, row))
             here.between_steps()

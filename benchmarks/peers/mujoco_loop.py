@@ -31,14 +31,22 @@ class MujocoLoop:
 
     def __init__(self, loop: Loop) -> None:
         if loop.wheels:
-            raise ValueError("a wheel is a body without mass, which MuJoCo's URDF does not support")
+            raise ValueError(
+                "a wheel is a body without mass, which MuJoCo's URDF does not support"
+            )
         self.loop = loop
         here = MujocoPoint(loop.point, motors=False, any_inertia=True)
         self.model, self.data, self.order = here.model, here.data, here.order
         model, n = self.model, 6 + loop.robot.n
-        model.opt.integrator, model.opt.timestep = mujoco.mjtIntegrator.mjINT_RK4, loop.dt
+        model.opt.integrator, model.opt.timestep = (
+            mujoco.mjtIntegrator.mjINT_RK4,
+            loop.dt,
+        )
         self.places = np.array([4, 5, 6, 0, 1, 2, *here.positions])  # of x in qpos
-        self.by_q, self.by_v = np.zeros((model.nv, model.nq)), np.zeros((model.nv, model.nv))
+        self.by_q, self.by_v = (
+            np.zeros((model.nv, model.nq)),
+            np.zeros((model.nv, model.nv)),
+        )
         self.by_q[np.ix_(self.order, self.places)] = -loop.K[:, :n]
         self.by_v[np.ix_(self.order, self.order)] = -loop.K[:, n:]
         self.start(loop.x0)
@@ -94,4 +102,6 @@ class MujocoLoop:
         """Return the last state (nx,)."""
         sign = np.ones(6 + self.loop.robot.n)
         sign[:3] = np.sign(self.data.qpos[3])
-        return np.concatenate((sign * self.data.qpos[self.places], self.data.qvel[self.order]))
+        return np.concatenate(
+            (sign * self.data.qpos[self.places], self.data.qvel[self.order])
+        )

@@ -21,7 +21,9 @@ DIFFERENCE = 1e-6
 class MujocoPoint:
     """A model and its data, and where the coordinates of the point lie in them."""
 
-    def __init__(self, point: Point, *, motors: bool = True, any_inertia: bool = False) -> None:
+    def __init__(
+        self, point: Point, *, motors: bool = True, any_inertia: bool = False
+    ) -> None:
         spec = mujoco.MjSpec.from_string(plain_urdf(point.robot))
         spec.compiler.fusestatic, spec.compiler.balanceinertia = False, any_inertia
         spec.body(BASE).add_freejoint(name=FREE)
@@ -59,7 +61,10 @@ class MujocoPoint:
             if 2.0 * moments[2] > moments.sum():
                 axes[:, 2] *= np.linalg.det(axes)
                 body = self.model.body(name)
-                body.inertia[:], body.iquat[:] = moments, np.roll(pin.Quaternion(axes).coeffs(), 1)
+                body.inertia[:], body.iquat[:] = (
+                    moments,
+                    np.roll(pin.Quaternion(axes).coeffs(), 1),
+                )
         mujoco.mj_setConst(self.model, self.data)
 
 
@@ -67,7 +72,10 @@ def _motor(spec: "mujoco.MjSpec", joint: str, axis: int) -> None:
     gear = np.zeros(6)
     gear[axis] = 1.0
     spec.add_actuator(
-        name=f"{joint} {axis}", target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT, gear=gear
+        name=f"{joint} {axis}",
+        target=joint,
+        trntype=mujoco.mjtTrn.mjTRN_JOINT,
+        gear=gear,
     )
 
 
@@ -93,7 +101,10 @@ def at_rest(point: Point) -> list[Method]:
         return kept["B"][nv:][np.ix_(order, order)]
 
     here.qvel[:] = here.ctrl[:] = 0.0
-    return [Method("MuJoCo by hand", by_hand, slopes), _transition(MujocoPoint(point), rest=True)]
+    return [
+        Method("MuJoCo by hand", by_hand, slopes),
+        _transition(MujocoPoint(point), rest=True),
+    ]
 
 
 def at_point(point: Point) -> list[Method]:

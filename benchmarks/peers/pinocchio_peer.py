@@ -39,6 +39,8 @@ def at_point(point: Point) -> list[Method]:
 
     def slopes() -> Array:
         by_q, by_v, inverse = kept["all"]
-        return np.hstack([block[np.ix_(order, order)] for block in (by_q, by_v, inverse)])
+        return np.hstack(
+            [block[np.ix_(order, order)] for block in (by_q, by_v, inverse)]
+        )
 
     return [Method("Pinocchio ABA derivatives", call, slopes, frame="local")]

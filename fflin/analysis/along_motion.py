@@ -11,7 +11,12 @@ import numpy as np
 
 from fflin.analysis import mechanics, ranks
 from fflin.base.validation import Array
-from fflin.linear.linear_trajectory import ACCURACY, LinearTrajectory, along, knot_transitions
+from fflin.linear.linear_trajectory import (
+    ACCURACY,
+    LinearTrajectory,
+    along,
+    knot_transitions,
+)
 from fflin.linear.linearization import Linearizer
 from fflin.linear.model import LinearModel
 
@@ -117,7 +122,9 @@ def _compressed(F: Array) -> Array:
     return triangle.T
 
 
-def _split(traj: LinearTrajectory, F: Array, known: Array, to_x: Array, from_x: Array) -> Split:
+def _split(
+    traj: LinearTrajectory, F: Array, known: Array, to_x: Array, from_x: Array
+) -> Split:
     """Split the state space by the singular values of F, apart from the columns of `known`.
 
     All arguments are in units of energy.

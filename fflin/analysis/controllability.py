@@ -100,7 +100,9 @@ class Controllability(ranks.RankAnalysis):
         lines = list[str]()
         if self.uncontrollable:
             lines.append(f"controllable: {', '.join(self.controllable)}")
-            lines.append(f"uncontrollable: {', '.join(mechanics.grouped(self.uncontrollable))}")
+            lines.append(
+                f"uncontrollable: {', '.join(mechanics.grouped(self.uncontrollable))}"
+            )
             placed = [f"{group} {count}" for group, count in self.reach.items()]
             lines.append(f"controllable directions: {', '.join(placed)}")
         conserved = self.uncontrollable[: len(self.basis) - self.bound]
@@ -214,7 +216,9 @@ def controllability(lin: LinearModel | LinearTrajectory) -> Controllability:
     others[:, conserved.selected] = rows
     zero = moving_points.constant_poles(2 * len(conserved.weights), lin.dt)
     margin = conserved.margin & fixed.margin.transformed(conserved.rates)
-    fixed = fixed._replace(margin=margin, settling=fixed.settling.transformed(conserved.rates))
+    fixed = fixed._replace(
+        margin=margin, settling=fixed.settling.transformed(conserved.rates)
+    )
     if len(zero):
         fixed = fixed._replace(decays=False, settling=ranks.Margin())
     momenta, notes = mechanics.momentum_names(lin, conserved), list[str]()
@@ -223,7 +227,9 @@ def controllability(lin: LinearModel | LinearTrajectory) -> Controllability:
     if rotates and any(name.startswith("q_m.") for name in kept):
         notes.append(_LOOPS)
     if momenta:
-        notes.append("fflin.momentum_reduction removes the conserved momenta from the model")
+        notes.append(
+            "fflin.momentum_reduction removes the conserved momenta from the model"
+        )
     dimension = controllable.shape[1]
     notes += moving_points.steadiness(lin)
     notes += mechanics.undecided(lin, fixed, "controllable", dimension, "stabilizable")
@@ -269,10 +275,13 @@ def _in_motion(lin: LinearModel) -> Controllability:
             notes=(moving_points.NOTE_AT_ONCE, *notes),
         )
     X = mechanics.rate_matrix(lin)
-    inside, _, rows, fixed = split_by_poles(X, lin.B, lin.M, lin.dt, known=conserved.rows)
+    inside, _, rows, fixed = split_by_poles(
+        X, lin.B, lin.M, lin.dt, known=conserved.rows
+    )
     rows, names = _named(rows, lin.state_names, np.tile(np.sqrt(lin.M.diagonal()), 2))
     zero = moving_points.constant_poles(count, lin.dt)
-    fixed = fixed._replace(settling=ranks.Margin())  # the frozen poles do not decide about decay
+    # the frozen poles do not decide about decay
+    fixed = fixed._replace(settling=ranks.Margin())
     undecided = mechanics.undecided(lin, fixed, "controllable", inside.shape[1])
     stabilizable = False if count else None
     return _result(
@@ -347,7 +356,9 @@ def _result(
     # Name the controllable states by coordinates on which an input acts directly, if possible.
     driven = mechanics.second_order(lin.generator or lin).S.values.any(axis=1)
     basis, pivots = ranks.echelon(controllable, size, np.tile(driven, 2))
-    groups = np.array([name.partition(".")[0] for name in lin.state_names[: len(lin.M)]])
+    groups = np.array(
+        [name.partition(".")[0] for name in lin.state_names[: len(lin.M)]]
+    )
     titles = {"q_b": "base attitude", "r_b": "base position", "q_m": "joints"}
     weighted = (basis * size[:, None])[: len(groups)]
     return Controllability(
@@ -361,7 +372,9 @@ def _result(
         fixed_poles=fixed_poles,
         stabilizable=stabilizable,
         reach={
-            title: ranks.image(ranks.unit_columns(weighted[groups == group]), 1e-8)[0].shape[1]
+            title: ranks.image(ranks.unit_columns(weighted[groups == group]), 1e-8)[
+                0
+            ].shape[1]
             for group, title in titles.items()
             if group in groups
         },
@@ -398,7 +411,13 @@ def _by_second_order(
         # states are controllable. Sampled models with springs or dampers are excluded, because
         # sampling may make their states uncontrollable.
         everything = np.eye(2 * r)
-        return everything, everything[:0], [], "closed form", ranks.FixedPoles(margin=margin)
+        return (
+            everything,
+            everything[:0],
+            [],
+            "closed form",
+            ranks.FixedPoles(margin=margin),
+        )
     S = system.S.T
     hidden = unobservable(system, S, ranks.Noisy.exact(0.0 * S.values), lin.dt)
     if hidden is None:
@@ -415,7 +434,9 @@ def _by_second_order(
     scale = 1.0 / np.tile(system.size, 2)
     controllable, _ = ranks.null_space(exact, scale)
     to_s = np.linalg.inv(
-        (mechanics.rates_of_positions(mechanics.rate_matrix(source)) @ R)[conserved.kept]
+        (mechanics.rates_of_positions(mechanics.rate_matrix(source)) @ R)[
+            conserved.kept
+        ]
     )
     controllable[:r] = np.linalg.solve(to_s, controllable[:r])
     if system.D.values.any():
@@ -423,7 +444,9 @@ def _by_second_order(
         return controllable, rows, None, "eigenvalues", fixed
     # Without damping, the uncontrollable combinations of states are modal coordinates of vibrations
     # and instabilities, and the rates of these coordinates.
-    members = tuple(lin.state_names[len(lin.M) + i].split(".", 1)[-1] for i in conserved.kept)
+    members = tuple(
+        lin.state_names[len(lin.M) + i].split(".", 1)[-1] for i in conserved.kept
+    )
     read = [np.zeros((0, 2 * r))]
     names = list[str]()
     for pole, of_pole in shapes:
@@ -435,7 +458,9 @@ def _by_second_order(
         kind = "vibration" if pole.imag else "instability"
         for prefix in ("", "rate of "):
             for amplitudes in of_pole.real.T * system.size:
-                shape = combination(amplitudes / np.abs(amplitudes).max(), members, np.ones(r))
+                shape = combination(
+                    amplitudes / np.abs(amplitudes).max(), members, np.ones(r)
+                )
                 names.append(f"{prefix}{kind} at {abs(pole):.4g} rad/s ({shape})")
     return controllable, np.vstack(read), names, "modes", fixed
 
@@ -447,7 +472,9 @@ def require_stabilizable(lin: LinearModel) -> None:
         robot = lin._robot
         if robot and any(robot.damping.get(name) for name in lin.wheels):
             missed += ", or remove the damping of the wheels"
-        report = _reached(lin, lin.A, lin.B, "stabilised by the inputs", missed, unstable=True)
+        report = _reached(
+            lin, lin.A, lin.B, "stabilised by the inputs", missed, unstable=True
+        )
         return _conclude(StabilizabilityError, *report)
     analysis = controllability(lin)
     words = ""
@@ -458,11 +485,15 @@ def require_stabilizable(lin: LinearModel) -> None:
         count = len(conserved.weights)
         others = _lasting(lin, analysis, 2 * count)
         lost = (*analysis.uncontrollable[:count], *others)
-        words = missed.format(listed(mechanics.grouped(lost))) + _remedies(lin, conserved)
+        words = missed.format(listed(mechanics.grouped(lost))) + _remedies(
+            lin, conserved
+        )
     return _conclude(StabilizabilityError, words, analysis.notes, analysis.margin)
 
 
-def _lasting(lin: LinearModel, analysis: Controllability, first: int) -> tuple[str, ...]:
+def _lasting(
+    lin: LinearModel, analysis: Controllability, first: int
+) -> tuple[str, ...]:
     """Name the uncontrollable combinations of states that do not decay by themselves.
 
     The combinations are the rows of the result `analysis` from the row `first` on. The rows before
@@ -492,10 +523,16 @@ def _remedies(lin: LinearModel, conserved: ConservedMomenta) -> str:
         # The names of these joints, as a pattern if they differ only by their ends.
         loose = [
             name.removeprefix("momentum of ")
-            for name in mechanics.momentum_names(lin, conserved)[: len(conserved.weights)]
-            if name.startswith("momentum of ") and " + " not in name and " - " not in name
+            for name in mechanics.momentum_names(lin, conserved)[
+                : len(conserved.weights)
+            ]
+            if name.startswith("momentum of ")
+            and " + " not in name
+            and " - " not in name
         ]
-        advice += ", add a spring to any joint that no input moves (--stiffness, stiffness=)"
+        advice += (
+            ", add a spring to any joint that no input moves (--stiffness, stiffness=)"
+        )
         if loose:
             names = ", ".join(f'"{name}"' for name in _patterns(lin, loose))
             advice += f", lock such joints (lock = [{names}], --lock)"
@@ -506,7 +543,9 @@ def _remedies(lin: LinearModel, conserved: ConservedMomenta) -> str:
 
 def _patterns(lin: LinearModel, joints: Sequence[str]) -> list[str]:
     """Return patterns that match exactly the given joints of a model, such as ``arm_*``."""
-    everything = [x.removeprefix("q_m.") for x in lin.state_names if x.startswith("q_m.")]
+    everything = [
+        x.removeprefix("q_m.") for x in lin.state_names if x.startswith("q_m.")
+    ]
     groups = dict[str, list[str]]()
     for name in joints:
         groups.setdefault(re.sub(r"[0-9]+$", "", name), []).append(name)
@@ -525,7 +564,9 @@ def require_detectable(lin: LinearModel) -> None:
     """Raise `DetectabilityError` if there are unobservable motions that do not decay."""
     missed = "the outputs do not observe {}, whose motion does not decay by itself; add outputs"
     if len(lin.A) < 2 * len(lin.M):
-        report = _reached(lin, lin.A.T, lin.C.T, "observed by the outputs", missed, unstable=True)
+        report = _reached(
+            lin, lin.A.T, lin.C.T, "observed by the outputs", missed, unstable=True
+        )
         return _conclude(DetectabilityError, *report)
     analysis = observability(lin)
     words = ""
@@ -546,7 +587,9 @@ def require_disturbed(lin: LinearModel, W: Array) -> None:
         "W does not excite {}, whose motion does not decay by itself, so a steady-state filter "
         "would not correct its estimate; give the noise there a positive intensity"
     )
-    _conclude(InputError, *_reached(lin, lin.A, _root(W), "excited by W", missed, spans=True))
+    _conclude(
+        InputError, *_reached(lin, lin.A, _root(W), "excited by W", missed, spans=True)
+    )
 
 
 def _conclude(
@@ -572,7 +615,9 @@ def _root(W: Array) -> Array:
     size = ranks.divisors(np.sqrt(W.diagonal()))
     values, vectors = np.linalg.eigh(W / np.outer(size, size))
     rounding = len(W) * np.finfo(float).eps * values[-1:].max(initial=0.0)
-    root: Array = size[:, None] * vectors * np.sqrt(np.where(values > rounding, values, 0.0))
+    root: Array = (
+        size[:, None] * vectors * np.sqrt(np.where(values > rounding, values, 0.0))
+    )
     return root
 
 
@@ -602,7 +647,9 @@ def _reached(
     # pole, or of z - 1 for discrete-time poles z.
     candidates = [complex(discrete)]
     growing = (beyond > 0.0) & unstable
-    for pole in poles[((np.abs(beyond) <= 1e-3 * size) | growing) & (poles.imag >= 0.0)]:
+    for pole in poles[
+        ((np.abs(beyond) <= 1e-3 * size) | growing) & (poles.imag >= 0.0)
+    ]:
         if all(abs(pole - other) > 1e-3 * size for other in candidates):
             candidates.append(complex(pole))
     missed, margin = list[Values](), ranks.Margin()

@@ -80,7 +80,9 @@ def split_by_poles(
     p, v = slice(0, nv), slice(nv, None)
     to_x, from_x = energy_units(M, rates_of_positions(X))
     A = from_x @ X @ to_x
-    turning, fall, drag = (float(np.linalg.norm(A[i, j], 2)) for i, j in ((p, p), (v, p), (v, v)))
+    turning, fall, drag = (
+        float(np.linalg.norm(A[i, j], 2)) for i, j in ((p, p), (v, p), (v, v))
+    )
     rate = max(turning, drag, np.sqrt(fall))
     # If no force depends on the state, the unit of time is arbitrary.
     unit = 1.0
@@ -114,7 +116,9 @@ def split_by_poles(
         inside = np.linalg.qr(taken.T, mode="complete")[0][:, len(known) :]
     rest: Array = np.zeros((2 * nv, 0))
     while inside.shape[1]:
-        lost, step_margin = _left_vectors(inside.T @ A @ inside, inside.T @ B, 20.0 * noise)
+        lost, step_margin = _left_vectors(
+            inside.T @ A @ inside, inside.T @ B, 20.0 * noise
+        )
         margin &= step_margin.transformed(inside)
         if not lost.shape[1]:
             break
@@ -227,9 +231,14 @@ def unobservable(
     turns = np.round(apart.imag / (2.0 * np.pi))
     if ((turns != 0.0) & (np.abs(apart - 2j * np.pi * turns) < _ALIASED)).any():
         return None
-    none, empty = (ranks.Noisy.exact(np.zeros_like(m)) for m in (system.M, position.values))
+    none, empty = (
+        ranks.Noisy.exact(np.zeros_like(m)) for m in (system.M, position.values)
+    )
     rows = [[system.K, none], [none, system.K], [none, system.D], [empty, position]]
-    fast, slow = np.abs(velocity.values).max(initial=0.0), np.abs(position.values).max(initial=0.0)
+    fast, slow = (
+        np.abs(velocity.values).max(initial=0.0),
+        np.abs(position.values).max(initial=0.0),
+    )
     unit = 1.0
     if fast and slow:
         unit = slow / fast
@@ -243,7 +252,9 @@ def unobservable(
     decays: list[ranks.Decision] = []
     missed: list[tuple[complex, Values]] = []
     for start in starts:
-        shapes, pole, certain = _missed_shapes_at(system, position, velocity, complex(start))
+        shapes, pole, certain = _missed_shapes_at(
+            system, position, velocity, complex(start)
+        )
         if any(abs(pole - other) < _SAME_POLE * abs(pole) for other, _ in missed):
             continue
         margin &= certain
@@ -284,7 +295,9 @@ def unobservable(
 
 def _nearly_equal(poles: list[complex]) -> bool:
     """Return whether two of the poles, or a pole and its complex conjugate, nearly coincide."""
-    near = [abs(a - b) < _DEFECTIVE * abs(a) for i, a in enumerate(poles) for b in poles[:i]]
+    near = [
+        abs(a - b) < _DEFECTIVE * abs(a) for i, a in enumerate(poles) for b in poles[:i]
+    ]
     near += [0.0 < pole.imag < _DEFECTIVE * abs(pole) for pole in poles]
     return any(near)
 

@@ -52,7 +52,9 @@ def checked(lin: LinearModel) -> LinearModel:
             raise InputError(f"{name} of the model has entries that are not finite")
     # Orbital effects in A may be smaller than the rounding errors that a fast vibration causes.
     nv, size = len(lin.M), np.sqrt(lin.M.diagonal())
-    fastest = float((np.abs(rate_matrix(lin)[nv:, :nv]) * size[:, None] / size).max()) ** 0.5
+    fastest = (
+        float((np.abs(rate_matrix(lin)[nv:, :nv]) * size[:, None] / size).max()) ** 0.5
+    )
     if 0.0 < lin.mean_motion < _SLOWEST * fastest:
         warnings.warn(
             f"orbital effects on '{lin.robot}' at {lin.mean_motion:.3g} rad/s are smaller than "
@@ -77,7 +79,9 @@ def floating_inertia(M: Array, kept: Indices, others: Indices) -> Array:
     This matrix is the inertia of the coordinates `kept` if no force acts on the other coordinates.
     """
     across = M[np.ix_(others, kept)]
-    return M[np.ix_(kept, kept)] - across.T @ np.linalg.solve(M[np.ix_(others, others)], across)
+    return M[np.ix_(kept, kept)] - across.T @ np.linalg.solve(
+        M[np.ix_(others, others)], across
+    )
 
 
 @dataclass(frozen=True)
@@ -110,7 +114,10 @@ class SecondOrder:
         """Whether K and D are symmetric, and D is positive or negative semidefinite."""
         units = np.outer(self.size, self.size)
         for matrix in (self.K.values / units, self.D.values / units):
-            if np.abs(matrix - matrix.T).max(initial=0.0) > _SYMMETRIC * np.abs(matrix).max():
+            if (
+                np.abs(matrix - matrix.T).max(initial=0.0)
+                > _SYMMETRIC * np.abs(matrix).max()
+            ):
                 return False
         drag = np.linalg.eigvalsh(self.D.values / units)
         return bool(min(-drag.min(), drag.max()) <= _SYMMETRIC * np.abs(drag).max())
@@ -124,14 +131,18 @@ class SecondOrder:
         scale = 1.0 / self.size
         rigid, margin = ranks.null_space(ranks.stacked([[self.K], [self.D]]), scale)
         unloaded, other = ranks.null_space(self.K, scale)
-        part = self.restricted(ranks.null_space(ranks.Noisy.exact(rigid.T @ self.M), scale)[0])
+        part = self.restricted(
+            ranks.null_space(ranks.Noisy.exact(rigid.T @ self.M), scale)[0]
+        )
         r = len(part.M)
         L = np.linalg.inv(np.linalg.cholesky(part.M))
         K, D = L @ part.K.values @ L.T, L @ part.D.values @ L.T
         zeros = unloaded.shape[1] - rigid.shape[1]
         if D.any():
             fastest = max(np.linalg.norm(K, 2) ** 0.5, np.linalg.norm(D, 2))
-            A = np.block([[np.zeros((r, r)), np.eye(r)], [-K / fastest**2, -D / fastest]])
+            A = np.block(
+                [[np.zeros((r, r)), np.eye(r)], [-K / fastest**2, -D / fastest]]
+            )
             poles = np.linalg.eigvals(A) * fastest
         else:
             roots = np.sqrt(-np.linalg.eigvalsh((K + K.T) / 2.0).astype(complex))
@@ -155,18 +166,24 @@ def second_order(lin: LinearModel) -> SecondOrder:
     spread = 4.0 * nv * ranks.EPS * np.abs(rates)
     if lin.dt:
         # In a matrix exponential, each entry has the rounding error of the largest entry.
-        spread[:, : 2 * nv] += 4.0 * nv * ranks.EPS * np.abs(lin.A).max() / lin.dt * (X[nv:] != 0.0)
+        spread[:, : 2 * nv] += (
+            4.0 * nv * ranks.EPS * np.abs(lin.A).max() / lin.dt * (X[nv:] != 0.0)
+        )
     noise = np.abs(M) @ spread
     # In a spin, forces that balance each other leave rounding errors in K and D. If no other forces
     # act, the size of these errors cannot be seen in K and D. It is therefore estimated from
     # `spin`, the largest angular rate of the base and the joints.
-    turns = [x for x, unit in zip(lin.x0, lin.state_units, strict=True) if unit == "rad/s"]
+    turns = [
+        x for x, unit in zip(lin.x0, lin.state_units, strict=True) if unit == "rad/s"
+    ]
     spin = float(np.abs(turns).max(initial=0.0))
     units = _units_of_spin(lin, size)
     noise[:, :nv] += _OF_SPIN * np.outer(units, units) * spin**2
     noise[:, nv : 2 * nv] += _OF_SPIN * np.outer(units, units) * spin
     forces = ranks.Noisy(M @ rates, noise)
-    K, D, S = map(forces.columns, (slice(0, nv), slice(nv, 2 * nv), slice(2 * nv, None)))
+    K, D, S = map(
+        forces.columns, (slice(0, nv), slice(nv, 2 * nv), slice(2 * nv, None))
+    )
     # The norm of each column of S sets the threshold for the entries of this column.
     column_sizes = ranks.divisors(np.linalg.norm(S.values / size[:, None], axis=0))
     return SecondOrder(
@@ -182,7 +199,9 @@ def outputs_without_rounding(lin: LinearModel, C: Array | None = None) -> ranks.
     C = lin.C if C is None else C
     size = np.tile(np.sqrt(lin.M.diagonal()), 2)
     units = ranks.divisors(np.linalg.norm(C / size, axis=1))
-    return ranks.without_rounding(ranks.Noisy(C, 4.0 * ranks.EPS * np.abs(C)), units, size)
+    return ranks.without_rounding(
+        ranks.Noisy(C, 4.0 * ranks.EPS * np.abs(C)), units, size
+    )
 
 
 def _units_of_spin(lin: LinearModel, size: Array) -> Array:
@@ -258,7 +277,8 @@ class ConservedMomenta:
     # (r,): indices of the kept coordinates. If L1 x = L2 x = 0, these coordinates and their rates
     # determine all other states.
     kept: Indices
-    T: Array  # (nx, 2 r): maps kept coordinates and rates to the state, if L1 x = L2 x = 0
+    # (nx, 2 r): maps kept coordinates and rates to the state, if L1 x = L2 x = 0
+    T: Array
     margin: ranks.Margin  # margin of the rank decision on r
 
     @property
@@ -290,7 +310,9 @@ def conserved(lin: LinearModel) -> ConservedMomenta:
         coordinates = np.linalg.solve(X12.T, momenta.T).T
     else:
         wanted = np.hstack((momenta, np.zeros_like(momenta)))
-        coordinates = np.linalg.lstsq(np.hstack((X12, X11)).T, wanted.T, rcond=None)[0].T
+        coordinates = np.linalg.lstsq(np.hstack((X12, X11)).T, wanted.T, rcond=None)[
+            0
+        ].T
     error = np.hstack((coordinates @ X12 - momenta, coordinates @ X11))
     if np.abs(error).max(initial=0.0) > _CONSISTENT * np.abs(momenta).max(initial=0.0):
         pivots, W = pivots[:0], W[:0]
@@ -336,7 +358,10 @@ def momentum_names(lin: LinearModel, conserved: ConservedMomenta) -> tuple[str, 
     rest = "the joints" if only_joints and of_base else "the rest"
     return (
         *(combination(row, momenta, size) for row in conserved.weights),
-        *(f"{combination(row, driven, size)} with {rest} fixed" for row in conserved.weights),
+        *(
+            f"{combination(row, driven, size)} with {rest} fixed"
+            for row in conserved.weights
+        ),
     )
 
 
@@ -353,7 +378,9 @@ def grouped(names: tuple[str, ...]) -> list[str]:
     return [key.replace("\0", "/".join(axes)) for key, axes in groups.items()]
 
 
-def combination(weights: Array, names: tuple[str, ...], sizes: Array, most: int = 3) -> str:
+def combination(
+    weights: Array, names: tuple[str, ...], sizes: Array, most: int = 3
+) -> str:
     """Format a linear combination of names.
 
     At most `most` terms are written, those with the largest ``abs(weights) * sizes``. The other
@@ -362,7 +389,11 @@ def combination(weights: Array, names: tuple[str, ...], sizes: Array, most: int 
     shares = np.abs(weights) * sizes
     largest = float(shares.max())
     # Rounding must not decide the order of terms of the same size.
-    order = [i for i in np.argsort(-np.round(shares / largest, 6), kind="stable") if weights[i]]
+    order = [
+        i
+        for i in np.argsort(-np.round(shares / largest, 6), kind="stable")
+        if weights[i]
+    ]
     weights = weights * np.sign(weights[order[0]])
     shown = [i for i in order if abs(weights[i]) * sizes[i] > 1e-6 * largest]
     terms: list[str] = []
@@ -408,5 +439,7 @@ def shape(lin: LinearModel, at: Values) -> str:
     largest = at[int(np.abs(at * size).argmax())]
     of_base = {"omega_b": "rotation about ", "v_b": "translation along "}
     pairs = (name.partition(".") for name in lin.state_names[len(lin.M) :])
-    names = tuple(of_base.get(group, "") + (member or group) for group, _, member in pairs)
+    names = tuple(
+        of_base.get(group, "") + (member or group) for group, _, member in pairs
+    )
     return combination(np.real(at / largest), names, size)

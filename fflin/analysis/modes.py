@@ -265,9 +265,13 @@ class Modes:
             name = next(iter(mode.strain), "")
             if name in clamped and mode.frequency > least:
                 percents = _percents(mode.strain, 60)
-                rows.append([f"{mode.frequency:.6g}", f"{clamped[name]:.6g}", name, percents])
+                rows.append(
+                    [f"{mode.frequency:.6g}", f"{clamped[name]:.6g}", name, percents]
+                )
         of_masses = [["mode", "clamped", *"xyz", "xx", "yy", "zz"]]
-        for name, parts in effective_shares(robot._bare.model, robot.appendages).items():
+        for name, parts in effective_shares(
+            robot._bare.model, robot.appendages
+        ).items():
             cells = [f"{100.0 * part:.1f}" if part > 1e-12 else "." for part in parts]
             frequency = f"{clamped[name]:.6g}" if name in clamped else "."
             of_masses.append([name, frequency, *cells])
@@ -329,7 +333,9 @@ def modes(lin: LinearModel) -> Modes:
     """
     lin = checked(lin)
     if lin.dt:
-        raise InputError(f"the model is sampled at dt = {lin.dt:g} s; give the continuous model")
+        raise InputError(
+            f"the model is sampled at dt = {lin.dt:g} s; give the continuous model"
+        )
     nv, inertia = len(lin.M), np.sqrt(lin.M.diagonal())
     # If the input forces u0 cancel each other, their rounding errors remain in the derivatives of
     # the accelerations with respect to the positions. Derivatives that are no larger than these
@@ -343,7 +349,9 @@ def modes(lin: LinearModel) -> Modes:
     turning = max(float(rates[nv:, nv:].max()), float(rates[:nv, :nv].max()))
     fastest = max(float(rates[nv:, :nv].max()) ** 0.5, turning) or 1.0
     weight = np.concatenate((fastest * inertia, inertia))
-    pairs, rigid_body = nonzero_eigenpairs(weight[:, None] * A / weight / fastest, _NO_STIFFNESS)
+    pairs, rigid_body = nonzero_eigenpairs(
+        weight[:, None] * A / weight / fastest, _NO_STIFFNESS
+    )
     # Pole, shape and margin of each mode
     eigenmodes: list[tuple[complex, Complex, float]] = []
     residual = 0.0
@@ -355,7 +363,9 @@ def modes(lin: LinearModel) -> Modes:
         pole = complex(growth, scaled_pole.imag) * fastest
         shape = vector / weight
         left = weight * (A @ shape - pole * shape) / fastest
-        residual = max(residual, float(np.linalg.norm(left) / np.linalg.norm(weight * shape)))
+        residual = max(
+            residual, float(np.linalg.norm(left) / np.linalg.norm(weight * shape))
+        )
         # A shape is scaled by its largest coordinate. If several coordinates are equally large, as
         # for symmetric panels, the shape is scaled by the first of them.
         positions = np.abs(shape[:nv])
@@ -369,7 +379,9 @@ def modes(lin: LinearModel) -> Modes:
     energies = energies_of(lin._robot, lin, shapes)
     listed = [
         Mode(pole, shape, margin > 1.0, margin, energy, strain)
-        for (pole, shape, margin), (energy, strain) in zip(eigenmodes, energies, strict=True)
+        for (pole, shape, margin), (energy, strain) in zip(
+            eigenmodes, energies, strict=True
+        )
     ]
     return Modes(
         tuple(sorted(listed, key=lambda mode: (abs(mode.pole), mode.pole.real))),
@@ -389,7 +401,9 @@ def _percents(energy: Mapping[str, float], room: int) -> str:
 
     The list is shortened until it fits into `room` characters.
     """
-    words = [f"{body} {100.0 * part:.0f} %" for body, part in energy.items() if part >= 0.01]
+    words = [
+        f"{body} {100.0 * part:.0f} %" for body, part in energy.items() if part >= 0.01
+    ]
     text = ""
     for count in range(len(words), 0, -1):
         left = sum(list(energy.values())[count:])
@@ -425,7 +439,9 @@ def energies_of(
     # The inertia of a link without its balls is not physically realisable, and its energy alone may
     # be negative. So the energies of all balls and liquids are added to the energy of their link.
     carriers = mode_carriers(robot)
-    owners = np.array([carriers.get(i, i) for i in range(ROOT, robot.model.njoints)]) - ROOT
+    owners = (
+        np.array([carriers.get(i, i) for i in range(ROOT, robot.model.njoints)]) - ROOT
+    )
     kinetic = np.zeros_like(terms)
     sizes = np.zeros_like(terms)
     np.add.at(kinetic, owners, terms)
@@ -441,7 +457,9 @@ def energies_of(
         energy = {names[i]: float(parts[i]) for i in order if i in bodies}
         parts = of_springs / (of_springs.sum() or 1.0)
         order = np.argsort(-parts, kind="stable").tolist()
-        strain = {robot.joint_names[i]: float(parts[i]) for i in order if parts[i] > 0.0}
+        strain = {
+            robot.joint_names[i]: float(parts[i]) for i in order if parts[i] > 0.0
+        }
         fractions.append((energy, strain))
     return fractions
 
@@ -477,7 +495,9 @@ def _energies(robot: Robot, q: Array, v: Array) -> Array:
     for index in range(ROOT, model.njoints):
         body = model.inertias[index]
         rates = v[model.idx_vs[index] : model.idx_vs[index] + model.nvs[index]]
-        armature = model.armature[model.idx_vs[index] : model.idx_vs[index] + model.nvs[index]]
+        armature = model.armature[
+            model.idx_vs[index] : model.idx_vs[index] + model.nvs[index]
+        ]
         twist = twists[index]
         twist[:] = np.asarray(data.joints[index].S).reshape(6, -1) @ rates
         twist += data.liMi[index].toActionMatrixInverse() @ twists[model.parents[index]]
@@ -504,7 +524,9 @@ def nonzero_eigenpairs(
     n = len(A)
     whole = A
     size = float(np.linalg.norm(A))
-    nullity = n - int(np.count_nonzero(np.linalg.svd(A, compute_uv=False) > n * tolerance))
+    nullity = n - int(
+        np.count_nonzero(np.linalg.svd(A, compute_uv=False) > n * tolerance)
+    )
     steps: list[Array] = []
     while len(A):
         used = A.any(axis=0)

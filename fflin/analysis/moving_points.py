@@ -101,7 +101,9 @@ def _clearly_pushed(lin: LinearModel) -> bool:
     units = np.sqrt(lin.M.diagonal())[:, None]
     forces = (lin.M @ source.B[nv:]) / units
     linear = [name.startswith("v_b.") for name in lin.state_names[nv:]]
-    return bool((np.abs(forces[linear]) > _CERTAIN * np.linalg.norm(forces, axis=0)).any())
+    return bool(
+        (np.abs(forces[linear]) > _CERTAIN * np.linalg.norm(forces, axis=0)).any()
+    )
 
 
 def unobserved(lin: LinearModel, C: Array | None = None) -> Array:
@@ -126,7 +128,11 @@ def unobserved(lin: LinearModel, C: Array | None = None) -> Array:
     if not IN_REFERENCE_AXES[lin.frame][0]:
         groups.append("q_b")
     for group in groups:
-        members = [i for i, name in enumerate(lin.state_names) if name.partition(".")[0] == group]
+        members = [
+            i
+            for i, name in enumerate(lin.state_names)
+            if name.partition(".")[0] == group
+        ]
         if len(members) != 3 or shown[:, members].any():
             break
         motions = np.hstack((motions, np.eye(nx)[:, members]))

@@ -77,9 +77,13 @@ class Observability(RankAnalysis):
         lines = list[str]()
         if self.unobservable:
             lines.append(f"unobservable: {', '.join(self.unobservable)}")
-        parts = ("position", "velocity", "attitude")[: (len(self.basis) - self.bound) // 3]
+        parts = ("position", "velocity", "attitude")[
+            : (len(self.basis) - self.bound) // 3
+        ]
         limit = f"no output depends on the {listed(parts)} of the base"
-        return self._summary("observable", limit, verdict(self.detectable, "detectable"), lines)
+        return self._summary(
+            "observable", limit, verdict(self.detectable, "detectable"), lines
+        )
 
 
 def observability(lin: LinearModel | LinearTrajectory) -> Observability:
@@ -187,9 +191,12 @@ def _in_motion(lin: LinearModel) -> Observability:
         )
     known = moving_points.unobserved(lin)
     X = mechanics.rate_matrix(lin)
-    _, others, _, fixed = split_by_poles(X, lin.C.T, lin.M, lin.dt, known=known.T, dual=True)
+    _, others, _, fixed = split_by_poles(
+        X, lin.C.T, lin.M, lin.dt, known=known.T, dual=True
+    )
     motions = np.hstack((known, others))
-    fixed = fixed._replace(settling=Margin())  # the frozen poles do not decide about decay
+    # the frozen poles do not decide about decay
+    fixed = fixed._replace(settling=Margin())
     undecided = mechanics.undecided(lin, fixed, "observable", nx - motions.shape[1])
     detectable = False if known.shape[1] else None
     return _result(
@@ -279,7 +286,9 @@ def lasting_motions(lin: LinearModel, analysis: Observability) -> tuple[str, ...
     if motions.shape[1] in (0, len(F)):
         return analysis.unobservable
     lasts, _ = echelon(analysis.basis @ motions, size)
-    return tuple(mechanics.combination(column, lin.state_names, size) for column in lasts.T)
+    return tuple(
+        mechanics.combination(column, lin.state_names, size) for column in lasts.T
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -388,13 +397,17 @@ def _gramian(A: Array, Q: Array, dt: float, duration: float | None) -> Array:
     if duration is None:
         from scipy.linalg import solve_continuous_lyapunov, solve_discrete_lyapunov
 
-        W: Array = solve_discrete_lyapunov(A, Q) if dt else solve_continuous_lyapunov(A, -Q)
+        W: Array = (
+            solve_discrete_lyapunov(A, Q) if dt else solve_continuous_lyapunov(A, -Q)
+        )
         return W
     if not dt:
         return held_cost(A.T, Q, duration)
     steps = round(duration / dt)
     if not steps or abs(steps * dt - duration) > 1e-9 * duration:
-        raise InputError(f"duration is {duration:g} s, expected a multiple of dt = {dt:g} s")
+        raise InputError(
+            f"duration is {duration:g} s, expected a multiple of dt = {dt:g} s"
+        )
     # Sum A^k Q (A^k)^T over k < steps by repeated doubling.
     total, power = np.zeros_like(Q), np.eye(len(A))
     while steps:

@@ -40,7 +40,8 @@ class Decision(NamedTuple):
 
     ratio: float
     at: Values  # singular vector
-    states: int = 1  # states affected: 2 for a pair of poles, or for a momentum and its coordinate
+    # states affected: 2 for a pair of poles, or for a momentum and its coordinate
+    states: int = 1
 
 
 class Margin(NamedTuple):
@@ -51,12 +52,16 @@ class Margin(NamedTuple):
     @property
     def kept(self) -> float:
         """Smallest singular value counted as nonzero, relative to its tolerance."""
-        return min((one.ratio for one in self.decisions if one.ratio > 1.0), default=np.inf)
+        return min(
+            (one.ratio for one in self.decisions if one.ratio > 1.0), default=np.inf
+        )
 
     @property
     def dropped(self) -> float:
         """Largest singular value counted as zero, relative to its tolerance."""
-        return max((one.ratio for one in self.decisions if one.ratio <= 1.0), default=0.0)
+        return max(
+            (one.ratio for one in self.decisions if one.ratio <= 1.0), default=0.0
+        )
 
     def __and__(self, other: Margin) -> Margin:
         return Margin(self.decisions + other.decisions)
@@ -84,11 +89,15 @@ class Margin(NamedTuple):
         If the rank is decided the other way, the number of controllable or observable states
         changes by `change`.
         """
-        counted = [decision for decision in self.decisions if decision.ratio == self.kept < CLEAR][
-            :1
-        ]
+        counted = [
+            decision
+            for decision in self.decisions
+            if decision.ratio == self.kept < CLEAR
+        ][:1]
         left_out = [
-            decision for decision in self.decisions if decision.ratio == self.dropped > LOST
+            decision
+            for decision in self.decisions
+            if decision.ratio == self.dropped > LOST
         ][:1]
         return (*((ratio, at, -states) for ratio, at, states in counted), *left_out)
 
@@ -123,7 +132,9 @@ class RankAnalysis(FrozenArrays):
         `limit` is the reason why `bound` is less than the number of states.
         """
         nx = len(self.basis)
-        head = f"{self.robot}: {self.dimension} of {nx} states are {what} ({self.method})"
+        head = (
+            f"{self.robot}: {self.dimension} of {nx} states are {what} ({self.method})"
+        )
         frozen = "the matrices frozen at this point, which the robot leaves"
         if self.method == GRAMIAN:
             head = (
@@ -136,7 +147,9 @@ class RankAnalysis(FrozenArrays):
                 f"{self.dimension} of these {self.bound} by {frozen}"
             )
         elif self.method == FROZEN:
-            head = f"{self.robot}: {self.dimension} of {nx} states are {what} by {frozen}"
+            head = (
+                f"{self.robot}: {self.dimension} of {nx} states are {what} by {frozen}"
+            )
         notes = (f"note: {note}" for note in self.notes)
         return folded([f"{head}; {decays}", *lines, *notes])
 
@@ -197,7 +210,9 @@ def without_rounding(forces: Noisy, rows: Array, columns: Array) -> Noisy:
     size = np.abs(forces.values)
     least = np.maximum(forces.noise, _FLOOR * (size / units).max(initial=0.0) * units)
     real = size > _ROUNDING * least
-    noise = np.where(size < CLEAR * least, np.maximum(forces.noise, least / SAFETY), forces.noise)
+    noise = np.where(
+        size < CLEAR * least, np.maximum(forces.noise, least / SAFETY), forces.noise
+    )
     return Noisy(np.where(real, forces.values, 0.0), np.where(real, noise, 0.0))
 
 
@@ -237,10 +252,14 @@ def divisors(sizes: Array) -> Array:
 def judged(ratios: Array, vectors: Values, rank: int, states: int = 1) -> Margin:
     """Return the margin of a rank; `ratios` are singular values divided by their tolerance."""
     near = range(max(rank - 1, 0), min(rank + 1, len(ratios)))
-    return Margin(tuple(Decision(float(ratios[i]), vectors[:, i], states) for i in near))
+    return Margin(
+        tuple(Decision(float(ratios[i]), vectors[:, i], states) for i in near)
+    )
 
 
-def null_space(matrix: Noisy, scale: Array | float = 1.0, states: int = 1) -> tuple[Array, Margin]:
+def null_space(
+    matrix: Noisy, scale: Array | float = 1.0, states: int = 1
+) -> tuple[Array, Margin]:
     """Return a basis (n, k) of the null space, and the margin of its dimension.
 
     The basis vectors are ``scale * y`` with orthonormal vectors y (n,).

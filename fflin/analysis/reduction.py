@@ -103,7 +103,9 @@ class ReducedModel(LinearModel):
         )
 
 
-def momentum_reduction(lin: LinearModel, *, wheel_speeds: bool | None = None) -> ReducedModel:
+def momentum_reduction(
+    lin: LinearModel, *, wheel_speeds: bool | None = None
+) -> ReducedModel:
     r"""Remove the conserved momenta from a model, exactly.
 
     A momentum :math:`W M \nu` is conserved if no input, spring or damper changes it. If its initial
@@ -196,7 +198,9 @@ def momentum_reduction(lin: LinearModel, *, wheel_speeds: bool | None = None) ->
             lin, FixedPoles(margin=momenta.margin), "kept by the reduction", len(z)
         ),
     )
-    return certified(reduced, whole, partial(momentum_reduction, wheel_speeds=wheel_speeds))
+    return certified(
+        reduced, whole, partial(momentum_reduction, wheel_speeds=wheel_speeds)
+    )
 
 
 def _require_coordinates(lin: LinearModel, momenta: mechanics.ConservedMomenta) -> None:
@@ -207,7 +211,9 @@ def _require_coordinates(lin: LinearModel, momenta: mechanics.ConservedMomenta) 
     """
     if not lin.v.any() or len(momenta.weights) >= 6:
         return
-    names = tuple(name for name in moving_points.conserved(lin).names if "momentum" in name)
+    names = tuple(
+        name for name in moving_points.conserved(lin).names if "momentum" in name
+    )
     if len(names) > len(momenta.weights):
         raise InputError(
             f"no input can change {listed(mechanics.grouped(names))}, but the robot moves at the "
@@ -249,12 +255,16 @@ def generalized_inertia(lin: LinearModel) -> Array:
     lin = mechanics.checked(lin)
     joints = sum(name.startswith("q_m.") for name in lin.state_names)
     if len(lin.A) != 12 + 2 * joints:
-        raise InputError("the model lacks the states of the base; give the unreduced model")
+        raise InputError(
+            "the model lacks the states of the base; give the unreduced model"
+        )
     inertia = mechanics.floating_inertia(lin.M, np.arange(6, 6 + joints), np.arange(6))
     return (inertia + inertia.T) / 2.0
 
 
-def generalized_jacobian(robot: Robot, q: Array | None = None, frame: str = "") -> Array:
+def generalized_jacobian(
+    robot: Robot, q: Array | None = None, frame: str = ""
+) -> Array:
     r"""Return the generalized Jacobian from joint rates to a frame's velocity.
 
     This Jacobian is valid if the base is free and the momentum of the robot is zero.
@@ -323,7 +333,9 @@ def ignorable_wheels(lin: LinearModel) -> tuple[Indices, Indices]:
     if not len(at):
         return at, at
     system = mechanics.second_order(lin.generator or lin)
-    angle, speed = (~matrix.values[:, at].any(axis=0) for matrix in (system.K, system.D))
+    angle, speed = (
+        ~matrix.values[:, at].any(axis=0) for matrix in (system.K, system.D)
+    )
     return at[angle], at[angle & speed]
 
 
@@ -336,17 +348,23 @@ def removed_wheels(lin: LinearModel, wheel_speeds: bool | None) -> Indices:
     # is false, all wheels in `free` are removed. By default, `wheel_speeds` is true if an input,
     # such as a thruster, exerts a torque on the whole robot.
     if wheel_speeds is not None and not isinstance(wheel_speeds, bool | np.bool_):
-        raise InputError(f"wheel_speeds is {wheel_speeds!r}, expected True, False or None")
+        raise InputError(
+            f"wheel_speeds is {wheel_speeds!r}, expected True, False or None"
+        )
     _, free = ignorable_wheels(lin)
     if len(free) and wheel_speeds is None:
         turning = [name.startswith("q_b.") for name in lin.state_names[: len(lin.M)]]
-        wheel_speeds = bool(mechanics.second_order(lin.generator or lin).S.values[turning].any())
+        wheel_speeds = bool(
+            mechanics.second_order(lin.generator or lin).S.values[turning].any()
+        )
     if not len(free) or not wheel_speeds:
         return free
     forces = rigid_forces(without(lin.generator or lin, free))
     sizes = divisors(np.linalg.norm(forces.values, axis=0))
     idle = null_space(forces @ np.diag(1.0 / sizes))[0]
-    motors = [motor_of(lin.input_names, lin.state_names[i].removeprefix("q_m.")) for i in free]
+    motors = [
+        motor_of(lin.input_names, lin.state_names[i].removeprefix("q_m.")) for i in free
+    ]
     # A wheel without a motor has a zero row: no combination of inputs spins it alone.
     torques = np.zeros((len(free), idle.shape[1]))
     for row, motor in enumerate(motors):
@@ -373,7 +391,9 @@ def regulated_part(lin: LinearModel, wheel_speeds: bool | None = None) -> Linear
             "wheel speeds would be the only states of the reduced model; remove the damping of "
             "the wheels"
         )
-    return selected(lin, rest, part.M, partial(regulated_part, wheel_speeds=wheel_speeds))
+    return selected(
+        lin, rest, part.M, partial(regulated_part, wheel_speeds=wheel_speeds)
+    )
 
 
 def unpushed_positions(lin: LinearModel) -> Indices:
@@ -408,7 +428,11 @@ def rigid_forces(body: LinearModel) -> Noisy:
     motions, _ = null_space(system.K.T, 1.0 / system.size)
     forces = system.S.after(motions.T)
     # Rounding leaves a small part of every coordinate in each motion.
-    rounding = len(motions) * EPS * (np.abs(system.S.values) / system.size[:, None]).sum(axis=0)
+    rounding = (
+        len(motions)
+        * EPS
+        * (np.abs(system.S.values) / system.size[:, None]).sum(axis=0)
+    )
     return forces._replace(noise=forces.noise + rounding)
 
 
@@ -429,7 +453,9 @@ def without(lin: LinearModel, removed: Indices) -> LinearModel:
     return selected(replace(lin, A=A), names, rest, partial(without, removed=removed))
 
 
-def selected(lin: LinearModel, names: Sequence[str], M: Array, make: Make) -> LinearModel:
+def selected(
+    lin: LinearModel, names: Sequence[str], M: Array, make: Make
+) -> LinearModel:
     """Return the model with the named states, inertia M, and only the outputs of these states."""
     S = selection(names, lin.state_names)
     seen, values = outputs_of(lin, S), part_of(lin, S, S.T, M)
@@ -458,7 +484,9 @@ def part_of(lin: LinearModel, S: Array, T: Array, M: Array) -> dict[str, object]
         "x0": S @ lin.x0,
         "state_names": names,
         "state_units": tuple(lin.state_units[i] for i in S.argmax(axis=1)),
-        "_ignorable": partial(given, tuple(name for name in names if name in lin.ignorable)),
+        "_ignorable": partial(
+            given, tuple(name for name in names if name in lin.ignorable)
+        ),
         "_wheels": partial(given, lin.wheels),
         "drift": None if lin.drift is None else S @ lin.drift,
         "_inertia": partial(given, frozen(M)),

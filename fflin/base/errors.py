@@ -232,7 +232,10 @@ class SweepError(FflinError, RuntimeError):
     """
 
     def __init__(
-        self, message: str, failed: tuple[tuple[int, int, str], ...] = (), batch: object = None
+        self,
+        message: str,
+        failed: tuple[tuple[int, int, str], ...] = (),
+        batch: object = None,
     ) -> None:
         super().__init__(message)
         self.failed, self.batch = failed, batch

@@ -21,7 +21,16 @@ else:
 
 FORMATS = (".png", ".pdf", ".svg")
 
-COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#8a6d3b")
+COLORS = (
+    "#0072b2",
+    "#d55e00",
+    "#009e73",
+    "#cc79a7",
+    "#e69f00",
+    "#56b4e9",
+    "#000000",
+    "#8a6d3b",
+)
 _STYLE = Path(__file__).parent / "assets" / "figures.mplstyle"
 
 
@@ -40,7 +49,9 @@ def letters_of(count: float, height: float) -> float:
     return min(8.0, 0.75 * height / max(1, count))
 
 
-def logarithmic(axes: Axes, axis: Literal["x", "y"], values: Array, unit: float) -> None:
+def logarithmic(
+    axes: Axes, axis: Literal["x", "y"], values: Array, unit: float
+) -> None:
     """Set a symmetric logarithmic scale on an axis if the magnitudes of `values` span a decade.
 
     Magnitudes up to 1e-9 times `unit` are ignored.
@@ -94,7 +105,9 @@ def _in_place_of(axes: object) -> Figure:
         spec = axes.get_subplotspec()
     if not isinstance(axes, GivenAxes) or spec is None:
         kind = type(axes).__name__
-        raise InputError(f"axes has type {kind}, expected matplotlib axes, as of pyplot.subplots")
+        raise InputError(
+            f"axes has type {kind}, expected matplotlib axes, as of pyplot.subplots"
+        )
     owner: Any = axes.figure
     root: Any = axes.get_figure(root=True)
     if root.get_layout_engine() is None:

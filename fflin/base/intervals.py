@@ -36,7 +36,9 @@ def clopper_pearson(successes: int, count: int, confidence: float) -> Estimate:
     return Estimate(fraction, float(low), float(high))
 
 
-def until_failure(failed: Array, confidence: float) -> tuple[int, float, tuple[float, float]]:
+def until_failure(
+    failed: Array, confidence: float
+) -> tuple[int, float, tuple[float, float]]:
     """Return success statistics of N runs.
 
     `failed` (N,) is true for each failed run. The runs must be sorted by increasing initial
@@ -71,7 +73,9 @@ def quantile(values: Array, p: float, confidence: float) -> Estimate:
     tail = (1.0 - confidence) / 2.0
     low, high = np.searchsorted(below, (tail, 1.0 - tail)).tolist()
     middle = min(max(math.ceil(p * count), 1), count)
-    return Estimate(*map(float, (ordered[middle], ordered[low], ordered[min(high, count) + 1])))
+    return Estimate(
+        *map(float, (ordered[middle], ordered[low], ordered[min(high, count) + 1]))
+    )
 
 
 def mean(values: Array, confidence: float) -> Estimate:

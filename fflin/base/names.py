@@ -41,7 +41,9 @@ def input_keys(model: Any) -> tuple[str, ...]:
 
 def state_keys(joints: Sequence[str]) -> tuple[str, ...]:
     """Return the names of the 12 + 2 n states for n joints: first positions, then velocities."""
-    groups = dict(q_b="xyz", r_b="xyz", q_m=joints, omega_b="xyz", v_b="xyz", qdot_m=joints)
+    groups = dict(
+        q_b="xyz", r_b="xyz", q_m=joints, omega_b="xyz", v_b="xyz", qdot_m=joints
+    )
     return tuple(f"{group}.{name}" for group, names in groups.items() for name in names)
 
 
@@ -53,7 +55,9 @@ def runs(names: Sequence[str], units: Sequence[str]) -> list[tuple[int, int, str
     """
     blocks: list[tuple[int, int, str, list[str]]] = []
     for i, (name, unit) in enumerate(zip(names, units, strict=True)):
-        group = name.partition(".")[0] if name.count(".") == 1 else name.rpartition(".")[0]
+        group = (
+            name.partition(".")[0] if name.count(".") == 1 else name.rpartition(".")[0]
+        )
         first = i
         block_units = [unit]
         if blocks and blocks[-1][2] == group and (group or unit in blocks[-1][3]):
@@ -61,7 +65,8 @@ def runs(names: Sequence[str], units: Sequence[str]) -> list[tuple[int, int, str
             block_units = list(dict.fromkeys((*block_units, unit)))
         blocks.append((first, i, group, block_units))
     return [
-        (first, last, group, "|".join(block_units)) for first, last, group, block_units in blocks
+        (first, last, group, "|".join(block_units))
+        for first, last, group, block_units in blocks
     ]
 
 
@@ -74,16 +79,22 @@ def matching(kind: str, key: str, names: Sequence[str]) -> list[int]:
         return [names.index(key)]
     # If the pattern matches no whole name, it is compared with the part of each name after its
     # first dot. Only * and ? are wildcards, because joint names may contain brackets.
-    pattern = re.compile(re.escape(str(key)).replace(r"\*", ".*").replace(r"\?", "."), re.DOTALL)
+    pattern = re.compile(
+        re.escape(str(key)).replace(r"\*", ".*").replace(r"\?", "."), re.DOTALL
+    )
     of_group = [i for i, name in enumerate(names) if group_of(name) == key]
     indices = of_group or [i for i, name in enumerate(names) if pattern.fullmatch(name)]
     if not indices:
-        indices = [i for i, n in enumerate(names) if pattern.fullmatch(n.partition(".")[2])]
+        indices = [
+            i for i, n in enumerate(names) if pattern.fullmatch(n.partition(".")[2])
+        ]
         groups = list(dict.fromkeys(group_of(names[i]) for i in indices))
         if len(groups) > 1:
             written = " or ".join(f"{group}.{key}" for group in groups)
             fits = ", ".join(groups)
-            raise InputError(f"{kind} '{key}' is ambiguous: it is in {fits}; write {written}")
+            raise InputError(
+                f"{kind} '{key}' is ambiguous: it is in {fits}; write {written}"
+            )
     if not indices:
         known = dict.fromkeys((*filter(None, map(group_of, names)), *names))
         raise unknown(kind, key, known)
@@ -118,14 +129,18 @@ def by_name(kind: str, values: Mapping[str, T], names: Sequence[str]) -> dict[in
     return value_of_index
 
 
-def rates_by_name(joints: Sequence[str], values: Mapping[str, float]) -> dict[str, float]:
+def rates_by_name(
+    joints: Sequence[str], values: Mapping[str, float]
+) -> dict[str, float]:
     """Return {velocity state: rate}; `values` has joints, states, groups or patterns as keys."""
     names = state_keys(joints)[6 + len(joints) :]
     full = {}
     for key, value in values.items():
         name = f"qdot_m.{key}" if key in joints else key
         full[name] = value
-    return {names[index]: value for index, value in by_name("velocity", full, names).items()}
+    return {
+        names[index]: value for index, value in by_name("velocity", full, names).items()
+    }
 
 
 def chosen(kind: str, keys: Sequence[str], names: Sequence[str]) -> list[int]:
@@ -134,15 +149,22 @@ def chosen(kind: str, keys: Sequence[str], names: Sequence[str]) -> list[int]:
 
 
 def joints_by_name(
-    kind: str, values: Mapping[str, T], joints: Sequence[str], find: Callable[[str], object]
+    kind: str,
+    values: Mapping[str, T],
+    joints: Sequence[str],
+    find: Callable[[str], object],
 ) -> dict[str, T]:
     """Return {joint: value} from {joint, pattern or ``q_m``: value}.
 
     `find` must raise an error for an invalid joint name.
     """
-    many = {key: value for key, value in values.items() if key == "q_m" or _is_pattern(key)}
+    many = {
+        key: value for key, value in values.items() if key == "q_m" or _is_pattern(key)
+    }
     states = [f"q_m.{name}" for name in joints]
-    value_of_joint = {joints[i]: value for i, value in by_name(kind, many, states).items()}
+    value_of_joint = {
+        joints[i]: value for i, value in by_name(kind, many, states).items()
+    }
     for key, value in values.items():
         if key not in many:
             find(name := str(key).removeprefix("q_m."))

@@ -88,14 +88,22 @@ class Progress:
 
 def import_path_without(*folders: str | os.PathLike[str]) -> list[str]:
     """Return `sys.path` without the entries that lead to the given folders."""
-    return [entry for entry in sys.path if not any(same_file(entry, folder) for folder in folders)]
+    return [
+        entry
+        for entry in sys.path
+        if not any(same_file(entry, folder) for folder in folders)
+    ]
 
 
 def memory() -> float:
     """Return the size of the machine's memory [bytes], or infinity if it is unknown."""
     try:
         return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
-    except (AttributeError, ValueError, OSError):  # this system does not report the size
+    except (
+        AttributeError,
+        ValueError,
+        OSError,
+    ):  # this system does not report the size
         return math.inf
 
 

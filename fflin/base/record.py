@@ -56,7 +56,9 @@ _MAT_TEXT, _MAT_CHECKSUM = 116, b"MATLAB 5.0 MAT-file, by fflin, sha256 "
 _MAT_NEARLY = re.compile(rb"[0-9a-f]{64}|, by fflin", re.IGNORECASE)
 
 
-def write_record(path: Path, record: Mapping[str, object], *, checksummed: bool) -> None:
+def write_record(
+    path: Path, record: Mapping[str, object], *, checksummed: bool
+) -> None:
     """Write a record in the format of the path's ending, with a digest if `checksummed`."""
     writing.check_ending(path, writing.RECORDS)
     require_finite(record)
@@ -88,9 +90,13 @@ def reading(path: Path, what: str) -> Iterator[None]:
         raise FileError(f"{path}: No such file{writing.missing(path)}") from None
     except Exception as error:  # each decoder raises its own types of errors
         if isinstance(error, MemoryError) or getattr(error, "errno", None) == ENOMEM:
-            raise FileError(f"{writing.shown(path)}: does not fit into memory") from None
+            raise FileError(
+                f"{writing.shown(path)}: does not fit into memory"
+            ) from None
         why = writing.reason(error)
-        raise FileError(f"{writing.shown(path)}: not a {what} saved by fflin ({why})") from None
+        raise FileError(
+            f"{writing.shown(path)}: not a {what} saved by fflin ({why})"
+        ) from None
 
 
 def require_finite(record: Mapping[str, object]) -> None:
@@ -156,14 +162,20 @@ def content_digest(entries: Mapping[str, object]) -> str:
             blocks = [data[at : at + _BLOCK] for at in range(0, len(data), _BLOCK)]
             # hashlib releases the interpreter lock, so threads hash the blocks in parallel.
             run = pool.map if len(blocks) > 1 else map
-            digest.update(b"".join(run(lambda block: hashlib.sha256(block).digest(), blocks)))
+            digest.update(
+                b"".join(run(lambda block: hashlib.sha256(block).digest(), blocks))
+            )
     return digest.hexdigest()
 
 
 def _to_npz(record: Mapping[str, object], checksummed: bool) -> bytes:
     buffer = io.BytesIO()
-    groups = {k: json.dumps(group) for k, group in record.items() if isinstance(group, dict)}
-    plain: dict[str, Any] = {key: np.asarray(value) for key, value in {**record, **groups}.items()}
+    groups = {
+        k: json.dumps(group) for k, group in record.items() if isinstance(group, dict)
+    }
+    plain: dict[str, Any] = {
+        key: np.asarray(value) for key, value in {**record, **groups}.items()
+    }
     if checksummed:
         plain[CHECKSUM] = content_digest(plain)
     np.savez(buffer, **plain)
@@ -194,7 +206,9 @@ def _to_mat(record: Mapping[str, object], checksummed: bool) -> bytes:
     from scipy.io import savemat
 
     buffer = io.BytesIO()
-    cells = {k: np.array(v, dtype=object) for k, v in record.items() if isinstance(v, list)}
+    cells = {
+        k: np.array(v, dtype=object) for k, v in record.items() if isinstance(v, list)
+    }
     savemat(buffer, {**record, **cells}, oned_as="column")
     body = buffer.getvalue()[_MAT_TEXT:]
     head = b"MATLAB 5.0 MAT-file"
@@ -214,9 +228,13 @@ def _from_mat(content: bytes) -> tuple[Record, bool]:
     elif _MAT_NEARLY.search(content[:_MAT_TEXT]):
         raise ValueError("its header was damaged or edited")
     if content[124:128] not in (b"\0\1IM", b"\1\0MI"):
-        raise ValueError(f"{_other_format(content)}; save it with save -v7 (MATLAB and Octave)")
+        raise ValueError(
+            f"{_other_format(content)}; save it with save -v7 (MATLAB and Octave)"
+        )
     _require_room(_unpacked_size(content))
-    record = {key: _of_mat(value) for key, value in loadmat(io.BytesIO(content)).items()}
+    record = {
+        key: _of_mat(value) for key, value in loadmat(io.BytesIO(content)).items()
+    }
     return {key: value for key, value in record.items() if key[:2] != "__"}, checksummed
 
 
@@ -299,7 +317,10 @@ def _to_json(record: Mapping[str, object], checksummed: bool) -> bytes:
             return value.tolist()
         return value
 
-    lines = (f"{json.dumps(k)}: {json.dumps(plain(v), allow_nan=False)}" for k, v in record.items())
+    lines = (
+        f"{json.dumps(k)}: {json.dumps(plain(v), allow_nan=False)}"
+        for k, v in record.items()
+    )
     body = ("{\n" + ",\n".join(lines)).encode()
     if checksummed:
         checksum = hashlib.sha256(body).hexdigest()
@@ -318,7 +339,9 @@ def _from_json(content: bytes) -> tuple[Record, bool]:
             )
     record: Record = json.loads(content)
     if record.pop(CHECKSUM, None) is not None and not checksum:
-        raise ValueError(f"its entry {CHECKSUM} is not written by fflin; delete this entry")
+        raise ValueError(
+            f"its entry {CHECKSUM} is not written by fflin; delete this entry"
+        )
     return record, bool(checksum)
 
 
@@ -345,8 +368,13 @@ class Design(Result):
 
     def __init_subclass__(cls) -> None:
         # `_value` reads the type of a field from its annotation, which must therefore be a string.
-        if not all(isinstance(kind, str) for kind in vars(cls).get("__annotations__", {}).values()):
-            raise TypeError(f"'{cls.__name__}' needs `from __future__ import annotations`")
+        if not all(
+            isinstance(kind, str)
+            for kind in vars(cls).get("__annotations__", {}).values()
+        ):
+            raise TypeError(
+                f"'{cls.__name__}' needs `from __future__ import annotations`"
+            )
 
     def save(self, path: str | Path) -> None:
         """Write the result to a .npz, .mat or .json file; the file is written atomically.
@@ -368,7 +396,9 @@ class Design(Result):
         """
         names = [item.name for item in fields(cls) if item.init]
         for source in sources:
-            values = {key: getattr(source, key) for key in names if hasattr(source, key)} | values
+            values = {
+                key: getattr(source, key) for key in names if hasattr(source, key)
+            } | values
         return cls(**values)
 
     @classmethod
@@ -391,7 +421,9 @@ class Design(Result):
             record, verified = read_record(source)
             if text(record["kind"]) != name:
                 raise ValueError(f"the file contains: {text(record['kind'])}")
-            values = {item.name: _value(item, record[item.name]) for item in _saved(cls)}
+            values = {
+                item.name: _value(item, record[item.name]) for item in _saved(cls)
+            }
             require_possible(values, getattr(cls, "_SHAPES", ""))
             return cls(**given, **values, verified=verified)
 
@@ -406,20 +438,30 @@ def require_possible(values: Record, shapes: str = "") -> None:
         least = 0.0 if key == "dt" else -_LARGEST
         if isinstance(value, float) and not least <= value <= _LARGEST:
             raise ValueError(f"{key} is {value:g}, which is not possible")
-        if key.endswith("_units") and len(value) != len(values[key.replace("units", "names")]):
-            raise ValueError(f"the number of its {key} differs from the number of names")
+        if key.endswith("_units") and len(value) != len(
+            values[key.replace("units", "names")]
+        ):
+            raise ValueError(
+                f"the number of its {key} differs from the number of names"
+            )
     lengths: dict[str, int] = {}
     for key, letters in (item.split(":") for item in shapes.split()):
         shape = np.shape(values[key])
-        if tuple(map(lengths.setdefault, letters, shape)) != shape or len(shape) < len(letters):
-            raise ValueError(f"{key} has shape {shape}, which contradicts other entries")
+        if tuple(map(lengths.setdefault, letters, shape)) != shape or len(shape) < len(
+            letters
+        ):
+            raise ValueError(
+                f"{key} has shape {shape}, which contradicts other entries"
+            )
 
 
 def unit_pose(values: Array) -> Array:
     """Return a pose from a file with a normalised quaternion, or raise `ValueError`."""
     if values.shape == (7,):
         with suppress(InputError):
-            return np.concatenate((values[:3], normalised("the quaternion", values[3:])))
+            return np.concatenate(
+                (values[:3], normalised("the quaternion", values[3:]))
+            )
     raise ValueError("placement is not a position and a unit quaternion (7,)")
 
 
@@ -428,7 +470,8 @@ def record_of(design: Design) -> Record:
     record: Record = {"kind": type(design).__name__}
     for item in _saved(type(design)):
         value = getattr(design, item.name)
-        if item.type == "Open":  # JSON has no infinity, so the largest double replaces it
+        # JSON has no infinity, so the largest double replaces it
+        if item.type == "Open":
             value = np.nan_to_num(value, nan=np.nan)
         if isinstance(value, tuple):
             value = list(value)
@@ -438,7 +481,9 @@ def record_of(design: Design) -> Record:
 
 def _saved(cls: type[Design]) -> list[Field[object]]:
     """Return the fields of a result that its file contains."""
-    saved = (item for item in fields(cls) if item.name != "verified" and item.name[0] != "_")
+    saved = (
+        item for item in fields(cls) if item.name != "verified" and item.name[0] != "_"
+    )
     return [item for item in saved if item.type != "Robot"]
 
 

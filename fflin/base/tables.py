@@ -60,7 +60,11 @@ def cut(rows: Sequence[Sequence[str]], rest: str = "see -o") -> list[Sequence[st
 
 def dim(text: str) -> str:
     """Return dimmed text if the output is a terminal with colours."""
-    if _on_terminal() and "NO_COLOR" not in os.environ and os.environ.get("TERM") != "dumb":
+    if (
+        _on_terminal()
+        and "NO_COLOR" not in os.environ
+        and os.environ.get("TERM") != "dumb"
+    ):
         return f"\x1b[2m{text}\x1b[0m"
     return text
 
@@ -146,7 +150,9 @@ def counted(number: int, thing: str) -> str:
     return f"{number} {thing}{plural}"
 
 
-def signals(title: str, values: Array, names: Sequence[str], units: Sequence[str]) -> str:
+def signals(
+    title: str, values: Array, names: Sequence[str], units: Sequence[str]
+) -> str:
     """Format the nonzero entries of a state, an input or a force, with their units."""
     # Lines may break between entries, but not at the spaces within an entry.
     entries = []
@@ -158,7 +164,9 @@ def signals(title: str, values: Array, names: Sequence[str], units: Sequence[str
             entry += f"\xa0{unit}"
         entries.append(entry)
     below = " " * (len(title) + 2)
-    text = textwrap.fill(f"{title}: {', '.join(entries)}", width(), subsequent_indent=below)
+    text = textwrap.fill(
+        f"{title}: {', '.join(entries)}", width(), subsequent_indent=below
+    )
     return text.replace("\xa0", " ")
 
 

@@ -26,7 +26,8 @@ _DOTS_LIMIT = 1_000
 # Matches strings and comments. Multi-line strings may contain lines that look like keys. One-line
 # strings and comments are matched too, because a quote inside them does not begin a string.
 _TEXTS = re.compile(
-    r'"""(?:\\.|[^\\])*?"""+|\'\'\'.*?\'\'\'+|"(?:\\.|[^"\\\n])*"|\'[^\'\n]*\'|#[^\n]*', re.DOTALL
+    r'"""(?:\\.|[^\\])*?"""+|\'\'\'.*?\'\'\'+|"(?:\\.|[^"\\\n])*"|\'[^\'\n]*\'|#[^\n]*',
+    re.DOTALL,
 )
 _PART = r"""(?:[\w-]+|"[^"]*"|'[^']*')"""
 _KEY = rf"({_PART}(?:\s*\.\s*{_PART})*)\s*"
@@ -37,7 +38,11 @@ def is_number(value: object) -> bool:
     """Return whether a TOML value is a number with a magnitude below 1e100."""
     # The limit keeps the norm of a vector of such numbers finite. It also excludes inf, nan, and
     # integers that are too large for a float.
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e100
+    return (
+        isinstance(value, int | float)
+        and not isinstance(value, bool)
+        and abs(value) < 1e100
+    )
 
 
 class TomlFile:
@@ -50,7 +55,9 @@ class TomlFile:
             text = content.decode("utf-8-sig").replace("\r\n", "\n")
             for number, written in enumerate(text.split("\n"), start=1):
                 if written.count(".") > _DOTS_LIMIT:
-                    raise ValueError(f"more than {_DOTS_LIMIT} dots in one line (at line {number})")
+                    raise ValueError(
+                        f"more than {_DOTS_LIMIT} dots in one line (at line {number})"
+                    )
             self.record: dict[str, Any] = tomllib.loads(text)
         except (ValueError, RecursionError) as error:
             place = re.search(r"at line (\d+)", str(error))
@@ -61,7 +68,9 @@ class TomlFile:
             raise InputError(message) from None
         # Multi-line strings are replaced by line breaks, which keeps the line numbers. One-line
         # strings stay, because they may be quoted keys.
-        self._lines = _lines_of(_TEXTS.sub(lambda x: "\n" * x[0].count("\n") or x[0], text))
+        self._lines = _lines_of(
+            _TEXTS.sub(lambda x: "\n" * x[0].count("\n") or x[0], text)
+        )
         for key_path, value in _values(self.record):
             # Python refuses to convert very long integers to text, so a message could not show the
             # value.
@@ -127,7 +136,9 @@ def flat(table: object) -> object:
 
     A value that is not a table is returned unchanged.
     """
-    while isinstance(table, dict) and any(isinstance(x, dict) and x for x in table.values()):
+    while isinstance(table, dict) and any(
+        isinstance(x, dict) and x for x in table.values()
+    ):
         pairs = []
         for key, value in table.items():
             inner = value if isinstance(value, dict) and value else {"": value}
@@ -138,7 +149,9 @@ def flat(table: object) -> object:
     return table
 
 
-def _values(record: Mapping[str, object]) -> Iterator[tuple[tuple[str | int, ...], object]]:
+def _values(
+    record: Mapping[str, object],
+) -> Iterator[tuple[tuple[str | int, ...], object]]:
     """Yield (key path, value) for all values that are neither tables nor arrays, at any depth."""
     left: list[tuple[tuple[str | int, ...], object]] = [((), record)]
     while left:

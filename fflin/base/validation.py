@@ -70,7 +70,9 @@ def shaped(name: str, value: object, shape: tuple[int, ...], hint: str = "") -> 
     if array.shape != shape:
         raise InputError(f"{name} has shape {array.shape}, expected {shape}{hint}")
     for at in np.argwhere(~np.isfinite(array))[:1].tolist():
-        raise InputError(f"{name}{at} is {array[tuple(at)]}; every entry must be finite")
+        raise InputError(
+            f"{name}{at} is {array[tuple(at)]}; every entry must be finite"
+        )
     return array
 
 
@@ -119,10 +121,14 @@ def refuse_masked(name: str, value: object) -> None:
     # Masked arrays can exist only if numpy.ma is loaded.
     ma: ModuleType | None = sys.modules.get("numpy.ma")
     if ma and isinstance(value, ma.MaskedArray) and ma.getmaskarray(value).any():
-        raise InputError(f"{name} has masked entries; replace the masked entries by numbers")
+        raise InputError(
+            f"{name} has masked entries; replace the masked entries by numbers"
+        )
 
 
-def instance(name: str, value: object, kind: type[T] | tuple[type[T], ...], expected: str) -> T:
+def instance(
+    name: str, value: object, kind: type[T] | tuple[type[T], ...], expected: str
+) -> T:
     """Return a value of the expected type, or raise `InputError` that shows the given type."""
     if not isinstance(value, kind):
         raise InputError(f"{name} has type {type(value).__name__}, expected {expected}")
@@ -153,7 +159,9 @@ def truth(name: str, value: object) -> bool:
 def whole(name: str, value: object, least: int, largest: int = 2**63 - 1) -> int:
     """Return a whole number within limits, or raise `InputError` that shows the given value."""
     if isinstance(value, bool | np.bool_) or not isinstance(value, int | np.integer):
-        raise InputError(f"{name} is {value!r}, expected a whole number of at least {least}")
+        raise InputError(
+            f"{name} is {value!r}, expected a whole number of at least {least}"
+        )
     if not least <= value <= largest:
         bound = f"of at least {least}" if value < least else f"of at most {largest:,}"
         raise InputError(f"{name} is {value}, expected a whole number {bound}")
@@ -190,7 +198,9 @@ def untied(key: str, value: object) -> tuple[object, bool]:
     if not isinstance(value, Mapping):
         return value, False
     if value.keys() != {"range", "tied"}:
-        raise InputError(f"'{key}' is {value!r}, expected {{'range': 0.2, 'tied': True}}")
+        raise InputError(
+            f"'{key}' is {value!r}, expected {{'range': 0.2, 'tied': True}}"
+        )
     return value["range"], truth(f"tied of '{key}'", value["tied"])
 
 
@@ -228,7 +238,9 @@ def placement(name: str, value: object) -> pin.SE3:
     if not np.isfinite(given.homogeneous).all():
         raise InputError(f"{name} has entries that are not finite")
     if not is_rotation(given.rotation):
-        raise InputError(f"{name} is not a rotation matrix; expected R^T R = I and det R = 1")
+        raise InputError(
+            f"{name} is not a rotation matrix; expected R^T R = I and det R = 1"
+        )
     return rotated(given)
 
 
@@ -236,7 +248,9 @@ def rotated(given: pin.SE3) -> pin.SE3:
     """Return a copy of a placement, whose matrix R is replaced by a rotation near to R."""
     import pinocchio as pin
 
-    return pin.SE3(pin.Quaternion(given.rotation).normalized().matrix(), given.translation)
+    return pin.SE3(
+        pin.Quaternion(given.rotation).normalized().matrix(), given.translation
+    )
 
 
 def is_rotation(R: Array) -> bool:
@@ -262,7 +276,9 @@ def _as_array(name: str, value: object) -> NDArray[np.generic]:
     try:
         return np.asarray(value)
     except ValueError:
-        raise InputError(f"{name} is not an array, because its rows differ in length") from None
+        raise InputError(
+            f"{name} is not an array, because its rows differ in length"
+        ) from None
 
 
 class FrozenArrays:
@@ -290,7 +306,9 @@ class Result(FrozenArrays):
 
     def __repr__(self) -> str:
         """Return a title with the robot, the numbers of points and signals, and the accuracy."""
-        shown = [key for key in _TITLE if key not in self._untitled and hasattr(self, key)]
+        shown = [
+            key for key in _TITLE if key not in self._untitled and hasattr(self, key)
+        ]
         parts = [_TITLE[key](getattr(self, key)) for key in shown]
         return f"{type(self).__name__}({', '.join(parts)})"
 

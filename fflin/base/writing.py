@@ -30,7 +30,9 @@ _MANY = 1000
 
 # Output files that a command has yet to write, and input files that it has read. The value is None
 # in a Python session, which may overwrite files that it has read.
-_of_command: ContextVar[tuple[set[Path], set[str]] | None] = ContextVar("files", default=None)
+_of_command: ContextVar[tuple[set[Path], set[str]] | None] = ContextVar(
+    "files", default=None
+)
 
 
 def as_path(path: object) -> Path:
@@ -45,7 +47,9 @@ def as_path(path: object) -> Path:
 def check_ending(path: Path, endings: tuple[str, ...]) -> None:
     """Raise `FileError` if the name of a file has none of the given endings."""
     if path.suffix not in endings:
-        raise FileError(f"'{path}' ends in '{path.suffix}', expected one of {', '.join(endings)}")
+        raise FileError(
+            f"'{path}' ends in '{path.suffix}', expected one of {', '.join(endings)}"
+        )
 
 
 def read_file(
@@ -74,7 +78,9 @@ def require_regular(
     with failing(path, "read"):
         status = path.stat()
         if not stat.S_ISREG(status.st_mode):
-            actual_kind = "a folder" if stat.S_ISDIR(status.st_mode) else "not a regular file"
+            actual_kind = (
+                "a folder" if stat.S_ISDIR(status.st_mode) else "not a regular file"
+            )
             raise FileError(f"{path}: is {actual_kind}; give the path of a {kind} file")
     if limit is not None and status.st_size > limit:
         size = f"{limit >> 20} MiB" if limit >> 20 else f"{limit >> 10} KiB"
@@ -136,7 +142,9 @@ def csv_table(rows: Iterable[Iterable[object]]) -> bytes:
     # The writer calls `write` once for each row. It quotes a cell with a line break only if the
     # break is part of `lineterminator`.
     lines = list[str]()
-    csv.writer(SimpleNamespace(write=lines.append), lineterminator="\r\n").writerows(rows)
+    csv.writer(SimpleNamespace(write=lines.append), lineterminator="\r\n").writerows(
+        rows
+    )
     return "".join(line.removesuffix("\r\n") + "\n" for line in lines).encode()
 
 
@@ -154,7 +162,9 @@ def replacing(*targets: Path) -> Iterator[list[Path]]:
     try:
         for target in targets:
             with failing(target, "written"):
-                temporary = followed_path(target).parent / f".fflin-{os.urandom(8).hex()}"
+                temporary = (
+                    followed_path(target).parent / f".fflin-{os.urandom(8).hex()}"
+                )
                 temporary.touch(exist_ok=False)  # its mode follows from the umask
             written[temporary] = target
         with failing(targets[-1], "written"):
@@ -192,7 +202,9 @@ def followed_path(target: Path) -> Path:
             if real.parent.is_dir():
                 return real
             folder = real.parent if os.path.islink(target) else target.parent
-            raise FileError(f"{target}: cannot be written: there is no folder {folder}") from None
+            raise FileError(
+                f"{target}: cannot be written: there is no folder {folder}"
+            ) from None
     if not stat.S_ISREG(mode):
         kind = "a folder" if stat.S_ISDIR(mode) else "not a regular file"
         raise FileError(f"{target}: is {kind}; give the name of a file")

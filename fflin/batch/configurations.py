@@ -67,7 +67,8 @@ class Grid:
         """Return configurations start to stop - 1 as rows of an array (stop - start, nq)."""
         picks = np.unravel_index(np.arange(start, stop), self.shape)
         values = {
-            name: axis[pick] for (name, axis), pick in zip(self.axes.items(), picks, strict=True)
+            name: axis[pick]
+            for (name, axis), pick in zip(self.axes.items(), picks, strict=True)
         }
         return _placed(self.robot, self.start, stop - start, values)
 
@@ -108,7 +109,9 @@ class RandomConfigurations:
         low, high = np.array(list(self.ranges.values())).reshape(-1, 2).T
         first = start // _DRAWN
         blocks = [np.empty((0, len(low)))] + [
-            np.random.default_rng([self.seed, block]).uniform(low, high, (_DRAWN, len(low)))
+            np.random.default_rng([self.seed, block]).uniform(
+                low, high, (_DRAWN, len(low))
+            )
             for block in range(first, -(-stop // _DRAWN))
         ]
         drawn = np.concatenate(blocks)[start - first * _DRAWN : stop - first * _DRAWN]
@@ -158,7 +161,9 @@ def grid(
     """
     start = configuration(robot, joints, base)
     if not isinstance(axes, Mapping) or not axes:
-        raise InputError(f"the axes of the grid are {axes!r}, expected a mapping {{joint: values}}")
+        raise InputError(
+            f"the axes of the grid are {axes!r}, expected a mapping {{joint: values}}"
+        )
     checked: dict[str, Array] = {}
     for name, values in axes.items():
         robot.joint(name)
@@ -168,7 +173,9 @@ def grid(
             )
         label = f"grid of joint '{name}'"
         axis = validation.as_double(label, values)
-        validation.vector(label, axis, max(1, axis.size), "increasing values (k,), k > 0")
+        validation.vector(
+            label, axis, max(1, axis.size), "increasing values (k,), k > 0"
+        )
         if (np.diff(axis) <= 0.0).any():
             raise InputError(
                 f"{label} has values that do not increase, expected increasing numbers"
@@ -176,7 +183,9 @@ def grid(
         checked[name] = frozen(axis)
     count = math.prod(map(len, checked.values()))
     if count > sys.maxsize:
-        raise InputError(f"the grid has {count:,} points, too many to index; give fewer values")
+        raise InputError(
+            f"the grid has {count:,} points, too many to index; give fewer values"
+        )
     return Grid(robot, checked, frozen(start))
 
 
@@ -225,19 +234,28 @@ def random_configurations(
     count, seed = validation.whole("count", count, 1), validation.whole("seed", seed, 0)
     start = configuration(robot, base=base)
     ranges = {} if ranges is None else ranges
-    given = validation.instance("ranges", ranges, Mapping, "a mapping {joint: (low, high)}")
+    given = validation.instance(
+        "ranges", ranges, Mapping, "a mapping {joint: (low, high)}"
+    )
     given = by_joint(given, robot.joint_names, robot.joint)
-    checked = {joint.name: _range(robot, joint, given.get(joint.name)) for joint in robot.joints}
+    checked = {
+        joint.name: _range(robot, joint, given.get(joint.name))
+        for joint in robot.joints
+    }
     return RandomConfigurations(robot, count, seed, checked, frozen(start))
 
 
-def _range(robot: Robot, joint: Joint, given: tuple[float, float] | None) -> tuple[float, float]:
+def _range(
+    robot: Robot, joint: Joint, given: tuple[float, float] | None
+) -> tuple[float, float]:
     if given is not None:
         label = f"range of '{joint.name}'"
         low, high = validation.vector(label, given, 2, "(low, high)").tolist()
         if not 0.0 <= high - low < math.inf:
             message = f"{label} is {low:g} to {high:g}"
-            raise InputError(f"{message}, expected low <= high with a width that does not overflow")
+            raise InputError(
+                f"{message}, expected low <= high with a width that does not overflow"
+            )
         return low, high
     low, high = travel_of(robot.model, joint)
     if not joint.prismatic:
@@ -253,7 +271,9 @@ def _range(robot: Robot, joint: Joint, given: tuple[float, float] | None) -> tup
     return low, high
 
 
-def _placed(robot: Robot, start: Array, count: int, values: Mapping[str, Array]) -> Array:
+def _placed(
+    robot: Robot, start: Array, count: int, values: Mapping[str, Array]
+) -> Array:
     """Return copies (count, nq) of `start`, in which the named joints have the given `values`."""
     q = np.tile(start, (count, 1))
     for name, column in values.items():
@@ -262,7 +282,9 @@ def _placed(robot: Robot, start: Array, count: int, values: Mapping[str, Array])
     return q
 
 
-def checked_points(robot: Robot, q: ArrayLike | Configurations) -> Array | Configurations:
+def checked_points(
+    robot: Robot, q: ArrayLike | Configurations
+) -> Array | Configurations:
     """Return checked configurations of a robot: a new array, a grid or random configurations.
 
     Each row of an array (N, nq) is checked and corrected as in `Robot.checked_configuration`.
@@ -282,14 +304,18 @@ def checked_points(robot: Robot, q: ArrayLike | Configurations) -> Array | Confi
         with np.errstate(all="ignore"):
             excess = np.abs(np.einsum("ij,ij->i", block[:, 3:7], block[:, 3:7]) - 1.0)
             for at in robot.unbounded:
-                excess = np.maximum(excess, np.abs(block[:, at] ** 2 + block[:, at + 1] ** 2 - 1.0))
+                excess = np.maximum(
+                    excess, np.abs(block[:, at] ** 2 + block[:, at + 1] ** 2 - 1.0)
+                )
         # Rows that may be invalid. They include rows with NaN, because comparisons with NaN are
         # false.
         doubtful = ~((excess <= validation.ROUND_OFF) & np.isfinite(block).all(axis=1))
         if robot.followers:
             followed = block.copy()
             robot.follow(followed.T)
-            doubtful |= ~(np.abs(followed - block) <= validation.NORM_TOLERANCE).all(axis=1)
+            doubtful |= ~(np.abs(followed - block) <= validation.NORM_TOLERANCE).all(
+                axis=1
+            )
         for row in np.flatnonzero(doubtful).tolist():
             with located(f"configuration {start + row}"):
                 block[row] = robot.checked_configuration(block[row])
@@ -322,12 +348,20 @@ def checked_rows(
     return frozen(rows)
 
 
-def _rows(name: str, value: ArrayLike, size: int, of_what: str, count: int | None = None) -> Array:
+def _rows(
+    name: str, value: ArrayLike, size: int, of_what: str, count: int | None = None
+) -> Array:
     array = validation.as_double(name, value)
     rows = "N" if count is None else count
     expected = f"({rows}, {size})"
-    if array.ndim != 2 or array.shape[1] != size or (count is not None and len(array) != count):
-        raise InputError(f"{name} has shape {array.shape}, expected {expected}: {of_what}")
+    if (
+        array.ndim != 2
+        or array.shape[1] != size
+        or (count is not None and len(array) != count)
+    ):
+        raise InputError(
+            f"{name} has shape {array.shape}, expected {expected}: {of_what}"
+        )
     if not len(array):
         raise InputError(f"{name} has no rows; give at least one row")
     return np.ascontiguousarray(array)

@@ -59,7 +59,11 @@ def is_constant(array: Array) -> bool:
 
 
 def write_rows(
-    path: Path, arrays: Mapping[str, Array], texts: Mapping[str, str], *, checksummed: bool
+    path: Path,
+    arrays: Mapping[str, Array],
+    texts: Mapping[str, str],
+    *,
+    checksummed: bool,
 ) -> None:
     """Write `arrays`, which have equal numbers of rows, and the strings `texts` to a file.
 
@@ -100,7 +104,9 @@ def _chunk_checksums(varying: Mapping[str, Array], chunk: int) -> NDArray[np.uin
     """Return the SHA-256 digest of each chunk of `chunk` rows, as an array (chunks, 32)."""
 
     def checksum(start: int) -> NDArray[np.uint8]:
-        return _checksum({key: value[start : start + chunk] for key, value in varying.items()})
+        return _checksum(
+            {key: value[start : start + chunk] for key, value in varying.items()}
+        )
 
     # hashlib releases the interpreter lock, so threads hash the chunks in parallel.
     with ThreadPoolExecutor() as pool:
@@ -109,7 +115,10 @@ def _chunk_checksums(varying: Mapping[str, Array], chunk: int) -> NDArray[np.uin
 
 
 def file_checksum(
-    texts: Mapping[str, str], chunk: int, checksums: object, constants: Mapping[str, Array]
+    texts: Mapping[str, str],
+    chunk: int,
+    checksums: object,
+    constants: Mapping[str, Array],
 ) -> NDArray[np.uint8]:
     """Return the SHA-256 digest (32,) of the strings, chunk size, chunk digests and constants."""
     return _checksum({**texts, "chunk": chunk, CHUNK_CHECKSUMS: checksums, **constants})
@@ -134,7 +143,11 @@ def read_rows(
         texts = {key: str(arrays.pop(key)) for key in names}
         return arrays, json.loads(texts["constant"]), texts, verified
     with hdf5().File(path, "r") as file:
-        texts = {key: str(value) for key, value in file.attrs.items() if isinstance(value, str)}
+        texts = {
+            key: str(value)
+            for key, value in file.attrs.items()
+            if isinstance(value, str)
+        }
         arrays = {key: _mapped(path, file[key]) for key in file}
         chunk = int(file.attrs.get("chunk", 0))
     constant = json.loads(texts["constant"])
@@ -146,7 +159,9 @@ def read_rows(
     checked_texts = {key: value for key, value in texts.items() if key != "request"}
     if not (
         chunk > 0
-        and np.array_equal(checksum, file_checksum(checked_texts, chunk, checksums, constants))
+        and np.array_equal(
+            checksum, file_checksum(checked_texts, chunk, checksums, constants)
+        )
         and np.array_equal(checksums, _chunk_checksums(varying, chunk))
     ):
         raise ValueError(DAMAGED)
@@ -258,7 +273,9 @@ class FileStore:
         new = self.part.with_name(f".fflin-{os.urandom(8).hex()}")
         try:
             with self._reported():
-                _reserve(new, 8 * count * sum(map(math.prod, shapes.values())) + _OVERHEAD)
+                _reserve(
+                    new, 8 * count * sum(map(math.prod, shapes.values())) + _OVERHEAD
+                )
                 self._file = hdf5().File(new, "w", libver=CHECKED)
             try:
                 with self._reported():
@@ -274,7 +291,8 @@ class FileStore:
     def _name(self, new: Path) -> None:
         """Give the new file its name NAME.part, unless another file has this name."""
         try:
-            os.link(new, self.part)  # fails if the name exists, even as a link to nothing
+            # fails if the name exists, even as a link to nothing
+            os.link(new, self.part)
         except FileExistsError:
             raise FileError(
                 f"{self.part} was begun by another run at the same time; wait for that run, or "
@@ -324,7 +342,9 @@ class FileStore:
         """Return whether a chunk is in the file and matches its checksum."""
         with self._reported():
             kept = self._file[CHUNK_CHECKSUMS][start // self.chunk]
-            rows = {key: self._file[key][start:stop] for key in self._shapes if kept.any()}
+            rows = {
+                key: self._file[key][start:stop] for key in self._shapes if kept.any()
+            }
             return bool(rows) and np.array_equal(kept, _checksum(rows))
 
     def read(self, stop: int) -> dict[str, Array]:
@@ -405,7 +425,9 @@ def output_path(out: str | Path) -> Path:
     part = part_of(path)
     writing.check_output_path(part)
     if os.path.islink(part):
-        raise FileError(f"{part} is a link, expected no file or an unfinished one; remove the link")
+        raise FileError(
+            f"{part} is a link, expected no file or an unfinished one; remove the link"
+        )
     return path
 
 

@@ -91,7 +91,9 @@ class GainBatch(Design):
             If `joints` does not contain n finite numbers, or if the points of the batch are all the
             same or not on a grid.
         """
-        return self._between(vector("joints", joints, len(self.joint_names), "the joint positions"))
+        return self._between(
+            vector("joints", joints, len(self.joint_names), "the joint positions")
+        )
 
     def _between(self, joints: Array) -> Array:
         point = [
@@ -104,14 +106,22 @@ class GainBatch(Design):
     @cached_property
     def _axes(self) -> dict[str, Array]:
         columns = dict(zip(self.joint_names, self.joint_positions.T, strict=True))
-        axes = {name: np.unique(column) for name, column in columns.items() if np.ptp(column) > 0.0}
+        axes = {
+            name: np.unique(column)
+            for name, column in columns.items()
+            if np.ptp(column) > 0.0
+        }
         if not axes:
             raise InputError(
                 "all points of the batch are the same, expected a grid; make the points with "
                 "fflin.grid"
             )
         points = np.unique(self.joint_positions, axis=0)
-        if not len(points) == len(self) == np.prod([len(values) for values in axes.values()]):
+        if (
+            not len(points)
+            == len(self)
+            == np.prod([len(values) for values in axes.values()])
+        ):
             raise InputError(
                 f"interpolation needs all points of a grid over {', '.join(axes)}, but the "
                 f"{len(self)} points of the batch are not a full grid; make the points with "
@@ -163,7 +173,9 @@ def lqr_batch(batch: LinearBatch, Q: Weight, R: Weight) -> GainBatch:
     """
     instance("batch", batch, LinearBatch, "a LinearBatch; fflin.sweep returns one")
     if not len(batch):
-        raise InputError("the batch has no points; give a batch with at least one point")
+        raise InputError(
+            "the batch has no points; give a batch with at least one point"
+        )
     batch[0].require_unchanged()
     Q = weight("Q", Q, batch.state_names)
     R = weight("R", R, input_keys(batch), definite=True)
@@ -182,7 +194,11 @@ def lqr_batch(batch: LinearBatch, Q: Weight, R: Weight) -> GainBatch:
         if solution is None:
             with located(f"point {index}"):
                 solution = regulator(batch[index], Q, R)
-        K[index], residual[index], margin[index] = solution.K, solution.residual, solution.margin
+        K[index], residual[index], margin[index] = (
+            solution.K,
+            solution.residual,
+            solution.margin,
+        )
     return GainBatch._of(batch, K=K, residual=residual, margin=margin)
 
 
@@ -222,7 +238,9 @@ class ScheduledFeedback(Feedback):
         instance("lin", self.lin, LinearModel, "a LinearModel")
         instance("gains", self.gains, GainBatch, "a GainBatch")
         lin, gains = self.lin, self.gains
-        columns = [k for k, x in enumerate(gains.joint_names) if f"q_m.{x}" in lin.state_names]
+        columns = [
+            k for k, x in enumerate(gains.joint_names) if f"q_m.{x}" in lin.state_names
+        ]
         lined = replace(
             gains,
             K=line_up(gains, lin),

@@ -116,12 +116,16 @@ class LinearBatch(ModelHeader):
     @overload
     def __getitem__(self, index: int) -> LinearModel: ...
     @overload
-    def __getitem__(self, index: slice | Sequence[int] | Indices | Mask) -> LinearBatch: ...
+    def __getitem__(
+        self, index: slice | Sequence[int] | Indices | Mask
+    ) -> LinearBatch: ...
 
     def __getitem__(self, index: int | slice | ArrayLike) -> LinearModel | LinearBatch:
         if isinstance(index, int | np.integer):
             if not -len(self) <= index < len(self):
-                raise IndexError(f"index is {index}, but the batch has {len(self)} points")
+                raise IndexError(
+                    f"index is {index}, but the batch has {len(self)} points"
+                )
             return self._model(int(index) % len(self))
         if not isinstance(index, slice):
             validation.refuse_masked("index", index)
@@ -172,7 +176,9 @@ class LinearBatch(ModelHeader):
         if (self._root[0] == AT_ROOT).all():
             return bases
         root = pin.XYZQUATToSE3(np.array(self._root[0]))
-        placed = [pin.SE3ToXYZQUAT(root * pin.XYZQUATToSE3(np.array(base))) for base in bases]
+        placed = [
+            pin.SE3ToXYZQUAT(root * pin.XYZQUATToSE3(np.array(base))) for base in bases
+        ]
         return frozen(np.array(placed))
 
     @property
@@ -275,10 +281,17 @@ class LinearBatch(ModelHeader):
         """
         if not len(self):
             raise InputError("the batch has no points; there is nothing to save")
-        write_rows(as_path(path), self._arrays(), self.header(len(self)), checksummed=self.verified)
+        write_rows(
+            as_path(path),
+            self._arrays(),
+            self.header(len(self)),
+            checksummed=self.verified,
+        )
 
     @staticmethod
-    def load(path: str | Path, robot: Robot | None = None, *, verify: bool = True) -> LinearBatch:
+    def load(
+        path: str | Path, robot: Robot | None = None, *, verify: bool = True
+    ) -> LinearBatch:
         """Read a batch that `save` or `sweep` wrote; all numbers are restored bit for bit.
 
         Parameters
@@ -320,15 +333,27 @@ class LinearBatch(ModelHeader):
                 **{"weights": {}, "mean_motion": n, "dt": 0.0},
             }
             return LinearBatch(**values, _asked=asked, verified=verified)
-        identity = robot.urdf_sha256, robot.locked, robot.joint_names, mean_motion(robot)
-        if identity != (values["urdf_sha256"], values["locked"], _joints(values["state_names"]), n):
+        identity = (
+            robot.urdf_sha256,
+            robot.locked,
+            robot.joint_names,
+            mean_motion(robot),
+        )
+        if identity != (
+            values["urdf_sha256"],
+            values["locked"],
+            _joints(values["state_names"]),
+            n,
+        ):
             raise InputError(
                 f"robot '{robot.name}' differs from the robot '{values['robot']}' of the batch in "
                 "its URDF, joints or orbit; give the robot for which the batch was made"
             )
         from fflin.linear.linearization import Prepared
 
-        ready = Prepared(robot, frame=values["frame"], reference=None, moving=values["moving"])
+        ready = Prepared(
+            robot, frame=values["frame"], reference=None, moving=values["moving"]
+        )
         return LinearBatch(**values, _asked=ready.common, verified=verified)
 
     def _arrays(self) -> dict[str, Array]:
@@ -341,17 +366,24 @@ class LinearBatch(ModelHeader):
         first = self[0]
         header = {key: getattr(self, key) for key in TEXTS}
         header |= {"_ignorable": first.ignorable, "mean_motion": first.mean_motion}
-        wheels = first._robot.flown_wheels if first._robot else self._asked.get("_wheels")
+        wheels = (
+            first._robot.flown_wheels if first._robot else self._asked.get("_wheels")
+        )
         if isinstance(wheels, FlownWheels):
             header["_wheels"] = wheels
-        return {"header": json.dumps({**header, "points": count, "columns": self.columns})}
+        return {
+            "header": json.dumps({**header, "points": count, "columns": self.columns})
+        }
 
     def _model(self, index: int) -> LinearModel:
-        common = {**dict.fromkeys(_MODEL), **self._asked}  # fields without a value are None
+        # fields without a value are None
+        common = {**dict.fromkeys(_MODEL), **self._asked}
         common |= {key: getattr(self, key) for key in (*TEXTS, "verified")}
         # `asarray` converts a row of a memory-mapped file to a plain array, without a copy.
         arrays = self._arrays().items()
-        rows = {key.removeprefix("_"): np.asarray(array[index]) for key, array in arrays}
+        rows = {
+            key.removeprefix("_"): np.asarray(array[index]) for key, array in arrays
+        }
         lower, root = rows.pop("B_lower"), rows.pop("root")
         rows["B"] = frozen(np.concatenate((np.zeros_like(lower), lower)))
         if self._x0 is None:  # x0 then follows from q
@@ -379,7 +411,9 @@ class LinearBatch(ModelHeader):
             q_m[:, k] = position / scale
         return q_m
 
-    def _named(self, joints: Mapping[str, object]) -> list[tuple[str, Array, bool, Any]]:
+    def _named(
+        self, joints: Mapping[str, object]
+    ) -> list[tuple[str, Array, bool, Any]]:
         """Return (label, positions (N,), flag, value) for each joint in {joint: value}.
 
         The label names the joint in messages. The flag is true for a continuous joint.
@@ -390,7 +424,9 @@ class LinearBatch(ModelHeader):
         at = {name: self.joint_names.index(name) for name in joints}
         q_m = self.joint_positions
         turning = [second >= 0 for _, second, _ in self.columns]
-        return [(f"joint '{x}'", q_m[:, k], turning[k], joints[x]) for x, k in at.items()]
+        return [
+            (f"joint '{x}'", q_m[:, k], turning[k], joints[x]) for x, k in at.items()
+        ]
 
 
 # Names of a batch's fields, grouped by type. Arrays have one row per point. The fields in TEXTS are
@@ -413,18 +449,30 @@ def _checked_fields(
         if key in constant:
             array = np.broadcast_to(array, (count, *array.shape))
         if array.dtype != np.float64 or len(array) != count:
-            raise ValueError(f"{key} has {len(array)} rows of {array.dtype}, expected {count}")
+            raise ValueError(
+                f"{key} has {len(array)} rows of {array.dtype}, expected {count}"
+            )
         values[key] = frozen(array)
     for key in TEXTS:
         values[key] = header[key]
         if isinstance(header[key], list):
             values[key] = tuple(header[key])
-    values["columns"] = tuple((int(a), int(b), float(scale)) for a, b, scale in header["columns"])
+    values["columns"] = tuple(
+        (int(a), int(b), float(scale)) for a, b, scale in header["columns"]
+    )
     nx, nu, ny = (len(values[f"{kind}_names"]) for kind in ("state", "input", "output"))
-    shapes = {"A": (nx, nx), "B_lower": (nx // 2, nu), "C": (ny, nx), "D": (ny, nu), "f0": (nx,)}
+    shapes = {
+        "A": (nx, nx),
+        "B_lower": (nx // 2, nu),
+        "C": (ny, nx),
+        "D": (ny, nu),
+        "f0": (nx,),
+    }
     for key, shape in shapes.items():
         if values[key].shape[1:] != shape:
-            raise ValueError(f"{key} has shape {values[key].shape[1:]} per point, expected {shape}")
+            raise ValueError(
+                f"{key} has shape {values[key].shape[1:]} per point, expected {shape}"
+            )
     return values
 
 
@@ -441,7 +489,9 @@ def _apart(at: Array, turning: bool, value: float) -> Array:
 
 
 def _joints(state_names: Sequence[str]) -> tuple[str, ...]:
-    return tuple(name.removeprefix("q_m.") for name in state_names if name.startswith("q_m."))
+    return tuple(
+        name.removeprefix("q_m.") for name in state_names if name.startswith("q_m.")
+    )
 
 
 def _refuse(what: str, name: str, _: LinearModel) -> NoReturn:

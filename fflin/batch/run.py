@@ -79,15 +79,25 @@ class Execution(ExitStack):
         progress: Progress | None = None,
     ) -> None:
         if executor is not None and workers is not None:
-            raise InputError("executor and workers are both given; give only one of them")
+            raise InputError(
+                "executor and workers are both given; give only one of them"
+            )
         if executor is not None and not hasattr(executor, "submit"):
             kind = type(executor).__name__
-            raise InputError(f"executor has type {kind}, expected a concurrent.futures.Executor")
-        for name, value in (("workers", workers), ("threads", threads), ("chunk", chunk)):
+            raise InputError(
+                f"executor has type {kind}, expected a concurrent.futures.Executor"
+            )
+        for name, value in (
+            ("workers", workers),
+            ("threads", threads),
+            ("chunk", chunk),
+        ):
             if value is not None:
                 whole(name, value, 1)
         if progress is not None and not callable(progress):
-            raise InputError(f"progress is {progress!r}, expected a function progress(done, total)")
+            raise InputError(
+                f"progress is {progress!r}, expected a function progress(done, total)"
+            )
         super().__init__()
         self.progress = progress
         if progress is None and on_terminal():
@@ -195,7 +205,11 @@ def run_chunks(
 
 
 def _results(
-    job: Job, rows: RowsOf, store: FileStore | MemoryStore, spans: list[Span], how: Execution
+    job: Job,
+    rows: RowsOf,
+    store: FileStore | MemoryStore,
+    spans: list[Span],
+    how: Execution,
 ) -> Iterator[tuple[Span, Result | str]]:
     """Yield each chunk with its result, or with the reason why it failed."""
 
@@ -233,14 +247,19 @@ def _results(
                     # The pool is broken or shut down, or the executor raises its own exception
                     # type.
                     yield span, _reason(error)
-            ready = list(running)[:1]  # threads: wait for the chunk that was submitted first
+            # threads: wait for the chunk that was submitted first
+            ready = list(running)[:1]
             if not inside:
-                ready = list(futures.wait(running, return_when=futures.FIRST_COMPLETED).done)
+                ready = list(
+                    futures.wait(running, return_when=futures.FIRST_COMPLETED).done
+                )
             for future in ready:
                 span = running.pop(future)
                 try:
                     result = future.result()
-                except Exception as error:  # each executor raises its own exception types
+                except (
+                    Exception
+                ) as error:  # each executor raises its own exception types
                     if inside:
                         raise
                     result = _reason(error)
@@ -324,7 +343,8 @@ class OwnWorkers(futures.ThreadPoolExecutor):
         cores = available_cores()
         if count > cores:
             message = (
-                f"{count} workers requested, but only {cores} cores are available; using {cores}"
+                f"{count} workers requested, but only {cores} cores are available; "
+                f"using {cores}"
             )
             warnings.warn(message, FflinWarning, stacklevel=4)
         super().__init__(min(count, cores))
@@ -332,7 +352,9 @@ class OwnWorkers(futures.ThreadPoolExecutor):
         self._pools: list[futures.ProcessPoolExecutor] = []
         self._ended = ""  # reason why no further process can start
 
-    def submit(self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> futures.Future[T]:
+    def submit(
+        self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs
+    ) -> futures.Future[T]:
         """Call a function in a worker process.
 
         If the process dies, the returned future raises `FflinError`.
@@ -371,7 +393,9 @@ class OwnWorkers(futures.ThreadPoolExecutor):
                 with _starting():
                     # A forked process would inherit locks that other threads hold, and could wait
                     # for these locks forever.
-                    pool = futures.ProcessPoolExecutor(1, get_context("spawn"), _prepare)
+                    pool = futures.ProcessPoolExecutor(
+                        1, get_context("spawn"), _prepare
+                    )
                     ready = pool.submit(int)
                 self._pools.append(pool)
             ready.result()
@@ -383,7 +407,8 @@ class OwnWorkers(futures.ThreadPoolExecutor):
             self._ended = f"no worker process can be started: {error}"
         except futures.BrokenExecutor:
             self._ended = (
-                'a worker process did not start; make the call under `if __name__ == "__main__":`'
+                "a worker process did not start; make the call under "
+                '`if __name__ == "__main__":`'
             )
         else:
             self._mine.pool = pool

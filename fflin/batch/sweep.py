@@ -157,7 +157,9 @@ def sweep(
     if size is None:
         # Choose the chunk size such that all threads or workers compute about equally many chunks.
         same = how.count(job)
-        size = min(_CHUNK_BYTES, max(_LEAST_CHUNK_BYTES, row * count // (4 * same))) // row
+        size = (
+            min(_CHUNK_BYTES, max(_LEAST_CHUNK_BYTES, row * count // (4 * same))) // row
+        )
         size = min(max(size, _LEAST_CHUNK), _LARGEST_CHUNK)
         chunks = math.ceil(math.ceil(count / size) / same) * same
         size = math.ceil(count / chunks / _LEAST_CHUNK) * _LEAST_CHUNK
@@ -170,7 +172,9 @@ def sweep(
         )
     with closing(store), how:
         of_what = "configurations"
-        run_chunks(job, task.rows, store, how, how.progress, of_what=of_what, made=task.batch)
+        run_chunks(
+            job, task.rows, store, how, how.progress, of_what=of_what, made=task.batch
+        )
         batch = task.batch(store.complete())
     if path is not None and path.suffix == ".npz":
         batch.save(path)
@@ -205,7 +209,9 @@ class ChunkJob:
     `at_rest` must be false if velocities or inputs are given.
     """
 
-    def __init__(self, linearizer: Linearizer, *, at_rest: bool, engine: str | None = None) -> None:
+    def __init__(
+        self, linearizer: Linearizer, *, at_rest: bool, engine: str | None = None
+    ) -> None:
         self._again = partial(type(self), linearizer, at_rest=at_rest, engine=engine)
         self.linearizer = linearizer
         prepared = linearizer.prepared
@@ -225,7 +231,9 @@ class ChunkJob:
                 self.shapes["_drift"] = (nx,)
             if prepared.sensing is not None:
                 self.shapes |= {"C": (ny, nx), "D": (ny, nu), "_y0": (ny,)}
-        self.row_bytes = 8 * (linearizer.robot.nq + sum(map(math.prod, self.shapes.values())))
+        self.row_bytes = 8 * (
+            linearizer.robot.nq + sum(map(math.prod, self.shapes.values()))
+        )
 
     def __reduce__(self) -> tuple[object, ...]:
         # Only the arguments are pickled, because each worker allocates its own work arrays.
@@ -265,7 +273,9 @@ class ChunkJob:
             more = dict[str, Array]()
             for key, array in out.items():
                 more[key] = np.empty((LANES, *array.shape[1:]))
-            left = self.write({key: np.pad(x, filled, "edge") for key, x in rows.items()}, more)
+            left = self.write(
+                {key: np.pad(x, filled, "edge") for key, x in rows.items()}, more
+            )
             for key, array in out.items():
                 array[:] = more[key][:count]
             return left[left < count]
@@ -316,7 +326,11 @@ class ChunkJob:
         # checked, because it is finite if f0 is finite and the quaternion's scalar part q0 is not
         # close to zero.
         good = good & (np.asarray(chart.q0) >= SMALLEST_Q0).ravel()
-        for values in (A.reshape(count, -1)[:, A[0].size // 2 :], B.reshape(count, -1), f0):
+        for values in (
+            A.reshape(count, -1)[:, A[0].size // 2 :],
+            B.reshape(count, -1),
+            f0,
+        ):
             good &= np.vecdot(values, values) < LARGEST
         return good
 
@@ -356,7 +370,9 @@ class SweepTask:
             self._known["u0"] = checked_rows("u", u, nu, of_inputs, count)
         # `given`: the arrays in `_known` that vary between points. `shapes`: the shapes, per point,
         # of all arrays that vary between points.
-        self.given = {key: rows for key, rows in self._known.items() if not is_constant(rows)}
+        self.given = {
+            key: rows for key, rows in self._known.items() if not is_constant(rows)
+        }
         self.shapes = {**job.shapes, "q": (robot.nq,)}
         self.shapes |= {key: rows.shape[1:] for key, rows in self.given.items()}
         constants: dict[str, Array] = {
@@ -369,7 +385,9 @@ class SweepTask:
         if not prepared.own_reference:
             constants["_reference"] = prepared.common["placement"]
         # {array: value}, for the arrays that are the same at all points.
-        self.constants = {key: row for key, row in constants.items() if key not in self.shapes}
+        self.constants = {
+            key: row for key, row in constants.items() if key not in self.shapes
+        }
 
     def rows(self, start: int, stop: int) -> dict[str, Array]:
         """Return the configurations, velocities and inputs of points start to stop - 1."""
@@ -406,7 +424,9 @@ class SweepTask:
         """Digest of all data that determine the result: the robot, the options and the points."""
         robot, prepared = self.robot, self.job.linearizer.prepared
         inertias = [inertia.toDynamicParameters() for inertia in robot.model.inertias]
-        placements = [placement.homogeneous for placement in robot.model.jointPlacements]
+        placements = [
+            placement.homogeneous for placement in robot.model.jointPlacements
+        ]
         settings = [getattr(robot, key) for key in _OF_THE_ROBOT]
         settings += [prepared.map.frame, prepared.moving, prepared.own_reference]
         settings += [self.job.only_inertia, __version__, pin.__version__, self.count]
@@ -414,11 +434,15 @@ class SweepTask:
         settings += [type(self._points).__name__]
         points.pop("robot", None)
         axes = points.pop("axes", None) or points.pop("ranges", {})
-        points |= {f"{at} {name}": value for at, (name, value) in enumerate(axes.items())}
+        points |= {
+            f"{at} {name}": value for at, (name, value) in enumerate(axes.items())
+        }
         return content_digest(
             {
                 "robot": repr(settings),
-                "model": np.concatenate([np.ravel(matrix) for matrix in (*inertias, *placements)]),
+                "model": np.concatenate(
+                    [np.ravel(matrix) for matrix in (*inertias, *placements)]
+                ),
                 "reference": pin.SE3ToXYZQUAT(prepared.map.reference),
                 **self._known,
                 **{f"of q: {key}": value for key, value in points.items()},

@@ -99,7 +99,9 @@ class _Change(NamedTuple):
         return np.linalg.solve(self.to.V, self.own.V)
 
 
-def tool_batch(robot: Robot, batch: LinearBatch, tool: str, dt: float | None) -> ToolBatch:
+def tool_batch(
+    robot: Robot, batch: LinearBatch, tool: str, dt: float | None
+) -> ToolBatch:
     """Convert the models of a batch; see `LinearBatch.to`."""
     step = step_of(tool, dt)
     kind = tool_coordinates(robot, tool, moving=batch.moving)
@@ -111,7 +113,8 @@ def tool_batch(robot: Robot, batch: LinearBatch, tool: str, dt: float | None) ->
         rate = rates @ change.to.P.T
         if step:
             stepped = [
-                euler_step(*matrices, step, tool) for matrices in zip(A, B, rate, strict=True)
+                euler_step(*matrices, step, tool)
+                for matrices in zip(A, B, rate, strict=True)
             ]
             A, B, rate = (np.array(matrices) for matrices in zip(*stepped, strict=True))
         converted = {

@@ -18,7 +18,15 @@ from fflin.base.errors import FflinWarning, InputError, unknown
 from fflin.base.intervals import Estimate
 from fflin.base.record import CODECS, reading
 from fflin.base.tables import data_frame
-from fflin.base.validation import Array, FrozenArrays, Mask, dimension, instance, share, whole
+from fflin.base.validation import (
+    Array,
+    FrozenArrays,
+    Mask,
+    dimension,
+    instance,
+    share,
+    whole,
+)
 from fflin.base.writing import as_path, write_atomically
 from fflin.batch.files import read_rows, write_rows
 from fflin.campaign.report import campaign_report
@@ -58,7 +66,9 @@ class Bound(NamedTuple):
     met: Mask
 
 
-def bounds_of(condition: str, figure: Callable[[str], tuple[Array, str]]) -> list[Bound]:
+def bounds_of(
+    condition: str, figure: Callable[[str], tuple[Array, str]]
+) -> list[Bound]:
     """Return the comparisons in a condition such as ``attitude < 1 deg and settle < 40 s``.
 
     The function `figure` returns the values (N,) and the unit of a named quantity.
@@ -78,7 +88,9 @@ def bounds_of(condition: str, figure: Callable[[str], tuple[Array, str]]) -> lis
         alternatives = figure_unit.split("|")
         factor = 1.0
         if unit not in ("", figure_unit, *alternatives):
-            factor = max(_FACTORS.get((unit, alternative), 0.0) for alternative in alternatives)
+            factor = max(
+                _FACTORS.get((unit, alternative), 0.0) for alternative in alternatives
+            )
         if not factor:
             raise InputError(
                 f"condition {part!r} has the unit {unit}, expected {figure_unit or 'no unit'}"
@@ -182,9 +194,11 @@ class Campaign(FrozenArrays):
     state_units: tuple[str, ...]
     input_names: tuple[str, ...]
     input_units: tuple[str, ...]
-    input_limits: tuple[float, ...]  # largest permitted magnitudes; infinite without a limit
+    # largest permitted magnitudes; infinite without a limit
+    input_limits: tuple[float, ...]
     times: tuple[float, ...]
-    judged: tuple[str, ...]  # subset of attitude, position, joints that the policy controls
+    # subset of attitude, position, joints that the policy controls
+    judged: tuple[str, ...]
     robot: str
     urdf_sha256: str
     duration: float
@@ -256,12 +270,21 @@ class Campaign(FrozenArrays):
             errors = self.largest_x[:, at]
             if statistic == "final":
                 errors = np.abs(self.x[:, at] - np.array(self.x_end)[at])
-            return np.where(self.stopped, np.inf, errors.max(axis=1)), self.state_units[at[0]]
-        states, inputs = (self.state_names, self.state_units), (self.input_names, self.input_units)
+            return np.where(self.stopped, np.inf, errors.max(axis=1)), self.state_units[
+                at[0]
+            ]
+        states, inputs = (
+            (self.state_names, self.state_units),
+            (self.input_names, self.input_units),
+        )
         kinds = tuple(KINDS), tuple(KINDS.values())
         groups: list[tuple[tuple[str, ...], tuple[str, ...], Array]] = {
             "final": [(*kinds, self.errors), (*states, self.x), (*inputs, self.u)],
-            "worst": [(*kinds, self.largest), (*states, self.largest_x), (*inputs, self.largest_u)],
+            "worst": [
+                (*kinds, self.largest),
+                (*states, self.largest_x),
+                (*inputs, self.largest_u),
+            ],
             "settle": [(kinds[0], ("s",) * len(KINDS), self.settle)],
             "drawn": [(self.names, ("",) * len(self.names), self.drawn)],
         }[statistic]
@@ -273,7 +296,9 @@ class Campaign(FrozenArrays):
                     values = np.where(self.stopped, np.inf, values)
                 return values, unit
         known = [name for names, *_ in groups for name in names]
-        raise unknown("figure", rest, [*known, *(name for name, at in indices.items() if at)])
+        raise unknown(
+            "figure", rest, [*known, *(name for name, at in indices.items() if at)]
+        )
 
     def _indices(self, group: str, joints: tuple[str, ...]) -> list[int]:
         """Return the indices of the states of some joints, for "q_m" or "qdot_m"."""
@@ -318,7 +343,9 @@ class Campaign(FrozenArrays):
         values = self.values(name)
         if name in (*self.state_names, *self.input_names):
             values = values[~self.stopped]
-        return intervals.quantile(values, share("p", p), share("confidence", confidence))
+        return intervals.quantile(
+            values, share("p", p), share("confidence", confidence)
+        )
 
     def mean(self, name: str, *, confidence: float = 0.95) -> Estimate:
         """Return the mean of a figure over the completed runs, with Student's t interval.
@@ -360,9 +387,13 @@ class Campaign(FrozenArrays):
         name = self.about if name is None else name
         figure = self.values(name)
         apart = np.abs(self.drawn - np.median(self.drawn, axis=0))
-        signed, sized = (intervals.rank_correlations(x, figure) for x in (self.drawn, apart))
+        signed, sized = (
+            intervals.rank_correlations(x, figure) for x in (self.drawn, apart)
+        )
         correlations = {}
-        for key, value, size in zip(self.names, signed.tolist(), sized.tolist(), strict=True):
+        for key, value, size in zip(
+            self.names, signed.tolist(), sized.tolist(), strict=True
+        ):
             if key == SEED:
                 continue
             if abs(size) > abs(value):
@@ -372,7 +403,12 @@ class Campaign(FrozenArrays):
         return dict(sorted(correlations.items(), key=lambda pair: -abs(pair[1])))
 
     def replay(
-        self, run: int, *, robot: Robot | None = None, policy: object = None, **options: object
+        self,
+        run: int,
+        *,
+        robot: Robot | None = None,
+        policy: object = None,
+        **options: object,
     ) -> Motion:
         """Simulate a run of the campaign again, and return its motion.
 
@@ -451,7 +487,9 @@ class Campaign(FrozenArrays):
         """Return the columns and the rows of the table of figures, with one row for each run."""
         finals = (*KINDS, *self.state_names, *self.input_names)
         names = [f"drawn {name}" for name in self.names] + ["end", *finals]
-        names += [f"worst {name}" for name in finals] + [f"settle {kind}" for kind in KINDS]
+        names += [f"worst {name}" for name in finals] + [
+            f"settle {kind}" for kind in KINDS
+        ]
         values, units = zip(*map(self.figure, names), strict=True)
         columns = labels(["stop", *names], ["", *units])
         return columns, np.column_stack((self.stop, *values))

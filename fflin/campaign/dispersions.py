@@ -33,7 +33,8 @@ from fflin.simulation.lanes import noise_generator
 from fflin.simulation.plan import Times
 from fflin.simulation.run import Plant
 
-_BLOCK = 1024  # number of runs whose values are drawn together; does not depend on the chunks
+# number of runs whose values are drawn together; does not depend on the chunks
+_BLOCK = 1024
 # Names of the axes, for the kinds of dispersions that have one value per axis.
 _AXES = {"com": "xyz", "inertia": "xyz", "misalignment": "12"}
 _OF_BODIES = ("mass", "com", "inertia", "density")
@@ -46,7 +47,8 @@ class Column(NamedTuple):
     """Random variable with one value per run, and the quantities that this value changes."""
 
     name: str
-    kind: str  # "state", "delay", "seed" (of noise), or the last part of a name, such as "mass"
+    # "state", "delay", "seed" (of noise), or the last part of a name, such as "mass"
+    kind: str
     at: list[int]  # indices of the changed quantities in `Dispersions._known[kind]`
     axis: int
     inverse: Inverse
@@ -56,7 +58,13 @@ class Dispersions:
     """Dispersions of `monte_carlo`: random changes of the plant, policy and initial state."""
 
     def __init__(
-        self, given: object, plant: Plant, policy: Policy | None, x0: Array, seed: int, times: Times
+        self,
+        given: object,
+        plant: Plant,
+        policy: Policy | None,
+        x0: Array,
+        seed: int,
+        times: Times,
     ) -> None:
         self._plant, self._policy, self._x0, self._seed = plant, policy, x0, seed
         self._times = times
@@ -73,7 +81,11 @@ class Dispersions:
             "frequency": modes,
         }
         kinds = [*self._known]
-        self._known |= {"state": plant.state.names, "delay": ("delay",), "seed": (SEED,)}
+        self._known |= {
+            "state": plant.state.names,
+            "delay": ("delay",),
+            "seed": (SEED,),
+        }
         # Joint index of each mode, in the order of `modes`.
         self._modes = [*map(robot.joint_names.index, modes)]
         by_kind: dict[str, dict[str, tuple[Inverse, str]]] = {}
@@ -111,7 +123,9 @@ class Dispersions:
         pieces = [*robot.pieces.values()]
         masses = list[tuple[str, int]]()
         for kind in ("mass", "density"):
-            masses += ((x.name, at) for x in self.columns if x.kind == kind for at in x.at)
+            masses += (
+                (x.name, at) for x in self.columns if x.kind == kind for at in x.at
+            )
         for (name, at), (other, other_at) in combinations(masses, 2):
             one, two = pieces[at], pieces[other_at]
             if at == other_at or (one.joint == two.joint and (one.whole or two.whole)):
@@ -119,7 +133,9 @@ class Dispersions:
                     f"'{name}' and '{other}' disperse the same mass; disperse only one of them"
                 )
 
-    def _add(self, kind: str, spreads: Mapping[str, tuple[Inverse, str]], kinds: str) -> None:
+    def _add(
+        self, kind: str, spreads: Mapping[str, tuple[Inverse, str]], kinds: str
+    ) -> None:
         """Add the columns of one kind of dispersion.
 
         `spreads` is {name, group or pattern: (inverse distribution function, common name)}. If the
@@ -187,7 +203,8 @@ class Dispersions:
         named = dict[str, str]()
         alone = {*robot.pieces, *robot.link_of}
         whole = set[int]()
-        for key in sorted(spreads, key=alone.__contains__):  # names come last to override patterns
+        # names come last to override patterns
+        for key in sorted(spreads, key=alone.__contains__):
             for name in bodies_named(robot, f"{kind} to disperse", key):
                 if name in named:
                     raise InputError(
@@ -213,7 +230,9 @@ class Dispersions:
             for first in range(start // _BLOCK * _BLOCK, stop, _BLOCK):
                 low, high = max(start, first), min(stop, first + _BLOCK)
                 values = self._drawn(column, first // _BLOCK, high - first)
-                drawn[low - start : high - start, at] = values[low - first : high - first]
+                drawn[low - start : high - start, at] = values[
+                    low - first : high - first
+                ]
         return drawn
 
     def _drawn(self, column: Column, block: int, count: int) -> Array:
@@ -225,7 +244,8 @@ class Dispersions:
         stream = np.random.Philox(np.random.SeedSequence(key, spawn_key=(block,)))
         # An inverse distribution function can be infinite at 0 and 1, so both are excluded.
         uniform = np.random.Generator(stream).random(_BLOCK).clip(1e-16, 1.0 - 1e-16)
-        if isinstance(column.inverse, partial):  # a fast function from the module `spreads`
+        # a fast function from the module `spreads`
+        if isinstance(column.inverse, partial):
             values: Array = column.inverse(uniform)
             return values
         kept = self._kept.get((column.name, block), np.empty(0))
@@ -249,23 +269,33 @@ class Dispersions:
                 bad = ~np.isfinite(values) | (values <= least)
                 if bad.any():
                     run = int(bad.argmax())
-                    bound = f" more than {least:g}" if np.isfinite(least) else " a finite number"
+                    bound = (
+                        f" more than {least:g}"
+                        if np.isfinite(least)
+                        else " a finite number"
+                    )
                     raise InputError(
                         f"'{column.name}' is drawn as {values[run]:.4g} in run {start + run}, "
                         f"for which no valid robot exists; expected{bound}. Use a smaller standard "
                         "deviation, or a uniform distribution (least, largest)"
                     )
-            problem = f"an invalid initial attitude is drawn in the runs from {start} on"
+            problem = (
+                f"an invalid initial attitude is drawn in the runs from {start} on"
+            )
             try:
                 self.starts(drawn)
                 # A drawn mass or inertia can be too small for the flexible modes of its body.
                 if self._plant.robot.appendages:
                     refused = first_impossible(self._plant.robot, self.bodies(drawn))
                     if refused is not None:
-                        problem = f"run {start + refused} draws an invalid mass or inertia"
+                        problem = (
+                            f"run {start + refused} draws an invalid mass or inertia"
+                        )
                         self.one(drawn[refused])
             except (ChartError, InputError) as error:
-                raise InputError(f"{problem}: {error}; use a smaller dispersion") from None
+                raise InputError(
+                    f"{problem}: {error}; use a smaller dispersion"
+                ) from None
 
     def _of(self, kind: str, drawn: Array, rest: float = 0.0) -> Array:
         """Return the values (N, size) or (N, size, axes) of all quantities of a kind of dispersion.
@@ -299,16 +329,21 @@ class Dispersions:
         for column in self.columns:
             if column.kind in _OF_BODIES:
                 dispersed.update(column.at)
-        changed = dict[int, Array]()  # pseudo-inertias (N, 4, 4); at first, only their changes
+        # pseudo-inertias (N, 4, 4); at first, only their changes
+        changed = dict[int, Array]()
         for at in sorted(dispersed):
             joint = pieces[at].joint
             bare_joint = ROOT
             if joint > ROOT:
                 bare_joint = model.getJointId(robot.model.names[joint])
             changes = mass[:, at], density[:, at], com[:, at], inertia[:, at]
-            changed[bare_joint] = changed.get(bare_joint, 0.0) + varied(pieces[at], *changes)
+            changed[bare_joint] = changed.get(bare_joint, 0.0) + varied(
+                pieces[at], *changes
+            )
         for bare_joint, change in changed.items():
-            changed[bare_joint] = model.inertias[bare_joint].toPseudoInertia().toMatrix() + change
+            changed[bare_joint] = (
+                model.inertias[bare_joint].toPseudoInertia().toMatrix() + change
+            )
         return dict(zip(changed, map(properties, changed.values()), strict=True))
 
     def _springs(self, drawn: Array) -> dict[str, Array]:
@@ -332,10 +367,16 @@ class Dispersions:
         if not self._kinds & {*_OF_INPUTS, "misalignment"}:
             return None
         gain, bias = self._of("gain", drawn), self._of("bias", drawn)
-        until, angles = self._of("fails", drawn, np.inf), self._of("misalignment", drawn)
-        turn: list[Array] = [np.empty((len(drawn), 0))]  # the actual axes of tau_b and F_b
+        until, angles = (
+            self._of("fails", drawn, np.inf),
+            self._of("misalignment", drawn),
+        )
+        # the actual axes of tau_b and F_b
+        turn: list[Array] = [np.empty((len(drawn), 0))]
         for first in self._plant.triads:
-            turn += [turned(axis, angles[:, first + k]) for k, axis in enumerate(np.eye(3))]
+            turn += [
+                turned(axis, angles[:, first + k]) for k, axis in enumerate(np.eye(3))
+            ]
         return ActuatorFaults(1.0 + gain, bias, until, np.concatenate(turn, axis=1))
 
     def delays(self, drawn: Array) -> Array:
@@ -362,7 +403,9 @@ class Dispersions:
                 before = (np.array([x]) for x in (old.mass, old.lever, old.inertia))
                 # `parameters` include the wheels of a body, but `body` and `before` do not.
                 # Therefore only the change from `before` to `body` is added to `parameters`.
-                parameters[:, body_at] += _parameters(axes, *body) - _parameters(axes, *before)
+                parameters[:, body_at] += _parameters(axes, *body) - _parameters(
+                    axes, *before
+                )
             runs["bodies"] = parameters.reshape(count, -1)
         if "misalignment" in self._kinds:
             pointed = _pointed_lanes(plant.robot, tree, self._of("misalignment", drawn))
@@ -396,8 +439,12 @@ class Dispersions:
             robot = robot.with_bodies(drawn_bodies)
         springs = {"stiffness": robot.stiffness, "damping": robot.damping}
         for kind, values in self._springs(rows).items():
-            springs[kind] = dict(zip(robot.joint_names, values[0].tolist(), strict=True))
-        robot = replace(robot, stiffness=springs["stiffness"], damping=springs["damping"])
+            springs[kind] = dict(
+                zip(robot.joint_names, values[0].tolist(), strict=True)
+            )
+        robot = replace(
+            robot, stiffness=springs["stiffness"], damping=springs["damping"]
+        )
         if policy and self._kinds & {*_OF_SENSORS}:
             errors = (self._of(kind, rows)[0] for kind in (*_OF_SENSORS, "seed"))
             policy = _with_sensor_errors(policy, *errors)
@@ -406,7 +453,9 @@ class Dispersions:
             if policy and policy.commanded_robot:
                 # The allocation must use the nominal directions.
                 policy = _Bound(policy, plant.robot)
-        state = StateMap(robot, reference=plant.state.reference, frame=plant.state.frame)
+        state = StateMap(
+            robot, reference=plant.state.reference, frame=plant.state.frame
+        )
         faults = self._faults(rows)
         actuator_faults = None
         if faults is not None:
@@ -432,7 +481,9 @@ class _Bound(Policy):
         return bound(self.policy, self.robot)
 
 
-def _with_sensor_errors(policy: Policy, bias: Array, deviation: Array, seed: Array) -> Policy:
+def _with_sensor_errors(
+    policy: Policy, bias: Array, deviation: Array, seed: Array
+) -> Policy:
     """Add a bias and white noise to the measurements (ny,) of a policy; return the new policy.
 
     The measurements are the states or outputs that the policy feeds back. `deviation` (ny,)
@@ -457,10 +508,14 @@ def _parameters(axes: Array, mass: Array, com: Array, inertia: Array) -> Array:
     the first moment m c with the centre of mass c, and six entries (xx xy xz yy yz zz) of the
     inertia about the origin. The argument `inertia` (N, 3, 3) is about the centre of mass.
     """
-    square = (com * com).sum(axis=1)[:, None, None] * np.eye(3) - com[:, :, None] * com[:, None]
+    square = (com * com).sum(axis=1)[:, None, None] * np.eye(3) - com[:, :, None] * com[
+        :, None
+    ]
     about = axes.T @ (inertia + mass[:, None, None] * square) @ axes
     rows, columns = np.triu_indices(3)
-    return np.column_stack((mass, mass[:, None] * row_products(com, axes), about[:, rows, columns]))
+    return np.column_stack(
+        (mass, mass[:, None] * row_products(com, axes), about[:, rows, columns])
+    )
 
 
 def turned(direction: object, angles: Array) -> Array:
@@ -500,15 +555,26 @@ def _pointed_lanes(robot: Robot, tree: Tree, angles: Array) -> dict[str, Array]:
         axes = tree.axes[body].T @ placement.rotation
         after = turned(before, angles[:, at])
         if at in inputs:
-            forces = [placement.act(pin.Force(_pointed(item, x).wrench)).vector for x in np.eye(3)]
+            forces = [
+                placement.act(pin.Force(_pointed(item, x).wrench)).vector
+                for x in np.eye(3)
+            ]
             columns = np.column_stack(forces)
-            parts = [tree.axes[body].T @ columns[rows] for rows in (PIN_ANGULAR, PIN_LINEAR)]
-            wrench[:, inputs.index(at)] += row_products(after - before, np.concatenate(parts).T)
+            parts = [
+                tree.axes[body].T @ columns[rows] for rows in (PIN_ANGULAR, PIN_LINEAR)
+            ]
+            wrench[:, inputs.index(at)] += row_products(
+                after - before, np.concatenate(parts).T
+            )
         if isinstance(item, ReactionWheel) and item.momentum:
-            stored[:, storing.index(body)] += item.momentum * row_products(after - before, axes.T)
+            stored[:, storing.index(body)] += item.momentum * row_products(
+                after - before, axes.T
+            )
         if isinstance(item, ReactionWheel) and item.inertia:
             wheel = names.index(actuator_names[0]) - ROOT
-            fixed[:, wheel, :9] = [(axes @ turned_to(direction)).ravel("F") for direction in after]
+            fixed[:, wheel, :9] = [
+                (axes @ turned_to(direction)).ravel("F") for direction in after
+            ]
             a = row_products(after, axes.T)
             b = axes @ before
             change = np.outer(b, b) - a[:, :, None] * a[:, None]

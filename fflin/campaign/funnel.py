@@ -19,7 +19,15 @@ from fflin.base.tables import folded, grid
 from fflin.base.validation import Array, ArrayLike, Vector
 from fflin.base.writing import as_path
 from fflin.batch.run import Execution, Progress
-from fflin.campaign.runs import EDGE, KINDS, CampaignJob, Judge, completed, kind_named, of_campaign
+from fflin.campaign.runs import (
+    EDGE,
+    KINDS,
+    CampaignJob,
+    Judge,
+    completed,
+    kind_named,
+    of_campaign,
+)
 from fflin.control.tracking import TrajectoryFeedback, prepared
 from fflin.control.tvlqr import GainSchedule
 from fflin.dynamics.coordinates import moved_by, moving_error
@@ -29,7 +37,8 @@ from fflin.linear.trajectory import Trajectory
 from fflin.robot.robot import Robot
 
 _OPTIONS = ("dt", "method", "project", "sample", "delay", "limits", "disturbance")
-_ROUNDING = 1e-12  # eigenvalues of the scaled P up to this fraction of the largest count as zero
+# eigenvalues of the scaled P up to this fraction of the largest count as zero
+_ROUNDING = 1e-12
 
 # The search for the largest level simulates _PILOTS runs at each trial level, and halves the square
 # root of the level at most _HALVINGS times.
@@ -179,15 +188,26 @@ class Funnel(Design):
     def trajectory(self) -> Trajectory:
         """The followed trajectory."""
         return Trajectory(
-            self.robot, self.knots, self.q, self.v, self.u, hold=self.hold, frame=self.frame
+            self.robot,
+            self.knots,
+            self.q,
+            self.v,
+            self.u,
+            hold=self.hold,
+            frame=self.frame,
         )
 
     def level(self, t: float) -> float:
         """Return rho at time t; between two knots, the smaller of their two levels."""
         t = validation.number("t", t)
         if not self.t[0] <= t <= self.t[-1]:
-            raise InputError(f"t is {t:g} s, expected {self.t[0]:g} to {self.t[-1]:g} s")
-        near = [self.t.searchsorted(t, side) - (side == "right") for side in ("right", "left")]
+            raise InputError(
+                f"t is {t:g} s, expected {self.t[0]:g} to {self.t[-1]:g} s"
+            )
+        near = [
+            self.t.searchsorted(t, side) - (side == "right")
+            for side in ("right", "left")
+        ]
         return float(self.rho[near].min())
 
     def cost(self, t: float) -> Array:
@@ -249,7 +269,18 @@ class Funnel(Design):
             "tried: confidence interval of the success rate of runs that start up to the largest "
             "level tried",
         ]
-        rows = [["t [s]", "rho", "base [deg]", "base [m]", "joint", "runs", "inside", "tried"]]
+        rows = [
+            [
+                "t [s]",
+                "rho",
+                "base [deg]",
+                "base [m]",
+                "joint",
+                "runs",
+                "inside",
+                "tried",
+            ]
+        ]
         wide = (self.attitude, self.position, self.joints)
         for k, (low, high) in enumerate(100.0 * self.rate):
             reach = [f"{half_axes[k].max(initial=0.0):.3g}" for half_axes in wide]
@@ -257,7 +288,9 @@ class Funnel(Design):
             if self.inside[k] == count:
                 many += " +"
             shares = [f"{100.0 * self.inside_rate[k]:.1f} %", f"{low:.0f}-{high:.0f} %"]
-            rows.append([f"{self.t[k]:.4g}", f"{self.rho[k]:.3g}", *reach, many, *shares])
+            rows.append(
+                [f"{self.t[k]:.4g}", f"{self.rho[k]:.3g}", *reach, many, *shares]
+            )
         return "\n".join([folded([head]), "", grid(rows, "r"), "", folded(tail)])
 
     @classmethod
@@ -355,7 +388,9 @@ def funnel(
     """
     validation.instance("robot", robot, Robot, "a fflin.Robot")
     expected = "a GainSchedule or a TrajectoryFeedback"
-    validation.instance("schedule", schedule, (GainSchedule, TrajectoryFeedback), expected)
+    validation.instance(
+        "schedule", schedule, (GainSchedule, TrajectoryFeedback), expected
+    )
     feedback = prepared(schedule, robot)
     assert isinstance(feedback, TrajectoryFeedback)
     require_known("option of funnel", options, _OPTIONS)
@@ -374,12 +409,16 @@ def funnel(
     motion, gains = feedback.trajectory, feedback.schedule
     reached = partial(_outcomes, final, limits, gains.P[-1])
     indices = _indices(motion, gains, knots)
-    jobs = [runs_from(robot, feedback, pair, engine, options, reached) for pair in indices]
+    jobs = [
+        runs_from(robot, feedback, pair, engine, options, reached) for pair in indices
+    ]
     tried, outcomes = np.empty(len(jobs)), np.empty((len(jobs), samples))
     with how:
         for knot, (job, (_, first)) in enumerate(zip(jobs, indices, strict=True)):
             rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(knot,)))
-            tried[knot], outcomes[knot] = _tested(job, gains.P[first], samples, rng, how)
+            tried[knot], outcomes[knot] = _tested(
+                job, gains.P[first], samples, rng, how
+            )
             if how.progress:
                 how.progress(knot + 1, len(jobs))
     return Funnel._of(
@@ -398,7 +437,10 @@ def funnel(
 
 
 def _outcomes(
-    final: Mapping[str, float], within: Mapping[str, float], P: Array, runs: Mapping[str, Array]
+    final: Mapping[str, float],
+    within: Mapping[str, float],
+    P: Array,
+    runs: Mapping[str, Array],
 ) -> dict[str, Array]:
     """Return {"outcome": codes (N,)} of runs; `Funnel` lists the codes.
 
@@ -406,12 +448,16 @@ def _outcomes(
     time}. The kind "level" is e' P e, where e (nx,) is the final state error.
     """
     e = runs["state_errors"][:, -1]
-    largest, last = (dict(zip(KINDS, runs[key].T, strict=True)) for key in ("largest", "errors"))
+    largest, last = (
+        dict(zip(KINDS, runs[key].T, strict=True)) for key in ("largest", "errors")
+    )
     last["level"] = ((e @ P) * e).sum(axis=1)
     stopped = (runs["stop"] != 0.0) | (largest["attitude"] > EDGE)
     failures = [stopped]
     for sizes, bounds in ((largest, within), (last, final)):
-        failures.append(~np.all([sizes[key] <= bound for key, bound in bounds.items()], axis=0))
+        failures.append(
+            ~np.all([sizes[key] <= bound for key, bound in bounds.items()], axis=0)
+        )
     return {"outcome": np.select(failures, [1.0, 2.0, 3.0])}
 
 
@@ -438,7 +484,9 @@ def _tested(
         starts = moved_by("local", np.tile(job.x0, (len(e), 1)), e) - job.x0
         return completed(job, starts, how)["outcome"]
 
-    largest = [_LARGEST_LENGTH if joint.prismatic else _LARGEST_ANGLE for joint in joints]
+    largest = [
+        _LARGEST_LENGTH if joint.prismatic else _LARGEST_ANGLE for joint in joints
+    ]
     reach = [
         np.linalg.norm(W[:3], 2) / np.sin(np.radians(_LARGEST_ATTITUDE / 2.0)),
         np.linalg.norm(W[3:6], 2) / _LARGEST_LENGTH,
@@ -473,30 +521,46 @@ def runs_from(
     """
     motion, schedule, (k, first) = feedback.trajectory, feedback.schedule, knot
     rest = {name: getattr(motion, name)[k:] for name in ("t", "q", "v", "u")}
-    later = {name: getattr(schedule, name)[first:] for name in ("t", "K", "P", "A", "B")}
+    later = {
+        name: getattr(schedule, name)[first:] for name in ("t", "K", "P", "A", "B")
+    }
     policy = replace(
-        feedback, trajectory=replace(motion, **rest), schedule=replace(schedule, **later)
+        feedback,
+        trajectory=replace(motion, **rest),
+        schedule=replace(schedule, **later),
     )
     # The attitude at the knot can be any rotation, so the chart is centred at this attitude.
     # The histories have two entries: at the start and at the end of a run.
-    options = {"reference": pin.XYZQUATToSE3(motion.q[k][:7]), "histories": 2, **options}
+    options = {
+        "reference": pin.XYZQUATToSE3(motion.q[k][:7]),
+        "histories": 2,
+        **options,
+    }
     return CampaignJob(robot, policy, None, 0, engine, options, judge)
 
 
 def _bounds(name: str, given: object, kinds: Collection[str]) -> dict[str, float]:
     """Return the checked bounds {kind: largest error}, or raise `InputError`."""
-    given = {kind_named(str(key)): x for key, x in validation.by_name(name, given, "kind").items()}
+    given = {
+        kind_named(str(key)): x
+        for key, x in validation.by_name(name, given, "kind").items()
+    }
     require_known(f"kind of error in {name}", given, kinds)
     if name == "goal" and not given:
         raise InputError(
             "goal is empty; give the largest final error of at least one kind, such as "
             "{'attitude': 1.0} in deg"
         )
-    return {key: validation.positive(f"{name} '{key}'", value) for key, value in given.items()}
+    return {
+        key: validation.positive(f"{name} '{key}'", value)
+        for key, value in given.items()
+    }
 
 
 def _shown(bounds: Mapping[str, float]) -> str:
-    return ", ".join(f"{key} up to {bound:g} {KINDS[key]}" for key, bound in bounds.items())
+    return ", ".join(
+        f"{key} up to {bound:g} {KINDS[key]}" for key, bound in bounds.items()
+    )
 
 
 def _indices(
@@ -507,7 +571,9 @@ def _indices(
     at = schedule_times.searchsorted(t - 1e-6 * (schedule.dt or t[-1])).clip(
         max=len(schedule_times) - 1
     )
-    both = np.flatnonzero(np.abs(schedule_times[at] - t) <= 1e-6 * (schedule.dt or t[-1]))
+    both = np.flatnonzero(
+        np.abs(schedule_times[at] - t) <= 1e-6 * (schedule.dt or t[-1])
+    )
     both = both[both < len(t) - 1]
     if not len(both):
         raise InputError(
@@ -523,5 +589,7 @@ def _indices(
         times = validation.vector("knots", times, times.size, "times of knots")
         chosen = both[np.abs(motion.t[both] - times[:, None]).argmin(axis=1)]
     if not len(chosen):
-        raise InputError("knots is empty; give the number of knots, or a list of times [s]")
+        raise InputError(
+            "knots is empty; give the number of knots, or a list of times [s]"
+        )
     return [(k, int(at[k])) for k in sorted({*chosen.tolist()})]

@@ -34,7 +34,17 @@ from fflin.simulation.report import pushed
 _STAGE, _GROWTH = 256, 1.25
 
 _OPTIONS = {option.name for option in fields(SimulationOptions)} - {
-    *("robot", "policy", "duration", "events", "callback", "linear", "every", "progress", "engine")
+    *(
+        "robot",
+        "policy",
+        "duration",
+        "events",
+        "callback",
+        "linear",
+        "every",
+        "progress",
+        "engine",
+    )
 }
 
 
@@ -214,7 +224,9 @@ def monte_carlo(
         _require_sendable(job)
     header = _header(job) | {"seed": seed, "asked": runs, "confidence": confidence}
     none = files.MemoryStore(0, size, shapes).arrays
-    header["goals"] = wanted = _goals(goals, until, Campaign.of(none, {**header, "goals": ()}))
+    header["goals"] = wanted = _goals(
+        goals, until, Campaign.of(none, {**header, "goals": ()})
+    )
     with placed(dispersions):
         job.dispersions.require_possible(runs)
     request = ""
@@ -223,7 +235,8 @@ def monte_carlo(
         earlier = None if truth("overwrite", overwrite) else _earlier(path, request)
         if earlier and until is None and len(earlier) == runs:
             note = (
-                f"all runs are from {path}, which an earlier call wrote; none was simulated again"
+                f"all runs are from {path}, which an earlier call wrote; "
+                "none was simulated again"
             )
             return replace(
                 earlier,
@@ -237,7 +250,9 @@ def monte_carlo(
             store = files.FileStore(path, request, runs, size, shapes, {}, texts)
     assert store is not None
     with closing(store), how:
-        expect(how.progress, [(job, job.dispersions.drawn(0, min(runs, LANES)), runs)], how)
+        expect(
+            how.progress, [(job, job.dispersions.drawn(0, min(runs, LANES)), runs)], how
+        )
         enough = None
         if until is not None:
             enough = partial(_is_narrow, header, until, width, confidence)
@@ -271,11 +286,23 @@ def _computed(
     )
     while enough is not None and done < runs and not enough(store.read(done)):
         done = min(runs, math.ceil(_GROWTH * done / _STAGE) * _STAGE)
-        run_chunks(job, job.rows, store, how, how.progress, of_what="runs", made=made, upto=done)
+        run_chunks(
+            job,
+            job.rows,
+            store,
+            how,
+            how.progress,
+            of_what="runs",
+            made=made,
+            upto=done,
+        )
     shapes = {"drawn": (len(job.dispersions.names),), **job.shapes}
     for start in range(done, runs, store.chunk):
         stop = min(start + store.chunk, runs)
-        unused = {key: np.full((stop - start, *shape), NOT_RUN) for key, shape in shapes.items()}
+        unused = {
+            key: np.full((stop - start, *shape), NOT_RUN)
+            for key, shape in shapes.items()
+        }
         store.write(start, stop, unused)
     return resumed
 
@@ -322,7 +349,9 @@ def _goals(given: object, until: str | None, none: Campaign) -> tuple[str, ...]:
     Each goal is evaluated on the empty campaign `none`, so that an invalid goal raises an error.
     """
     listed = [given] if isinstance(given, str) else given
-    goals: list[str] = [*instance("goals", listed, Sequence, "a list such as ['attitude < 1 deg']")]
+    goals: list[str] = [
+        *instance("goals", listed, Sequence, "a list such as ['attitude < 1 deg']")
+    ]
     if until is not None:
         goals.append(until)
     for goal in goals:
@@ -353,7 +382,9 @@ def _header(job: CampaignJob) -> dict[str, object]:
     robot = job.plant.robot
     judged = list[str]()
     fed_back = np.isin(plant.state.names, plan.steered or plant.state.names)
-    for number, (kind, part) in enumerate(zip(KINDS, plant.state.groups[:3], strict=False)):
+    for number, (kind, part) in enumerate(
+        zip(KINDS, plant.state.groups[:3], strict=False)
+    ):
         if fed_back[part][job.kinds[part] == number].any():
             judged.append(kind)
     x_end = job.target if job.target.ndim == 1 else job.target[-1]
@@ -389,6 +420,12 @@ def _request(job: CampaignJob, runs: int, header: Mapping[str, object]) -> str:
     of fflin and Pinocchio. The goals and the confidence level are excluded.
     """
     drawn = job.dispersions.drawn(0, min(runs, _STAGE))
-    kept = {key: value for key, value in header.items() if key not in ("goals", "confidence")}
+    kept = {
+        key: value
+        for key, value in header.items()
+        if key not in ("goals", "confidence")
+    }
     call = repr((kept, __version__, pin.__version__))
-    return content_digest({"call": call, "drawn": drawn, "first": job.digest(drawn[:1])})
+    return content_digest(
+        {"call": call, "drawn": drawn, "first": job.digest(drawn[:1])}
+    )

@@ -34,7 +34,11 @@ _DECADES, _BARS, _BINS = 6, 10, 48
 
 
 def plot_campaign(
-    campaign: Campaign, path: str | Path | None = None, *, worst: int = 3, axes: Axes | None = None
+    campaign: Campaign,
+    path: str | Path | None = None,
+    *,
+    worst: int = 3,
+    axes: Axes | None = None,
 ) -> Figure:
     """Draw the error histories, final errors, inputs and rank correlations of a campaign.
 
@@ -74,7 +78,9 @@ def plot_campaign(
     >>> runs = fflin.monte_carlo(robot, policy, {"q_b": 0.02}, runs=8, duration=5.0, histories=20)
     >>> figure = fflin.plot_campaign(runs, "campaign.png")
     """
-    instance("campaign", campaign, Campaign, "a Campaign, as fflin.monte_carlo returns it")
+    instance(
+        "campaign", campaign, Campaign, "a Campaign, as fflin.monte_carlo returns it"
+    )
     top = whole("worst", worst, 0, len(_WORST))
     runs = campaign.worst(top) if top else []
     groups = dict[str, list[int]]()
@@ -85,7 +91,9 @@ def plot_campaign(
             groups.setdefault(group_of(key), []).append(index)
         rows.append([(_error, kind, runs) for kind in kinds])
     rows.append([(_histogram, kind) for kind in kinds])
-    last: list[Any] = [(_inputs, group, indices, runs) for group, indices in groups.items()]
+    last: list[Any] = [
+        (_inputs, group, indices, runs) for group, indices in groups.items()
+    ]
     last.append((_correlations,))
     across = math.ceil(len(last) / math.ceil(len(last) / 3))
     rows += [last[at : at + across] for at in range(0, len(last), across)]
@@ -142,7 +150,8 @@ def plot_validity(
         left.set_xticks(levels, [f"{x:.3g}" for x in levels])
         left.minorticks_off()
         left.set(
-            title="prediction error of the linear loop", ylabel="error [% of the displacement]"
+            title="prediction error of the linear loop",
+            ylabel="error [% of the displacement]",
         )
         settled = np.array([outcome == "settled" for outcome in validity.outcomes])
         tried = percent * validity.sampled
@@ -154,7 +163,9 @@ def plot_validity(
             color=[COLORS[2], COLORS[1]],
             label=["settled", "not settled"],
         )
-        right.set(title=f"{validity.settled} of {len(settled)} runs settled", ylabel="runs")
+        right.set(
+            title=f"{validity.settled} of {len(settled)} runs settled", ylabel="runs"
+        )
         right.yaxis.get_major_locator().set_params(integer=True)
         for panel in (left, right):
             panel.set_xlabel("displacement [% of the largest]")
@@ -209,9 +220,13 @@ def plot_funnel(
             ax.fill_between(t, half.max(axis=1), color=color, alpha=0.15)
             ax.set(ylabel=name, ylim=(0.0, None))
         low, high = percent * funnel.rate.T
-        panel[-1].fill_between(t, low, high, color="#888888", alpha=0.3, label="all starts tried")
+        panel[-1].fill_between(
+            t, low, high, color="#888888", alpha=0.3, label="all starts tried"
+        )
         inside = percent * funnel.inside_rate
-        panel[-1].plot(t, inside, "o-", color="#000000", ms=3, label="starts inside, lower bound")
+        panel[-1].plot(
+            t, inside, "o-", color="#000000", ms=3, label="starts inside, lower bound"
+        )
         panel[-1].set(xlabel="t [s]", ylabel="success rate [%]", ylim=(0.0, 102.0))
         figure.legend(loc="outside lower center", ncols=2)
         figure.suptitle(
@@ -223,17 +238,25 @@ def plot_funnel(
 
 
 def _bands(
-    axes: Axes, campaign: Campaign, values: Array, runs: list[int], selected: Any = slice(None)
+    axes: Axes,
+    campaign: Campaign,
+    values: Array,
+    runs: list[int],
+    selected: Any = slice(None),
 ) -> None:
     """Draw values (N, M) over time: lines of `runs`, bands and median of the `selected` runs."""
     # The bands and the median show infinite values of stopped runs at the upper edge of the axes.
     # The quantiles are not interpolated between runs, because a mean of a finite value and the edge
     # has no meaning.
-    most = 1.15 * float(np.where(np.isfinite(values), values, 0.0).max(initial=0.0)) or 1.0
+    most = (
+        1.15 * float(np.where(np.isfinite(values), values, 0.0).max(initial=0.0)) or 1.0
+    )
     shown = np.minimum(values[selected], most)
     t = campaign.times
     for tail, name, dark in _BANDS:
-        low, high = np.quantile(shown, (tail, 1.0 - tail), axis=0, method="inverted_cdf")
+        low, high = np.quantile(
+            shown, (tail, 1.0 - tail), axis=0, method="inverted_cdf"
+        )
         axes.fill_between(t, low, high, color=_INK, alpha=dark, lw=0, label=name)
     half = np.quantile(shown, 0.5, axis=0, method="inverted_cdf")
     axes.plot(t, half, color=_INK, lw=1.8, label="median")
@@ -250,7 +273,9 @@ def _error(axes: Axes, campaign: Campaign, kind: str, runs: list[int]) -> None:
     most = axes.get_ylim()[1]
     least = float(ends[ends > 0.0].min(initial=np.inf))
     if least < 0.05 * most:  # logarithmic, so that small final values are visible
-        axes.set(yscale="log", ylim=(max(0.5 * least, most * 10.0**-_DECADES), 1.5 * most))
+        axes.set(
+            yscale="log", ylim=(max(0.5 * least, most * 10.0**-_DECADES), 1.5 * most)
+        )
     _goals(axes.axhline, campaign, kind)
     axes.set(title=f"{kind} error", ylabel=f"[{KINDS[kind]}]")
 
@@ -278,7 +303,13 @@ def _histogram(axes: Axes, campaign: Campaign, kind: str) -> None:
         axes.set_xscale("log")
     for name, (label, color) in names.items():
         kept: Any = edges
-        axes.hist(values_of[name].clip(*edges[[0, -1]]), kept, color=color, alpha=0.55, label=label)
+        axes.hist(
+            values_of[name].clip(*edges[[0, -1]]),
+            kept,
+            color=color,
+            alpha=0.55,
+            label=label,
+        )
         for p, mark, style in _PERCENTILES:
             at = campaign.quantile(name, p).value
             if math.isfinite(at):
@@ -314,7 +345,9 @@ def _correlations(axes: Axes, campaign: Campaign) -> None:
     doubt = min(1.0, 3.0 / math.sqrt(len(campaign)))
     axes.axvspan(-doubt, doubt, color="#999999", alpha=0.18, lw=0)
     colors = [_INK if size > 0.0 else COLORS[1] for _, size in bars]
-    axes.barh([name for name, _ in bars], [size for _, size in bars], color=colors, height=0.7)
+    axes.barh(
+        [name for name, _ in bars], [size for _, size in bars], color=colors, height=0.7
+    )
     axes.axvline(0.0, color="#333333", lw=0.8)
     axes.set(title=f"correlation with {campaign.about}")
     axes.set(xlabel="rank correlation (grey: not significant)")

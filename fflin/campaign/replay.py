@@ -21,7 +21,9 @@ if TYPE_CHECKING:
 _ANY_SPREAD = (0.0, 1.0)
 
 
-def replay_settings(dispersions: object, options: Mapping[str, object]) -> dict[str, object]:
+def replay_settings(
+    dispersions: object, options: Mapping[str, object]
+) -> dict[str, object]:
     """Return what is needed to repeat the runs of a call, as JSON values.
 
     The result contains the dispersed names, each with a flag whether the names of a pattern share
@@ -85,8 +87,13 @@ def job_of(
     placement = again.get("reference")
     if isinstance(placement, Mapping):
         again["reference"] = pin.SE3(np.array(placement["placement"]))
-    job = CampaignJob(checked_robot, policy, spreads, campaign.seed, campaign.engine, again)
-    if job.dispersions.names != campaign.names or job.plant.state.names != campaign.state_names:
+    job = CampaignJob(
+        checked_robot, policy, spreads, campaign.seed, campaign.engine, again
+    )
+    if (
+        job.dispersions.names != campaign.names
+        or job.plant.state.names != campaign.state_names
+    ):
         raise InputError(
             "the robot or policy is not that of the campaign, because the names of the drawn "
             "values or of the states differ; give the arguments of the call of monte_carlo"

@@ -37,10 +37,13 @@ def campaign_report(campaign: Campaign) -> str:
         rows.append([name, unit, *(f"{x:.3g}" for x in figures), when])
     causes: dict[str, list[str]] = {}
     for name, influence in influences(campaign).items():
-        first = ", ".join(f"{key}\u00a0{value:+.2f}" for key, value in list(influence.items())[:4])
+        first = ", ".join(
+            f"{key}\u00a0{value:+.2f}" for key, value in list(influence.items())[:4]
+        )
         causes.setdefault(first or "none significant", []).append(name)
     correlations = [
-        f"rank correlations with {', '.join(names)}: {first}" for first, names in causes.items()
+        f"rank correlations with {', '.join(names)}: {first}"
+        for first, names in causes.items()
     ]
     goals = [goal_met(campaign, goal) for goal in campaign.goals]
     ended = ended_of(campaign)
@@ -59,7 +62,11 @@ def _errors(campaign: Campaign) -> dict[str, str]:
         names[WHEEL_SPEEDS] = campaign.figure(WHEEL_SPEEDS)[1]
     if campaign.modes:
         names[MODES] = campaign.figure(MODES)[1]
-    return {name: unit for name, unit in names.items() if campaign.values(f"worst {name}").any()}
+    return {
+        name: unit
+        for name, unit in names.items()
+        if campaign.values(f"worst {name}").any()
+    }
 
 
 def ended_of(campaign: Campaign) -> str:
@@ -100,7 +107,9 @@ def worst_runs(campaign: Campaign, k: int) -> list[str]:
     weights = {key.strip("|"): abs(x) for key, x in campaign.sensitivity().items()}
     # A drawn value is influential if it is far from the median and its correlation is large. The
     # seed of the noise has no correlation, so it is never influential.
-    out = abs(ranks - ranks.mean()) * [weights.get(name, 0.0) for name in campaign.names]
+    out = abs(ranks - ranks.mean()) * [
+        weights.get(name, 0.0) for name in campaign.names
+    ]
     for run in campaign.worst(k):
         far = int(out[run].argmax())
         stop = STOPS[int(campaign.stop[run])]
@@ -131,7 +140,9 @@ def campaign_record(campaign: Campaign, worst: int) -> dict[str, object]:
     def plain(values: Iterable[float]) -> list[float | None]:
         return [x if math.isfinite(x) else None for x in values]
 
-    names = [f"{prefix}{kind}" for kind in KINDS for prefix in ("", "worst ", "settle ")]
+    names = [
+        f"{prefix}{kind}" for kind in KINDS for prefix in ("", "worst ", "settle ")
+    ]
     sure = {"confidence": campaign.confidence}
     header = [
         "robot",
@@ -153,7 +164,9 @@ def campaign_record(campaign: Campaign, worst: int) -> dict[str, object]:
             name: {f"{p:g}": plain(campaign.quantile(name, p, **sure)) for p in _SHARES}
             for name in names
         },
-        "goals": {goal: plain(campaign.fraction(goal, **sure)) for goal in campaign.goals},
+        "goals": {
+            goal: plain(campaign.fraction(goal, **sure)) for goal in campaign.goals
+        },
         "goes_with": influences(campaign),
         "worst": campaign.worst(worst) if worst else [],
     }
@@ -161,5 +174,7 @@ def campaign_record(campaign: Campaign, worst: int) -> dict[str, object]:
 
 def _stops(campaign: Campaign) -> dict[str, int]:
     """Return {reason: number of runs that were stopped}."""
-    counts = {word: int((campaign.stop == at).sum()) for at, word in enumerate(STOPS) if at}
+    counts = {
+        word: int((campaign.stop == at).sum()) for at, word in enumerate(STOPS) if at
+    }
     return {word: number for word, number in counts.items() if number}

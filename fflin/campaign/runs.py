@@ -25,7 +25,12 @@ from fflin.batch.run import Execution, Progress, Rows, run_chunks
 from fflin.campaign.dispersions import Dispersions
 from fflin.campaign.spreads import placed
 from fflin.control.channel import Saturation
-from fflin.dynamics.coordinates import attitude_errors, moving_errors, states_of, unwound
+from fflin.dynamics.coordinates import (
+    attitude_errors,
+    moving_errors,
+    states_of,
+    unwound,
+)
 from fflin.dynamics.state import StateMap
 from fflin.kernel import loop
 from fflin.kernel.compiled import kernel
@@ -98,7 +103,9 @@ def kinds_of(state: StateMap, wheels: Collection[str]) -> Indices:
     """
     kind = np.zeros(state.nx, dtype=np.intp)
     groups, modes = state.groups, state.robot.modes
-    for number, group in enumerate((groups.r_b, groups.q_m, groups.omega_b, groups.v_b), 1):
+    for number, group in enumerate(
+        (groups.r_b, groups.q_m, groups.omega_b, groups.v_b), 1
+    ):
         kind[group] = number
     kind[groups.qdot_m] = len(KINDS) - 1
     for index, joint in enumerate(state.robot.joints):
@@ -137,7 +144,12 @@ class CampaignJob:
         histories = settings.pop("histories", 0)
         unlimited = settings.pop("unlimited", False)
         within_chart = settings.pop("within_chart", False)
-        settings |= {"robot": robot, "policy": policy, "linear": False, "progress": False}
+        settings |= {
+            "robot": robot,
+            "policy": policy,
+            "linear": False,
+            "progress": False,
+        }
         self.plan = Plan(SimulationOptions(**settings))
         if unlimited:
             most = np.full(len(self.plan.initial), np.inf)
@@ -149,7 +161,8 @@ class CampaignJob:
         self.engine = lanes.engine_of(engine, self.plan, many=True)
         state = self.plant.state
         self.threaded = self.engine == "compiled"
-        self.lanes = LANES if self.threaded else 1  # number of runs that are computed together
+        # number of runs that are computed together
+        self.lanes = LANES if self.threaded else 1
         self.x0 = state.read(self.plan.q, self.plan.v, near=self.plan.near)
         # Errors are deviations from `target`: a fixed state (nx,) or the states (steps + 1, nx) of
         # a reference motion. `path` contains q and nu of the reference motion, or is empty.
@@ -168,15 +181,20 @@ class CampaignJob:
                 given, self.plant, self.plan.policy, self.x0, seed, times
             )
         # Steps at which the histories have entries.
-        self.steps = np.unique(np.linspace(0.0, times.steps, histories).round().astype(int))
+        self.steps = np.unique(
+            np.linspace(0.0, times.steps, histories).round().astype(int)
+        )
         # `outcome_shapes` contains the shape of each array of an outcome. `shapes` contains the
         # shape per run of each array that `judge` returns. Both are read from the outcome of a run
         # of zero steps.
         start = self.plan.q[None], self.plan.v[None], self.plan.initial[None]
-        none = Recording(np.zeros(1), *start, np.zeros((1, 6)), np.zeros((1, 3)), 0, "", "python")
+        none = Recording(
+            np.zeros(1), *start, np.zeros((1, 6)), np.zeros((1, 3)), 0, "", "python"
+        )
         outcome = self.outcome(none)
         self.outcome_shapes = {key: x.shape for key, x in outcome.items()}
-        with np.errstate(invalid="ignore"):  # `judge` may divide by an initial error of 0
+        # `judge` may divide by an initial error of 0
+        with np.errstate(invalid="ignore"):
             results = judge({key: x[None] for key, x in outcome.items()})
         self.shapes = {key: x.shape[1:] for key, x in results.items()}
 
@@ -200,7 +218,10 @@ class CampaignJob:
             return content_digest(completed(self, first, Execution()))
         plan = self.plan
         arguments = lanes.packed(self.plan, stop_conditions(self.plan))
-        entries: dict[str, object] = {**self.dispersions.in_lanes(first), "target": self.target}
+        entries: dict[str, object] = {
+            **self.dispersions.in_lanes(first),
+            "target": self.target,
+        }
         if plan.noise:
             last = min(plan.times.steps, lanes.SLOTS * plan.times.sample)
             entries["of sensors"] = lanes.noises(plan, len(arguments.law.y), 0, last)[1]
@@ -219,11 +240,16 @@ class CampaignJob:
         outcomes = MemoryStore(len(drawn), 1, self.outcome_shapes).arrays
         if self.engine == "compiled":
             runs = self.dispersions.in_lanes(drawn)
-            eight_runs, statistics = lanes.LaneLoop(self.plan, runs), RunStatistics(self)
+            eight_runs, statistics = (
+                lanes.LaneLoop(self.plan, runs),
+                RunStatistics(self),
+            )
             for first in range(0, len(drawn), LANES):
                 part = slice(first, first + LANES)
                 eight = {key: values[part] for key, values in runs.items()}
-                eight_runs.fly(statistics, {key: x[part] for key, x in outcomes.items()}, eight)
+                eight_runs.fly(
+                    statistics, {key: x[part] for key, x in outcomes.items()}, eight
+                )
         else:
             for row, drawn_row in enumerate(drawn):
                 outcome = self._one(drawn_row)
@@ -303,7 +329,9 @@ class CampaignJob:
 
             def stops(t: float, q: Array, v: Array) -> float:
                 looks = round(t / plan.times.dt) % LOOK == 0
-                return float(not (looks and over(first, self.errors(q[None], v[None])[1])[0]))
+                return float(
+                    not (looks and over(first, self.errors(q[None], v[None])[1])[0])
+                )
 
             plan = plan.replace(events=(stops,))
         return self.outcome(_recorded(plan, every=1))
@@ -315,9 +343,12 @@ class CampaignJob:
         drawn = first[: self.lanes]
         times = list[float]()
         steps = plan.times.steps
-        out = {key: np.empty((len(drawn), *shape)) for key, shape in self.shapes.items()}
+        out = {
+            key: np.empty((len(drawn), *shape)) for key, shape in self.shapes.items()
+        }
         short, long = (min(trial, steps) for trial in (_FEW_STEPS, _SOME_STEPS))
-        for trial_steps in (1, short, long):  # the run of one step compiles the loop if needed
+        # the run of one step compiles the loop if needed
+        for trial_steps in (1, short, long):
             few.plan = plan.replace(times=plan.times._replace(steps=trial_steps))
             # Other programs can slow down a trial, so the fastest of three trials counts.
             timed = partial(few.run, {"drawn": drawn}, 0, out)
@@ -325,7 +356,9 @@ class CampaignJob:
         step = 0.0
         if long > short:
             step = (times[2] - times[1]) / (long - short)
-        return (times[1] + max(step, 0.0) * (steps - short)) * math.ceil(count / self.lanes)
+        return (times[1] + max(step, 0.0) * (steps - short)) * math.ceil(
+            count / self.lanes
+        )
 
     def replay(self, drawn: Array) -> Motion:
         """Repeat the run with the drawn values (k,), by the same engine, and return its motion."""
@@ -356,7 +389,9 @@ class RunStatistics(lanes.Statistics):
         x, y, z = first[:3].tolist()
         attitude = np.array((x, y, z, math.sqrt(max(0.0, 1.0 - x * x - y * y - z * z))))
         law = lanes.no_law(state, initial)
-        law.path.point.q[3:7] = quaternion_product(conjugate(state.origin_quaternion), attitude)
+        law.path.point.q[3:7] = quaternion_product(
+            conjugate(state.origin_quaternion), attitude
+        )
         q_ref, nu_ref = job.path or (np.zeros(0), np.zeros(0))
         marks = loop.RunStatistics(
             robot=lanes.mechanics_of(job.plant),
@@ -445,7 +480,9 @@ def _recorded(plan: Plan, every: int) -> Recording:
 
 
 def expect(
-    progress: Progress | None, work: Sequence[tuple[CampaignJob, Array, int]], how: Execution
+    progress: Progress | None,
+    work: Sequence[tuple[CampaignJob, Array, int]],
+    how: Execution,
 ) -> None:
     """Report the estimated time of jobs to a progress bar.
 
@@ -479,5 +516,7 @@ def completed(
     """Run a job with drawn values (N, k), and return its arrays."""
     count = len(drawn)
     store = MemoryStore(count, chunk_size(count, how.count(job), job.lanes), job.shapes)
-    run_chunks(job, lambda start, stop: {"drawn": drawn[start:stop]}, store, how, progress)
+    run_chunks(
+        job, lambda start, stop: {"drawn": drawn[start:stop]}, store, how, progress
+    )
     return store.arrays

@@ -40,7 +40,8 @@ _WIDEST = 10.0  # largest joint displacement [rad|m] to which the step is adapte
 # The steps of a diverging run are shortened by the factor _FINER, at most _FINEST times.
 _FINER, _FINEST = 8, 2
 _MOST_STEPS = 1_000_000
-_CHECKS = 60  # approximate number of comparisons with the prediction in a run of a continuous loop
+# approximate number of comparisons with the prediction in a run of a continuous loop
+_CHECKS = 60
 
 OUTCOMES = ("slow", "settled", "chart", "diverged")
 
@@ -57,7 +58,8 @@ class Loop:
         K = StateFeedback(lin, as_double("gain", getattr(gain, "K", gain))).K
         kept = getattr(gain, "regulated", ())
         part = regulated_part(lin, any(f"qdot_m.{name}" in kept for name in lin.wheels))
-        if part.state_names == kept:  # omit states that are not fed back and cannot settle
+        # omit states that are not fed back and cannot settle
+        if part.state_names == kept:
             K = K @ selection(kept, lin.state_names).T
             lin = part
         self.robot, self.lin, self.K = robot, lin, K
@@ -65,7 +67,9 @@ class Loop:
         self.state = state = StateMap(robot, reference=lin.reference, frame=lin.frame)
         require_fit(lin, robot, state)
         if not len(lin.x0):
-            raise InputError(f"the model of '{lin.robot}' has no states, so nothing can settle")
+            raise InputError(
+                f"the model of '{lin.robot}' has no states, so nothing can settle"
+            )
         if lin.moving or not lin.is_equilibrium() or lin.v.any():
             raise InputError(
                 "the operating point is not an equilibrium at rest, so the loop cannot settle "
@@ -74,7 +78,9 @@ class Loop:
         # Full state (nx,) at the operating point, and indices of the model's states in the full
         # state.
         self.start = state.to_state(lin.q, lin.v)
-        self.model_states = np.array([state.names.index(name) for name in lin.state_names])
+        self.model_states = np.array(
+            [state.names.index(name) for name in lin.state_names]
+        )
         # State matrix of the linear loop, and its slowest decay rate [1/s].
         self.rate: Array = lin.A - lin.B @ K
         poles = np.linalg.eigvals(self.rate)
@@ -93,14 +99,18 @@ class Loop:
         from scipy.linalg import solve_continuous_lyapunov, solve_discrete_lyapunov
 
         names, full = self.lin.state_names, self.state.names
-        root_of = dict(zip(names[-len(self.lin.M) :], np.sqrt(self.lin.M.diagonal()), strict=True))
+        root_of = dict(
+            zip(names[-len(self.lin.M) :], np.sqrt(self.lin.M.diagonal()), strict=True)
+        )
         # Q contains the weights of velocities and coordinates. `root_of` is {velocity: square root
         # of its weight}, and the weight is a diagonal entry of M. `size` contains the square root
         # of the weight of each coordinate: the root for its velocity times the decay rate of the
         # loop. Coordinates and velocities are matched by name, because a velocity can be a state of
         # the model even if its coordinate is not.
         rates = dict(zip(full, full[len(full) // 2 :], strict=False))
-        size = [self.decay * root_of[rates[name]] for name in names if name not in root_of]
+        size = [
+            self.decay * root_of[rates[name]] for name in names if name not in root_of
+        ]
         Q = np.diag(np.array([*size, *root_of.values()]) ** 2)
         P: Array
         if self.lin.dt:
@@ -124,7 +134,9 @@ class Loop:
         """
         g = self.state.groups
         x = self.start.copy()
-        axis, along = (vector / np.linalg.norm(vector) for vector in rng.normal(size=(2, 3)))
+        axis, along = (
+            vector / np.linalg.norm(vector) for vector in rng.normal(size=(2, 3))
+        )
         turn = np.radians(attitude) / 2.0
         q0 = np.sqrt(1.0 - float(x[g.q_b] @ x[g.q_b]))
         relative = np.array((*(np.sin(turn) * axis), np.cos(turn)))
@@ -138,7 +150,12 @@ class Loop:
         return x
 
     def runs(
-        self, predicts: bool, limits: object, joint: float, engine: str | None, fine: int = 0
+        self,
+        predicts: bool,
+        limits: object,
+        joint: float,
+        engine: str | None,
+        fine: int = 0,
     ) -> CampaignJob:
         """Return a job that simulates the loop from displaced states.
 
@@ -152,15 +169,22 @@ class Loop:
         # `fastest` is the larger of the open-loop and the closed-loop rates. A sampled loop is open
         # between samples, so `fastest` is twice the fastest open-loop rate. In both cases, the
         # decay rate of the closed loop is also taken into account, by the term 4 * decay in `pace`.
-        free = linearize(self.robot, lin.q, lin.v, lin.u0, frame=lin.frame, reference=lin.reference)
+        free = linearize(
+            self.robot, lin.q, lin.v, lin.u0, frame=lin.frame, reference=lin.reference
+        )
         rates = [2.0 * free.A] if lin.dt else [free.A, self.rate]
-        fastest = max(float(np.abs(np.linalg.eigvals(matrix)).max()) for matrix in rates)
+        fastest = max(
+            float(np.abs(np.linalg.eigvals(matrix)).max()) for matrix in rates
+        )
         time_constants = _CONSTANTS if predicts else PATIENCE * math.log(1.0 / SETTLED)
         horizon = time_constants / decay
         pace = max(fastest, 4.0 * decay) * min(max(joint, 1.0), _WIDEST)
         # The step must also be short enough for the damping of all modes.
         matrices = [free.A] if lin.dt else [free.A, self.rate]
-        poles = [Poles("robot and the loop", np.linalg.eigvals(matrix)) for matrix in matrices]
+        poles = [
+            Poles("robot and the loop", np.linalg.eigvals(matrix))
+            for matrix in matrices
+        ]
         step = _STEP_PREDICTED if predicts else _STEP
         dt, _ = Pace(poles, CommutatorFree4, horizon).step(step / pace)
         every = 1
@@ -180,7 +204,11 @@ class Loop:
         dt, every = dt / finer, every * finer
         options = {"q0": lin.q, "v0": lin.v, "dt": dt, "duration": dt * every * checks}
         # Without `limits`, inputs do not saturate, and thrusts can be negative.
-        options |= {"limits": limits, "unlimited": limits is None, "project": not predicts}
+        options |= {
+            "limits": limits,
+            "unlimited": limits is None,
+            "project": not predicts,
+        }
         # The linear loop predicts rotations of less than 180 deg only.
         options |= {"within_chart": True}
         histories = 1
@@ -212,7 +240,9 @@ class Loop:
         over: Mask = (size <= SETTLED * first) | ~(size < DIVERGED * first)
         return over
 
-    def _judged(self, step: Array | None, runs: Mapping[str, Array]) -> dict[str, Array]:
+    def _judged(
+        self, step: Array | None, runs: Mapping[str, Array]
+    ) -> dict[str, Array]:
         """Return {"outcome": indices (N,) into OUTCOMES, "error": relative prediction errors (N,)}.
 
         `step` is the transition matrix of the linear loop from one history entry to the next. If
@@ -220,8 +250,13 @@ class Loop:
         run leaves the chart or diverges.
         """
         e, stop = runs["state_errors"][..., self.model_states], runs["stop"]
-        last, first = self.size(runs["x"][:, self.model_states] - self.lin.x0), self.size(e[:, 0])
-        turned = (stop == STOPS.index("left the chart")) | (runs["largest"][:, 0] > EDGE)
+        last, first = (
+            self.size(runs["x"][:, self.model_states] - self.lin.x0),
+            self.size(e[:, 0]),
+        )
+        turned = (stop == STOPS.index("left the chart")) | (
+            runs["largest"][:, 0] > EDGE
+        )
         diverged = (stop == STOPS.index("diverged")) | ~(last < DIVERGED * first)
         code = np.select([turned, diverged, last <= SETTLED * first], [2, 3, 1], 0)
         apart = np.zeros(len(e))

@@ -16,7 +16,8 @@ from fflin.base.writing import as_path
 
 Inverse: TypeAlias = Callable[[Array], Array]  # inverse distribution function
 
-SEED = "noise"  # name of the noise seed among the drawn values; its correlation is omitted
+# name of the noise seed among the drawn values; its correlation is omitted
+SEED = "noise"
 
 _TABLE = "dispersions"
 _FORMS = ("normal", "uniform", "values", "distribution")
@@ -95,8 +96,12 @@ def load_dispersions(path: str | Path) -> dict[str, object]:
         if key != _TABLE or not isinstance(table, dict) or not table:
             problem = "contains no spreads"
             if key != _TABLE:
-                kind = "table" if isinstance(document.record[key], dict | list) else "name"
-                problem = f"{kind} '{key}' is outside [{_TABLE}], the only table of this file"
+                kind = (
+                    "table" if isinstance(document.record[key], dict | list) else "name"
+                )
+                problem = (
+                    f"{kind} '{key}' is outside [{_TABLE}], the only table of this file"
+                )
             problem = f"{problem}; write [{_TABLE}] and below it q_b = 0.05"
             raise document.error(UnknownNameError(problem), key)
     dispersions = DispersionFile()
@@ -105,11 +110,15 @@ def load_dispersions(path: str | Path) -> dict[str, object]:
         try:
             dispersions[name] = _spread(value)
         except FflinError as error:
-            raise document.error(type(error)(f"'{name}': {error}"), _TABLE, name) from None
+            raise document.error(
+                type(error)(f"'{name}': {error}"), _TABLE, name
+            ) from None
     return dispersions
 
 
-def _names(table: Mapping[str, object], before: str = "") -> Iterator[tuple[str, object]]:
+def _names(
+    table: Mapping[str, object], before: str = ""
+) -> Iterator[tuple[str, object]]:
     """Yield (name, spread) for each entry of a table.
 
     The entry ``mass`` of a nested table ``base`` has the name "base.mass".
@@ -122,17 +131,25 @@ def _names(table: Mapping[str, object], before: str = "") -> Iterator[tuple[str,
 
 
 def _spread(value: object) -> object:
-    table: dict[str, object] = dict(value) if isinstance(value, dict) else {"normal": value}
+    table: dict[str, object] = (
+        dict(value) if isinstance(value, dict) else {"normal": value}
+    )
     if "tied" in table:
         tied = table.pop("tied")
         return {"range": _spread(table), "tied": tied}
     if isinstance(name := table.get("distribution"), str):
-        return _distribution(name, {k: x for k, x in table.items() if k != "distribution"})
+        return _distribution(
+            name, {k: x for k, x in table.items() if k != "distribution"}
+        )
     (form, given), *others = table.items() or [("", None)]
     entries = [given]
     if isinstance(given, list) and form in ("uniform", "values"):
         entries = given
-    right = {"normal": given is not entries, "uniform": len(entries) == 2, "values": given}
+    right = {
+        "normal": given is not entries,
+        "uniform": len(entries) == 2,
+        "values": given,
+    }
     if not others and all(map(is_number, entries)) and right.get(form):
         if form == "uniform":
             return tuple(entries)
@@ -157,9 +174,13 @@ def _distribution(distribution: str, given: Mapping[str, object]) -> object:
     try:
         for key, value in given.items():
             if not is_number(value):
-                raise ValueError(f"has {key} = {reprlib.repr(value)}, expected a finite number")
+                raise ValueError(
+                    f"has {key} = {reprlib.repr(value)}, expected a finite number"
+                )
         if distribution in _SLOW and number("n", given.get("n", 1)) > _LARGEST_SAMPLE:
-            raise ValueError(f"has n = {given['n']}, expected at most {_LARGEST_SAMPLE}")
+            raise ValueError(
+                f"has n = {given['n']}, expected at most {_LARGEST_SAMPLE}"
+            )
         frozen = kind(**given)
         if abs(float(frozen.ppf(0.5))) < 1e100:
             return frozen
@@ -183,7 +204,9 @@ def inverse_of(name: str, spread: object, *, fixed: bool = False) -> Inverse:
     if hasattr(spread, "ppf"):
         try:
             middle = float(spread.ppf(0.5))
-        except Exception:  # `ppf` may be the method of any object, and raise any exception
+        except (
+            Exception
+        ):  # `ppf` may be the method of any object, and raise any exception
             middle = np.nan
         if not np.isfinite(middle):
             raise InputError(
@@ -202,11 +225,15 @@ def inverse_of(name: str, spread: object, *, fixed: bool = False) -> Inverse:
     if isinstance(spread, list | np.ndarray):
         values = [number(f"'{name}'", entry) for entry in np.ravel(spread).tolist()]
         if not values:
-            raise InputError(f"the list of values of '{name}' is empty; give at least one value")
+            raise InputError(
+                f"the list of values of '{name}' is empty; give at least one value"
+            )
         return partial(_choice, np.array(values))
     deviation = number(f"'{name}'", spread)
     if deviation < 0.0:
-        raise InputError(f"'{name}' is {deviation:g}, expected a standard deviation of at least 0")
+        raise InputError(
+            f"'{name}' is {deviation:g}, expected a standard deviation of at least 0"
+        )
     if fixed:
         return partial(_choice, np.array([deviation]))
     return partial(_normal, deviation)

@@ -11,7 +11,15 @@ import numpy as np
 from fflin.base.errors import InputError
 from fflin.base.intervals import until_failure
 from fflin.base.tables import folded
-from fflin.base.validation import Array, FrozenArrays, Indices, count, number, share, whole
+from fflin.base.validation import (
+    Array,
+    FrozenArrays,
+    Indices,
+    count,
+    number,
+    share,
+    whole,
+)
 from fflin.batch.run import Execution, Progress
 from fflin.campaign.runs import expect
 from fflin.campaign.settling import OUTCOMES, PATIENCE, Loop, settle
@@ -116,11 +124,17 @@ class Validity(FrozenArrays):
         sure = f"{100.0 * self.confidence:g} %"
         low, high = self.rate
         ends = Counter(self.outcomes)
-        failures = ", ".join(f"{ends[key]} {words}" for key, words in _ENDS.items() if ends[key])
+        failures = ", ".join(
+            f"{ends[key]} {words}" for key, words in _ENDS.items() if ends[key]
+        )
         order = "the order of the error cannot be determined"
         if np.isfinite(self.slope):
-            order = f"the error grows with the displacement to the power {self.slope:.3f}"
-        beyond = ", the largest displacement tested" if self.trusted == self.largest else ""
+            order = (
+                f"the error grows with the displacement to the power {self.slope:.3f}"
+            )
+        beyond = (
+            ", the largest displacement tested" if self.trusted == self.largest else ""
+        )
         first = shown(_scaled(self.largest, float(self.sampled[0])), self.joint_unit)
         prediction = (
             f"{self.robot}: the linear loop predicts the nonlinear loop within "
@@ -245,7 +259,9 @@ def validity(
         """Return the initial deviations (N, nx) of runs; each random stream gives one direction."""
         x = []
         for level, stream in zip(levels.tolist(), streams.tolist(), strict=True):
-            rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(stream,)))
+            rng = np.random.default_rng(
+                np.random.SeedSequence(seed, spawn_key=(stream,))
+            )
             x.append(loop.displaced(rng, **_scaled(largest, level)))
         return np.array(x) - loop.start
 
@@ -255,17 +271,24 @@ def validity(
     first = displaced(np.tile(_LEVELS, _DIRECTIONS), streams)
     second = displaced(levels, _DIRECTIONS + np.arange(samples))
     predicting, settling = (
-        partial(loop.runs, predicts, limits, largest["joint"], engine) for predicts in (True, False)
+        partial(loop.runs, predicts, limits, largest["joint"], engine)
+        for predicts in (True, False)
     )
     total = len(first) + samples
     with how:
         # A random run usually settles, and ends, after about 1 / PATIENCE of its largest duration.
         # So all random runs take about as long as `few` runs of the largest duration.
         few = math.ceil(samples / PATIENCE)
-        expect(how.progress, [(predicting(), first, len(first)), (settling(), second, few)], how)
+        expect(
+            how.progress,
+            [(predicting(), first, len(first)), (settling(), second, few)],
+            how,
+        )
         part_progress = how.progress and partial(_report, how.progress, 0, total)
         predicted = settle(predicting, first, how, part_progress)
-        part_progress = how.progress and partial(_report, how.progress, len(first), total)
+        part_progress = how.progress and partial(
+            _report, how.progress, len(first), total
+        )
         random = settle(settling, second, how, part_progress)
     error = predicted["error"].reshape(_DIRECTIONS, -1).max(axis=0)
     outcomes = tuple(OUTCOMES[int(code)] for code in random["outcome"])
@@ -326,7 +349,9 @@ def _crossing(errors: Array) -> float:
             return 0.0
         return near
     pair = slice(first - 1, first + 1)
-    return float(np.exp(np.interp(np.log(TRUSTED), np.log(errors[pair]), np.log(_LEVELS[pair]))))
+    return float(
+        np.exp(np.interp(np.log(TRUSTED), np.log(errors[pair]), np.log(_LEVELS[pair])))
+    )
 
 
 def _checked_displacement(
@@ -339,7 +364,9 @@ def _checked_displacement(
     """
     given = {"attitude": attitude, "position": position, "joint": joint}
     given = {key: number(key, value) for key, value in given.items()}
-    if given["attitude"] >= 175.0 or not all(0.0 <= x <= _FARTHEST for x in given.values()):
+    if given["attitude"] >= 175.0 or not all(
+        0.0 <= x <= _FARTHEST for x in given.values()
+    ):
         raise InputError(
             f"the displacements are {shown(given)}, but each must be 0 or more and at most "
             f"{_FARTHEST:g}, and the rotation must be less than 175 deg, because the attitude "
@@ -374,5 +401,9 @@ def joint_unit(lin: LinearModel) -> str:
 def shown(displacement: dict[str, float], of_joints: str = "rad|m") -> str:
     """Format a displacement; entries that are zero are omitted."""
     units = {"attitude": "deg", "position": "m", "joint": of_joints}
-    words = [f"{displacement[key]:.3g} {unit}" for key, unit in units.items() if displacement[key]]
+    words = [
+        f"{displacement[key]:.3g} {unit}"
+        for key, unit in units.items()
+        if displacement[key]
+    ]
     return " and ".join(filter(None, (", ".join(words[:-1]), *words[-1:]))) or "0"

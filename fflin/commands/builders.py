@@ -55,7 +55,9 @@ class Report:
     robot: str | None
     result: object
     text: str
-    files: Mapping[Path | None, Callable[[Path], object] | None] = field(default_factory=dict)
+    files: Mapping[Path | None, Callable[[Path], object] | None] = field(
+        default_factory=dict
+    )
     code: int = DONE
     interrupted: str = ""
 
@@ -119,7 +121,11 @@ def limits_of_options(
 
 def refuse(arguments: Namespace, names: Iterable[str], why: str) -> None:
     """Raise an error with the reason `why` if any option in `names` is given."""
-    if given := [f"--{name.replace('_', '-')}" for name in names if getattr(arguments, name, None)]:
+    if given := [
+        f"--{name.replace('_', '-')}"
+        for name in names
+        if getattr(arguments, name, None)
+    ]:
         raise InputError(f"{', '.join(given)}: {why}; remove {', '.join(given)}")
 
 
@@ -129,12 +135,17 @@ def once(option: str, pairs: list[tuple[str, T]]) -> dict[str, T]:
     if len(values) < len(pairs):
         names = [name for name, _ in pairs]
         double = next(name for name in names if names.count(name) > 1)
-        raise InputError(f"{option} is given more than once for '{double}'; give it once")
+        raise InputError(
+            f"{option} is given more than once for '{double}'; give it once"
+        )
     return values
 
 
 def state_of(
-    robot: fflin.Robot, arguments: Namespace, *states: Mapping[str, Any], prefix: str = ""
+    robot: fflin.Robot,
+    arguments: Namespace,
+    *states: Mapping[str, Any],
+    prefix: str = "",
 ) -> tuple[Array, Array | None]:
     """Combine `states` with the options of a command; return q (nq,), and v (nv,) or None.
 
@@ -199,7 +210,11 @@ def linear_model(arguments: Namespace) -> tuple[fflin.Robot, fflin.LinearModel]:
 
 
 def model_about(
-    robot: fflin.Robot, arguments: Namespace, q: Array, v: Array | None, reference: pin.SE3 | None
+    robot: fflin.Robot,
+    arguments: Namespace,
+    q: Array,
+    v: Array | None,
+    reference: pin.SE3 | None,
 ) -> fflin.LinearModel:
     """Linearise about q (nq,) and v (nv,), with the inputs of --effort or of an equilibrium.
 
@@ -210,15 +225,27 @@ def model_about(
     given = once("--effort", arguments.effort)
     u = fflin.effort(robot, given) if given else None
     if arguments.relative_equilibrium or arguments.equilibrium:
-        option = "--relative-equilibrium" if arguments.relative_equilibrium else "--equilibrium"
-        refuse(arguments, ("effort",), f"{option} already sets the inputs at the operating point")
+        option = (
+            "--relative-equilibrium"
+            if arguments.relative_equilibrium
+            else "--equilibrium"
+        )
+        refuse(
+            arguments,
+            ("effort",),
+            f"{option} already sets the inputs at the operating point",
+        )
         held = fflin.equilibrium(robot, q, v=v, **axes)
         q, u = held.q, held.u
     return fflin.linearize(robot, q, v, u, **axes)
 
 
 def model_to_regulate(
-    robot: fflin.Robot, arguments: Namespace, q: Array, v: Array | None, reference: pin.SE3 | None
+    robot: fflin.Robot,
+    arguments: Namespace,
+    q: Array,
+    v: Array | None,
+    reference: pin.SE3 | None,
 ) -> fflin.LinearModel:
     """Linearise as `model_about` does, with the inputs that hold the robot at the point.
 
@@ -232,7 +259,9 @@ def model_to_regulate(
     return lin
 
 
-def attitude(robot: fflin.Robot, q: Array, number: int, frame: Frame) -> tuple[Array, pin.SE3]:
+def attitude(
+    robot: fflin.Robot, q: Array, number: int, frame: Frame
+) -> tuple[Array, pin.SE3]:
     """Return q (nq,) and the base placement of a relative equilibrium; `number` is 1 to 24."""
     import pinocchio as pin
 
@@ -240,10 +269,16 @@ def attitude(robot: fflin.Robot, q: Array, number: int, frame: Frame) -> tuple[A
     return q, pin.XYZQUATToSE3(q[:7])
 
 
-def models_along(arguments: Namespace, robot: fflin.Robot | None = None) -> fflin.LinearTrajectory:
+def models_along(
+    arguments: Namespace, robot: fflin.Robot | None = None
+) -> fflin.LinearTrajectory:
     """Return the linear models along the trajectory of --trajectory."""
     point = ("joint", "velocity", "effort", "equilibrium", "rpy", "position")
-    refuse(arguments, point, "with --trajectory, the models are about the points of the trajectory")
+    refuse(
+        arguments,
+        point,
+        "with --trajectory, the models are about the points of the trajectory",
+    )
     robot = robot or load_robot(arguments)
     settings = {"hold": arguments.hold, "frame": arguments.frame}
     motion = fflin.Trajectory.load(arguments.trajectory, robot, **settings)
@@ -267,14 +302,18 @@ def robot_of_design(
         allocate = of_wrench and thrusters_give_every_wrench(robot)
     if not allocate:
         return robot
-    others = tuple(item for item in robot.inputs if not isinstance(item, fflin.Thruster))
+    others = tuple(
+        item for item in robot.inputs if not isinstance(item, fflin.Thruster)
+    )
     if len(others) == len(robot.inputs):
         raise InputError(
             f"--allocate needs thrusters, but '{robot.name}' has none; define them in the file of "
             "--inputs"
         )
     present = {*map(type, others)}
-    missing = [kind() for kind in (fflin.BaseTorque, fflin.BaseForce) if kind not in present]
+    missing = [
+        kind() for kind in (fflin.BaseTorque, fflin.BaseForce) if kind not in present
+    ]
     return robot.replace(inputs=(*missing, *others))
 
 
@@ -295,7 +334,9 @@ def weights_of(arguments: Namespace) -> dict[str, object]:
     return {"rule": arguments.weights, **given}
 
 
-def gain_of(lin: fflin.LinearModel, arguments: Namespace, *, allocated: bool = False) -> fflin.Gain:
+def gain_of(
+    lin: fflin.LinearModel, arguments: Namespace, *, allocated: bool = False
+) -> fflin.Gain:
     """Return the regulator of a model.
 
     The options --weights, --q, --r and --bryson define the weights. With --sample, the model is
@@ -304,7 +345,9 @@ def gain_of(lin: fflin.LinearModel, arguments: Namespace, *, allocated: bool = F
     if arguments.sample is not None:
         lin = lin.discretize(arguments.sample)
     try:
-        return fflin.lqr(lin, weights=weights_of(arguments), wheel_speeds=arguments.wheel_speeds)
+        return fflin.lqr(
+            lin, weights=weights_of(arguments), wheel_speeds=arguments.wheel_speeds
+        )
     except UnknownNameError as error:
         message = str(error)
         if allocated:
@@ -312,16 +355,25 @@ def gain_of(lin: fflin.LinearModel, arguments: Namespace, *, allocated: bool = F
         raise UnknownNameError(message) from None
 
 
-def loop_of(robot: fflin.Robot, arguments: Namespace) -> tuple[fflin.Policy | None, dict[str, Any]]:
+def loop_of(
+    robot: fflin.Robot, arguments: Namespace
+) -> tuple[fflin.Policy | None, dict[str, Any]]:
     """Return the policy (None with --free), and keyword arguments of `simulate`."""
     from fflin.simulation.plan import SHORTEST, time_to_settle
 
     settings: dict[str, Any] = {
-        **{name: getattr(arguments, name) for name in ("dt", "method", "delay", "duration")},
+        **{
+            name: getattr(arguments, name)
+            for name in ("dt", "method", "delay", "duration")
+        },
         "limits": limits_of_options(arguments),
     }
     if not arguments.controller:
-        refuse(arguments, ("negative_feedback",), "only --controller has a sign of the feedback")
+        refuse(
+            arguments,
+            ("negative_feedback",),
+            "only --controller has a sign of the feedback",
+        )
     if arguments.trajectory or arguments.schedule:
         design = robot_of_design(robot, bool(arguments.allocate))
         tracking = along(design, arguments)
@@ -330,11 +382,17 @@ def loop_of(robot: fflin.Robot, arguments: Namespace) -> tuple[fflin.Policy | No
         if arguments.allocate:
             return fflin.Allocation(tracking, design), settings
         return tracking, settings
-    refuse(arguments, ("offset", "hold"), "without --trajectory FILE, this has no effect")
+    refuse(
+        arguments, ("offset", "hold"), "without --trajectory FILE, this has no effect"
+    )
     if arguments.free:
         of_law = ("limit", "delay", "reduce", "allocate", "gain", "controller", "mpc")
         names = (*_WEIGHTS, *_POSE, *_TARGETS[:2], *of_law)
-        refuse(arguments, names, "with --free there is no regulator and all inputs are zero")
+        refuse(
+            arguments,
+            names,
+            "with --free there is no regulator and all inputs are zero",
+        )
         q, v = start_of(robot, arguments)
         if arguments.duration is None:
             settings["duration"] = SHORTEST
@@ -362,9 +420,12 @@ def start_of(
     the pose of this equilibrium.
     """
     point, number = robot.point, arguments.relative_equilibrium
-    if number:  # omit the base pose of the point, because the pose `about` below replaces it
+    # omit the base pose of the point, because the pose `about` below replaces it
+    if number:
         point = {part: point[part] for part in ("joints", "velocity") if part in point}
-    rates = rates_by_name(robot.joint_names, once("--target-velocity", arguments.target_velocity))
+    rates = rates_by_name(
+        robot.joint_names, once("--target-velocity", arguments.target_velocity)
+    )
     q, v = state_of(robot, arguments, point, {"velocity": rates}, robot.start)
     if number:
         import pinocchio as pin
@@ -376,7 +437,9 @@ def start_of(
 
 def about_point(
     robot: fflin.Robot, arguments: Namespace
-) -> tuple[fflin.Policy, fflin.StateFeedback | fflin.LinearController, fflin.LinearModel | None]:
+) -> tuple[
+    fflin.Policy, fflin.StateFeedback | fflin.LinearController, fflin.LinearModel | None
+]:
     """Return the policy about a point, its linear feedback, and the model that predicts the motion.
 
     The model is None for MPC, for a reduced model, for a controller from a file, and for allocated
@@ -389,7 +452,9 @@ def about_point(
         names = ("allocate", "gain", "controller", "reduce")
         refuse(arguments, names, "--mpc replaces the regulator and its options")
         if arguments.sample is None:
-            raise InputError("--mpc needs the sample time of the controller; add --sample H")
+            raise InputError(
+                "--mpc needs the sample time of the controller; add --sample H"
+            )
         arguments.allocate = False
     if arguments.gain:
         why = "the file of --gain already contains the weights and the operating point"
@@ -399,18 +464,24 @@ def about_point(
     if gain:
         lin = _about_gain(design, gain, arguments)
     else:
-        lin = model_to_regulate(design, arguments, *point_of(design, arguments, "target_"))
+        lin = model_to_regulate(
+            design, arguments, *point_of(design, arguments, "target_")
+        )
     if arguments.mpc:
         from fflin.control.mpc import Mpc
 
         settings = {"dt": arguments.sample, "limits": limits_of_options(arguments)}
         weights = weights_of(arguments)
-        controller = fflin.mpc(lin, horizon=arguments.horizon, weights=weights, **settings)
+        controller = fflin.mpc(
+            lin, horizon=arguments.horizon, weights=weights, **settings
+        )
         assert isinstance(controller, Mpc)  # since the model is about a point
         return controller, fflin.StateFeedback(controller.lin, controller.gain.K), None
     if arguments.controller:
         of_gain = (*_WEIGHTS, "gain", "reduce")
-        refuse(arguments, of_gain, "--controller replaces the regulator and its options")
+        refuse(
+            arguments, of_gain, "--controller replaces the regulator and its options"
+        )
         sign = -1.0 if arguments.negative_feedback else 1.0
         feedback = fflin.LinearController(arguments.controller, lin, sign=sign)
     else:
@@ -424,7 +495,9 @@ def about_point(
     return feedback, feedback, lin
 
 
-def _about_gain(robot: fflin.Robot, gain: fflin.Gain, arguments: Namespace) -> fflin.LinearModel:
+def _about_gain(
+    robot: fflin.Robot, gain: fflin.Gain, arguments: Namespace
+) -> fflin.LinearModel:
     """Return the linear model about the point for which a gain was designed.
 
     If the base pose of the gain's operating point is the reference of the gain, the new reference
@@ -436,11 +509,15 @@ def _about_gain(robot: fflin.Robot, gain: fflin.Gain, arguments: Namespace) -> f
     from fflin.control.gain import model_of
 
     if gain.x0[:6].any():
-        refuse(arguments, _POSE, "the file of --gain already contains the pose of the base")
+        refuse(
+            arguments, _POSE, "the file of --gain already contains the pose of the base"
+        )
         pose = gain.placement
     else:
         pose = point_of(robot, arguments, "target_")[0][:7]
-    linear = partial(model_of, gain, robot, f"{arguments.gain} was made for '{gain.robot}'")
+    linear = partial(
+        model_of, gain, robot, f"{arguments.gain} was made for '{gain.robot}'"
+    )
     lin = linear(pin.XYZQUATToSE3(pose))
     if number := arguments.relative_equilibrium:
         return linear(attitude(robot, lin.q, number, lin.frame)[1])
@@ -449,9 +526,18 @@ def _about_gain(robot: fflin.Robot, gain: fflin.Gain, arguments: Namespace) -> f
 
 def along(robot: fflin.Robot, arguments: Namespace) -> fflin.TrajectoryFeedback:
     """Return the feedback along the trajectory of --trajectory or --schedule."""
-    regulator = ("free", "mpc", "gain", "controller", "relative_equilibrium", *_POSE, *_TARGETS)
+    regulator = (
+        "free",
+        "mpc",
+        "gain",
+        "controller",
+        "relative_equilibrium",
+        *_POSE,
+        *_TARGETS,
+    )
     why = (
-        "the trajectory defines the regulator, its target, and the start, which --offset displaces"
+        "the trajectory defines the regulator, its target, and the start, "
+        "which --offset displaces"
     )
     refuse(arguments, (*regulator, "joint", "rpy", "position", "velocity"), why)
     if arguments.schedule is None:

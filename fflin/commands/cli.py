@@ -19,7 +19,12 @@ import fflin
 from fflin.base import __version__
 from fflin.base.errors import FflinError, FflinWarning, FileError
 from fflin.base.tables import first_paragraph, headed
-from fflin.base.writing import check_ending, check_output_path, files_of_command, followed_path
+from fflin.base.writing import (
+    check_ending,
+    check_output_path,
+    files_of_command,
+    followed_path,
+)
 from fflin.commands import BAD_INPUT, DONE, parser
 
 if TYPE_CHECKING:
@@ -78,7 +83,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             chosen = getattr(arguments, "command", main_parser)
             from difflib import get_close_matches
 
-            near = get_close_matches(unknown[0], chosen._option_string_actions, n=1, cutoff=0.75)
+            near = get_close_matches(
+                unknown[0], chosen._option_string_actions, n=1, cutoff=0.75
+            )
             hint = f"; did you mean {near[0]}?" if near else ""
             chosen.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
         parser.settle_former_names(arguments)
@@ -87,14 +94,17 @@ def main(argv: Sequence[str] | None = None) -> int:
             for action in arguments.command._actions
             if (value := getattr(arguments, action.dest, None)) is not None
         ]
-        outputs = [(path, kind) for kind, path in given if isinstance(kind, parser.OutputFile)]
+        outputs = [
+            (path, kind) for kind, path in given if isinstance(kind, parser.OutputFile)
+        ]
         readers = parser.input_file, parser.input_name
         inputs = [Path(name) for kind, name in given if kind in readers]
         with files_of_command(inputs, [path for path, _ in outputs]):
             # Check the output files first, so that an unwritable file is reported before any
             # computation.
             for path, kind in outputs:
-                check_output_path(path)  # first, because it reports an output that is also an input
+                # first, because it reports an output that is also an input
+                check_output_path(path)
                 check_ending(path, kind.endings)
                 if kind.kinds and not arguments.force:
                     require_own_kind(path, kind.kinds)
@@ -115,7 +125,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return DONE
     except OSError as error:
-        parser.print_error(f"fflin: error: the output cannot be written: {error.strerror}")
+        parser.print_error(
+            f"fflin: error: the output cannot be written: {error.strerror}"
+        )
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return BAD_INPUT
 
@@ -138,7 +150,9 @@ def _parser(asked: str) -> parser.Command:
         shown = {asked} & {*names} if known else names
         for name in shown:
             module = "control" if name in _CONTROL.split() else "models"
-            parser.add_command(commands, getattr(import_module(f"fflin.commands.{module}"), name))
+            parser.add_command(
+                commands, getattr(import_module(f"fflin.commands.{module}"), name)
+            )
         # argparse puts all commands in one group; move them to the group of their task.
         group._group_actions += commands._choices_actions
         commands._choices_actions = []
@@ -211,7 +225,9 @@ def plain(value: object) -> object:
     elif is_dataclass(value):
         entries = {item.name: getattr(value, item.name) for item in fields(value)}
         # Omit linear models that a result contains, because `fflin linearize` prints such models.
-        value = {key: x for key, x in entries.items() if not isinstance(x, fflin.LinearModel)}
+        value = {
+            key: x for key, x in entries.items() if not isinstance(x, fflin.LinearModel)
+        }
     elif hasattr(value, "_asdict"):
         value = value._asdict()
     if isinstance(value, Mapping):
@@ -258,7 +274,10 @@ def kind_of(path: Path) -> str:
             with hdf5().File(path, "r") as file:
                 names = {*file, *file.attrs}
         elif path.suffix == ".npz":
-            with path.open("rb") as content, np.load(content, allow_pickle=False) as entries:
+            with (
+                path.open("rb") as content,
+                np.load(content, allow_pickle=False) as entries,
+            ):
                 names = {*entries}
                 kind = text(entries.get("kind", ""))
         else:
@@ -268,4 +287,6 @@ def kind_of(path: Path) -> str:
             kind = text(entries.get("kind", ""))
     except Exception:  # each decoder raises its own types of errors
         return ""
-    return kind or next((name for name, required in _ENTRIES.items() if required <= names), "")
+    return kind or next(
+        (name for name, required in _ENTRIES.items() if required <= names), ""
+    )

@@ -61,10 +61,16 @@ def lqr(arguments: Namespace) -> Report:
 
     robot, design, _, gain = designed(arguments)
     # The report omits warnings, because they already appear on stderr.
-    text = "\n\n".join(x for x in str(gain).split("\n\n") if not x.startswith("warning: "))
+    text = "\n\n".join(
+        x for x in str(gain).split("\n\n") if not x.startswith("warning: ")
+    )
     if design is not robot:
         text += f"\n\n{folded([_ALLOCATED])}"
-    result = {**record_of(gain), "margins": gain.margins, "allocated": design is not robot}
+    result = {
+        **record_of(gain),
+        "margins": gain.margins,
+        "allocated": design is not robot,
+    }
     files = {
         arguments.output_file: gain.save,
         arguments.plot: lambda path: fflin.plot_loops(gain, path),
@@ -82,11 +88,15 @@ def tvlqr(arguments: Namespace) -> Report:
     refuse(arguments, ("reduce",), why)
     along = models_along(arguments)
     Qf = once("--qf", arguments.qf) or "steady"
-    schedule = fflin.tvlqr(along, Qf=Qf, sample=arguments.sample, weights=weights_of(arguments))
+    schedule = fflin.tvlqr(
+        along, Qf=Qf, sample=arguments.sample, weights=weights_of(arguments)
+    )
     text = str(schedule)
     if any(isinstance(item, fflin.Thruster) for item in along.robot.inputs):
         text += f"\n{folded([_NOT_ALLOCATED])}"
-    return Report(along.robot.name, schedule, text, {arguments.output_file: schedule.save})
+    return Report(
+        along.robot.name, schedule, text, {arguments.output_file: schedule.save}
+    )
 
 
 def export(arguments: Namespace) -> Report:
@@ -96,7 +106,10 @@ def export(arguments: Namespace) -> Report:
     """
     from fflin.base.record import read_record, reading, text
 
-    kinds = {kind.__name__: kind for kind in (fflin.Gain, fflin.GainSchedule, fflin.Compensator)}
+    kinds = {
+        kind.__name__: kind
+        for kind in (fflin.Gain, fflin.GainSchedule, fflin.Compensator)
+    }
     with reading(arguments.file, "Gain, GainSchedule or Compensator"):
         kind_name = text(read_record(arguments.file)[0]["kind"])
         if kind_name not in kinds:
@@ -111,12 +124,16 @@ def export(arguments: Namespace) -> Report:
         law, arguments.output_folder, robot=robot, limits=limits, name=name, real=real
     )
     test = (
-        f"cd '{folder}'\n  cc -std=c99 -o {name}_test {name}.c {name}_test.c -lm\n  ./{name}_test"
+        f"cd '{folder}'\n"
+        f"  cc -std=c99 -o {name}_test {name}.c {name}_test.c -lm\n"
+        f"  ./{name}_test"
     )
     message = f"C99 code of {law!r}, with numbers of type {real}\nto test it:\n  {test}"
     result = {"name": name, "real": real, "folder": str(folder)}
     endings = (".h", ".c", "_test.c", ".json")
-    return Report(law.robot, result, message, {folder / f"{name}{end}": None for end in endings})
+    return Report(
+        law.robot, result, message, {folder / f"{name}{end}": None for end in endings}
+    )
 
 
 def plan(arguments: Namespace) -> Report:
@@ -186,7 +203,9 @@ def montecarlo(arguments: Namespace) -> Report:
     path = arguments.output_file
     is_table = path is not None and path.suffix in (".csv", ".mat")
     if is_table and path.exists() and not arguments.force:
-        raise FileError(f"{path} already exists; give another file name, or add --force")
+        raise FileError(
+            f"{path} already exists; give another file name, or add --force"
+        )
     dispersions = fflin.load_dispersions(arguments.dispersions)
     robot = load_robot(arguments)
     check_pictures(robot, arguments)
@@ -261,7 +280,9 @@ def funnel(arguments: Namespace) -> Report:
     example: fflin funnel arm.toml --schedule gains.npz --goal attitude=1
     """
     if arguments.trajectory is None and arguments.schedule is None:
-        raise InputError("neither --trajectory nor --schedule is given; give one of them")
+        raise InputError(
+            "neither --trajectory nor --schedule is given; give one of them"
+        )
     robot = load_robot(arguments)
     policy = along(robot, arguments)
     with closing(Progress()) as bar:
@@ -292,16 +313,25 @@ def sweep(arguments: Namespace) -> Report:
     path = arguments.output_file
     robot = load_robot(arguments)
     settings = {"frame": arguments.frame, "reference": reference_of(arguments)}
-    linearizer, (q, v, u) = fflin.Linearizer(robot, **settings), _points(robot, arguments)
+    linearizer, (q, v, u) = (
+        fflin.Linearizer(robot, **settings),
+        _points(robot, arguments),
+    )
     size = len(q) * ChunkJob(linearizer, at_rest=v is None and u is None).row_bytes
     part = part_of(path)
     needs = f"{size / 1e9:,.1f} GB" if size >= 1e9 else f"{size / 1e3:,.1f} kB"
-    message = f"linearising '{robot.name}' about {len(q):,} points; {path} takes {needs}"
+    message = (
+        f"linearising '{robot.name}' about {len(q):,} points; {path} takes {needs}"
+    )
     if part.exists():
         message += f", resuming from {part}"
     with going_on(path, "points") as progress:
         progress.announce(f"fflin: {message}")
-        work = {"engine": arguments.engine, "workers": arguments.workers, "progress": progress}
+        work = {
+            "engine": arguments.engine,
+            "workers": arguments.workers,
+            "progress": progress,
+        }
         batch = fflin.sweep(robot, q, v, u, **settings, **work, out=path)
     states, inputs = len(batch.state_names), len(batch.input_names)
     text = f"{robot.name}: {len(batch):,} points, {states} states, {inputs} inputs"
@@ -320,7 +350,9 @@ def _points(
     from fflin.robot.joints import by_joint
 
     if bool(arguments.grid) == (arguments.random is not None):
-        raise InputError("a sweep needs exactly one of --grid and --random; give one of them")
+        raise InputError(
+            "a sweep needs exactly one of --grid and --random; give one of them"
+        )
     if arguments.range and arguments.random is None:
         raise InputError("--range needs --random; --grid has its own ranges")
     q, v = state_of(robot, arguments, robot.point)
@@ -336,8 +368,13 @@ def _points(
         return fflin.random_configurations(robot, arguments.random, **drawn), v, u
     axes = once("--grid", arguments.grid)
     values = {name: np.linspace(*axis) for name, axis in axes.items()}
-    joints = {**robot.point.get("joints", {}), **by_joint(fixed, robot.joint_names, robot.joint)}
-    others = {name: x for name, x in joints.items() if name not in axes or name in fixed}
+    joints = {
+        **robot.point.get("joints", {}),
+        **by_joint(fixed, robot.joint_names, robot.joint),
+    }
+    others = {
+        name: x for name, x in joints.items() if name not in axes or name in fixed
+    }
     return fflin.grid(robot, values, joints=others, base=base), v, u
 
 

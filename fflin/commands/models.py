@@ -57,8 +57,12 @@ def robots(_: Namespace) -> Report:
             reason = str(error).replace(f"{robot_file.path.parent}{os.sep}", "")
             notes.append(folded([f"{name} does not load: {reason}"]))
             result[name] = {"error": reason}
-    head = f"{len(rows) - 1} robots can be loaded by name; {len(notes)} cannot be loaded"
-    return Report(None, {"robots": result}, "\n\n".join((head, grid(rows, "lrrl"), *notes)))
+    head = (
+        f"{len(rows) - 1} robots can be loaded by name; {len(notes)} cannot be loaded"
+    )
+    return Report(
+        None, {"robots": result}, "\n\n".join((head, grid(rows, "lrrl"), *notes))
+    )
 
 
 def info(arguments: Namespace) -> Report:
@@ -117,7 +121,9 @@ def init(arguments: Namespace) -> Report:
 
     robot_file = find_robot(arguments.robot)
     if robot_file.path.suffix.lower() == ".toml":
-        raise InputError(f"{robot_file.path} is already a robot file; give the path of a URDF")
+        raise InputError(
+            f"{robot_file.path} is already a robot file; give the path of a URDF"
+        )
     target = arguments.output_file or Path(f"{robot_file.name}.toml")
     if target.exists() and not arguments.force:
         raise FileError(
@@ -125,7 +131,9 @@ def init(arguments: Namespace) -> Report:
         )
     urdf = robot_file.name
     if robot_file.origin == "file":
-        urdf = os.path.relpath(os.path.realpath(robot_file.path), os.path.realpath(target.parent))
+        urdf = os.path.relpath(
+            os.path.realpath(robot_file.path), os.path.realpath(target.parent)
+        )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         robot = fflin.load(arguments.robot)
@@ -151,7 +159,9 @@ def view(arguments: Namespace) -> Report:
     how = {name: getattr(arguments, name) for name in (*SHOWN, "frame")}
     live = fflin.visualize(robot, open=False, q=q, port=arguments.port or 0, **how)
     assert isinstance(live, Live)  # since there is no motion
-    print(f"fflin: {robot.name} at {live.url} (Ctrl-C ends)", file=sys.stderr, flush=True)
+    print(
+        f"fflin: {robot.name} at {live.url} (Ctrl-C ends)", file=sys.stderr, flush=True
+    )
     if not arguments.no_open:
         live.open()
     live.wait()
@@ -170,8 +180,14 @@ def linearize(arguments: Namespace) -> Report:
     if path and (tool or arguments.trajectory):
         check_ending(path, RECORDS)
     if arguments.trajectory:
-        refuse(arguments, ("for",), "this option converts one model, but --trajectory gives many")
-        refuse(arguments, ("plot",), "with --trajectory, there is no single model to plot")
+        refuse(
+            arguments,
+            ("for",),
+            "this option converts one model, but --trajectory gives many",
+        )
+        refuse(
+            arguments, ("plot",), "with --trajectory, there is no single model to plot"
+        )
         along = models_along(arguments)
         if arguments.dt is not None:
             along = along.discretize(arguments.dt)
@@ -182,7 +198,10 @@ def linearize(arguments: Namespace) -> Report:
     model = lin.to(tool) if tool else lin
     nx, nu = model.B.shape
     text = f"{lin.robot}: {nx} states, {nu} inputs" if path else model_report(lin)
-    files = {path: model.save, arguments.plot: lambda path: fflin.plot_matrices(lin, path)}
+    files = {
+        path: model.save,
+        arguments.plot: lambda path: fflin.plot_matrices(lin, path),
+    }
     return Report(lin.robot, model, text, files)
 
 
@@ -200,7 +219,11 @@ def check(arguments: Namespace) -> Report:
         robot, lin = linear_model(arguments)
         comparison = fflin.check(robot, lin, tolerance=arguments.tolerance)
         text = str(comparison)
-    result = {"ok": comparison.ok, "max_error": comparison.max_error, "rows": comparison.rows}
+    result = {
+        "ok": comparison.ok,
+        "max_error": comparison.max_error,
+        "rows": comparison.rows,
+    }
     files = {arguments.plot: lambda path: fflin.plot_check(comparison, path)}
     code = DONE if comparison.ok else FELL_SHORT
     return Report(robot.name, result, text, files, code)
@@ -267,7 +290,10 @@ def _units(lin: fflin.LinearModel) -> list[str]:
     For example, the line for the inputs is "u: tau_b [N m], F_b [N], tau_m [N m]". There is no line
     for the outputs if they are the states.
     """
-    signals = {"x": (lin.state_names, lin.state_units), "u": (lin.input_names, lin.input_units)}
+    signals = {
+        "x": (lin.state_names, lin.state_units),
+        "u": (lin.input_names, lin.input_units),
+    }
     if lin.output_names != lin.state_names:
         signals["y"] = lin.output_names, lin.output_units
     lines = []
@@ -294,11 +320,21 @@ def analyze(arguments: Namespace) -> Report:
     example: fflin analyze servicer_7dof --stiffness panel_left=100 --output joints
     """
     _, lin = linear_model(arguments)
-    moved, shown, lin_modes = fflin.controllability(lin), fflin.observability(lin), fflin.modes(lin)
-    parts = {"inputs": moved, "momentum": _momentum(lin), "modes": lin_modes, "outputs": shown}
+    moved, shown, lin_modes = (
+        fflin.controllability(lin),
+        fflin.observability(lin),
+        fflin.modes(lin),
+    )
+    parts = {
+        "inputs": moved,
+        "momentum": _momentum(lin),
+        "modes": lin_modes,
+        "outputs": shown,
+    }
     poles = counted(len(lin_modes.unstable), "unstable pole")
     if not lin_modes.equilibrium:
-        poles += " of the frozen A"  # away from an equilibrium, poles do not decide stability
+        # away from an equilibrium, poles do not decide stability
+        poles += " of the frozen A"
     head = [_rank(moved, "controllable"), _rank(shown, "observable"), poles]
     sections = (f"{title}\n{'-' * len(title)}\n{text}" for title, text in parts.items())
     result = {"controllability": moved, "observability": shown, "modes": lin_modes}
@@ -352,7 +388,11 @@ def equilibrium(arguments: Namespace) -> Report:
     from fflin.linear.holding import wheel_notes
     from fflin.robot.fields import limits_of
 
-    refuse(arguments, ("effort",), "this command computes the inputs at the operating point")
+    refuse(
+        arguments,
+        ("effort",),
+        "this command computes the inputs at the operating point",
+    )
     robot = load_robot(arguments)
     q, v, reference = point_of(robot, arguments)
     axes = {"frame": arguments.frame, "reference": reference}
@@ -361,7 +401,9 @@ def equilibrium(arguments: Namespace) -> Report:
     lin_modes = fflin.modes(lin)
     poles = lin_modes.poles
     growth = float(poles.real.max(initial=-math.inf))
-    decays = not lin_modes.zero_eigenvalues and all(mode.margin < -1.0 for mode in lin_modes.modes)
+    decays = not lin_modes.zero_eigenvalues and all(
+        mode.margin < -1.0 for mode in lin_modes.modes
+    )
     stability = "marginally stable"
     if lin_modes.unstable:
         stability = "unstable"
@@ -381,7 +423,9 @@ def equilibrium(arguments: Namespace) -> Report:
     value_of = dict(zip(names, (*lin.x0, *held.u), strict=True))
     limits = limits_of(robot).items()
     excess = {
-        k: max(low - value_of[k], value_of[k] - high) for k, (low, high) in limits if k in value_of
+        k: max(low - value_of[k], value_of[k] - high)
+        for k, (low, high) in limits
+        if k in value_of
     }
     beyond = [name for name, size in excess.items() if size > _SLACK]
     if beyond:
@@ -442,7 +486,10 @@ def sensitivity(arguments: Namespace) -> Report:
     derivatives = fflin.sensitivity(model)
     text = derivatives.table(arguments.top, arguments.only)
     return Report(
-        lin.robot, sensitivity_record(derivatives), text, {arguments.output_file: derivatives.save}
+        lin.robot,
+        sensitivity_record(derivatives),
+        text,
+        {arguments.output_file: derivatives.save},
     )
 
 

@@ -5,7 +5,11 @@ from fflin.base.writing import RECORDS
 _SAVED = ", ".join(RECORDS)
 
 # Titles of the groups of options in the help.
-POINT, ROBOT, OUTPUT = "operating point", "robot (these options override robot.toml)", "output"
+POINT, ROBOT, OUTPUT = (
+    "operating point",
+    "robot (these options override robot.toml)",
+    "output",
+)
 TRAJECTORY, CONTROLLER, SIMULATION = "trajectory", "controller", "simulation"
 
 _POSE = "joint rpy position velocity"
@@ -42,7 +46,11 @@ OPTIONS: dict[str, dict[str, str]] = {
         ROBOT: "lock xacro orbit",
         OUTPUT: f"frame {_SCENE} no-open port",
     },
-    "linearize": {**_AT_POINT, OUTPUT: "dt for output-file plot", TRAJECTORY: _TRAJECTORY},
+    "linearize": {
+        **_AT_POINT,
+        OUTPUT: "dt for output-file plot",
+        TRAJECTORY: _TRAJECTORY,
+    },
     "check": {**_AT_POINT, TRAJECTORY: _TRAJECTORY, OUTPUT: "tolerance plot"},
     "analyze": {**_AT_POINT, OUTPUT: "plot"},
     "modes": {**_AT_POINT, OUTPUT: "plot html"},
@@ -67,7 +75,11 @@ OPTIONS: dict[str, dict[str, str]] = {
         "runs": "goal within limits limit knots samples seed confidence threads dt step",
         OUTPUT: "plot output-file",
     },
-    "lqr": {**_AT_POINT, CONTROLLER: f"{_WEIGHTS} dt allocate", OUTPUT: "output-file plot"},
+    "lqr": {
+        **_AT_POINT,
+        CONTROLLER: f"{_WEIGHTS} dt allocate",
+        OUTPUT: "output-file plot",
+    },
     "tvlqr": {**_ALONG, CONTROLLER: f"{_WEIGHTS} dt qf", OUTPUT: "output-file"},
     "plan": {
         "": "ROBOT",

@@ -108,7 +108,9 @@ def xacro_argument(text: str) -> tuple[str, str]:
     """Read NAME=VALUE, the value of an argument of a xacro file."""
     name, equals, value = text.partition("=")
     if not (name and equals):
-        raise argparse.ArgumentTypeError(f"'{text}' is not NAME=VALUE, such as arm=long")
+        raise argparse.ArgumentTypeError(
+            f"'{text}' is not NAME=VALUE, such as arm=long"
+        )
     return name, value
 
 
@@ -164,7 +166,8 @@ def _parts(text: str, form: str, *counts: int) -> tuple[str, list[str]]:
     return name, parts
 
 
-Form: TypeAlias = Mapping[str, Any]  # keywords of `argparse.ArgumentParser.add_argument`
+# keywords of `argparse.ArgumentParser.add_argument`
+Form: TypeAlias = Mapping[str, Any]
 
 
 def one(
@@ -179,7 +182,13 @@ def one(
 
 def many(reader: Callable[[str], object], metavar: str, **more: object) -> Form:
     """Return the `Form` of a repeatable option, whose values form a list."""
-    return {"type": reader, "metavar": metavar, "action": "append", "default": [], **more}
+    return {
+        "type": reader,
+        "metavar": metavar,
+        "action": "append",
+        "default": [],
+        **more,
+    }
 
 
 def _saved(*kinds: str, endings: tuple[str, ...] = RECORDS) -> Form:
@@ -191,7 +200,10 @@ _PAIRS = many(assignment, "NAME=VALUE")
 _WEIGHTS = many(assignment, "NAME=W")
 _OF_JOINT = many(joint_or_all, "[NAME=]VALUE")
 _NAMES = many(str, "NAME")
-_ANGLES, _AXES = one(number, ("R", "P", "Y"), nargs=3), one(number, ("X", "Y", "Z"), nargs=3)
+_ANGLES, _AXES = (
+    one(number, ("R", "P", "Y"), nargs=3),
+    one(number, ("X", "Y", "Z"), nargs=3),
+)
 _TIME, _FILE, _COUNT = one(number, "H"), one(input_file, "FILE"), one(count_of, "N")
 _YES_OR_NO: Form = {"action": argparse.BooleanOptionalAction}
 _FORMER: Form = {**_TIME, "dest": "former_dt"}
@@ -204,8 +216,14 @@ FORMS: dict[str, Form] = {
     "ROBOT": {"dest": "robot", "type": input_name, "metavar": "ROBOT"},
     "URDF": {"dest": "robot", "type": input_name, "metavar": "URDF"},
     "FILE": {"dest": "file", "type": input_file, "metavar": "FILE"},
-    "DISPERSIONS": {"dest": "dispersions", "type": input_file, "metavar": "DISPERSIONS"},
-    **dict.fromkeys(("joint", "velocity", "target-joint", "target-velocity", "offset"), _PAIRS),
+    "DISPERSIONS": {
+        "dest": "dispersions",
+        "type": input_file,
+        "metavar": "DISPERSIONS",
+    },
+    **dict.fromkeys(
+        ("joint", "velocity", "target-joint", "target-velocity", "offset"), _PAIRS
+    ),
     **dict.fromkeys(("effort", "limit", "bryson", "qf", "goal", "within"), _PAIRS),
     "q": _WEIGHTS,
     "r": _WEIGHTS,
@@ -246,7 +264,9 @@ FORMS: dict[str, Form] = {
     "knots": one(count_of, "N", 101),
     "horizon": one(count_of, "N", 20),
     "jobs": one(count_of, "N", 1),
-    "relative-equilibrium": one(count_of, "N", nargs="?", const=1, choices=range(1, 25)),
+    "relative-equilibrium": one(
+        count_of, "N", nargs="?", const=1, choices=range(1, 25)
+    ),
     "seed": one(whole, "S", 0),
     "worst": one(whole, "K", 3),
     "port": one(whole, "N"),
@@ -267,16 +287,29 @@ FORMS: dict[str, Form] = {
     "engine": {"choices": ("compiled", "python")},
     "scene": {"choices": ("space", "lab")},
     "for": {
-        "choices": ("drake", "mujoco", "pinocchio", "crocoddyl", "spart", "euler", "euler_rates"),
+        "choices": (
+            "drake",
+            "mujoco",
+            "pinocchio",
+            "crocoddyl",
+            "spart",
+            "euler",
+            "euler_rates",
+        ),
         "metavar": "TOOL",
     },
     "real": {"choices": ("double", "float"), "default": "double"},
     **dict.fromkeys(("wheel-speeds", "allocate", "follow"), _YES_OR_NO),
     "plot": one(OutputFile((".png", ".pdf", ".svg")), "FILE"),
-    **{ending: one(OutputFile((f".{ending}",)), "FILE") for ending in ("html", "png", "gif")},
+    **{
+        ending: one(OutputFile((f".{ending}",)), "FILE")
+        for ending in ("html", "png", "gif")
+    },
     "init output-file": _saved(endings=(".toml",)),
     "view frame": {"choices": ("lvlh", "hill")},
-    "linearize output-file": _saved("LinearModel", "LinearTrajectory", "ToolModel", endings=_TABLE),
+    "linearize output-file": _saved(
+        "LinearModel", "LinearTrajectory", "ToolModel", endings=_TABLE
+    ),
     "equilibrium output-file": _saved("Equilibrium"),
     "sensitivity output-file": _saved("Sensitivity"),
     "uncertain output-file": _saved("LFT"),
@@ -292,7 +325,10 @@ FORMS: dict[str, Form] = {
     "plan hold": {"choices": ("linear", "previous"), "default": "previous"},
     "plan output-file": _saved("Trajectory", "Motion", endings=_TABLE),
     "simulate output-file": _saved("Motion", endings=_TABLE),
-    "sweep output-file": {**_saved("LinearBatch", endings=(".npz", ".h5")), "required": True},
+    "sweep output-file": {
+        **_saved("LinearBatch", endings=(".npz", ".h5")),
+        "required": True,
+    },
     "montecarlo goal": many(str, "CONDITION"),
     "montecarlo output-file": _saved(endings=(".npz", ".h5", ".csv", ".mat")),
 }
@@ -310,14 +346,17 @@ class Command(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Report invalid or missing arguments in one line, and exit."""
         if "required: DISPERSIONS" in message:
-            message += "; DISPERSIONS is a TOML file with lines such as [dispersions] and "
+            message += (
+                "; DISPERSIONS is a TOML file with lines such as [dispersions] and "
+            )
             message += '"base.mass" = 0.05'
         print_error(f"fflin: error: {message} (see {self.prog} --help)")
         self.exit(BAD_INPUT)
 
 
 def add_command(
-    commands: argparse._SubParsersAction[Command], run: Callable[[argparse.Namespace], object]
+    commands: argparse._SubParsersAction[Command],
+    run: Callable[[argparse.Namespace], object],
 ) -> None:
     """Add a command and its options. The command has the name of the function `run`.
 
@@ -333,13 +372,22 @@ def add_command(
         epilog=example,
     )
     # A negative number such as -1e-3 is a value, not an option.
-    command._negative_number_matcher = re.compile(r"^-(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$")
+    command._negative_number_matcher = re.compile(
+        r"^-(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$"
+    )
     about = "show help for the common options; --help all shows help for all options"
-    command.add_argument("-h", "--help", nargs="?", metavar="all", action=Help, help=about)
+    command.add_argument(
+        "-h", "--help", nargs="?", metavar="all", action=Help, help=about
+    )
     command.set_defaults(run=run, command=command, common=COMMON.get(name, "").split())
     for title, options in ((OUTPUT, "json"), *OPTIONS[name].items()):
-        groups = {"": command, **{existing.title: existing for existing in command._action_groups}}
-        group = groups.get(title) or command.add_argument_group(title, DESCRIPTIONS.get(title))
+        groups = {
+            "": command,
+            **{existing.title: existing for existing in command._action_groups},
+        }
+        group = groups.get(title) or command.add_argument_group(
+            title, DESCRIPTIONS.get(title)
+        )
         for option in options.split():
             key = f"{name} {option}"
             text = ABOUT.get(key) or ABOUT[option]
@@ -388,7 +436,9 @@ def short_help(command: argparse.ArgumentParser) -> str:
     names = [*common, "json"] if common else [*options]
     formatter = argparse.HelpFormatter(command.prog, max_help_position=30)
     required = [
-        f"{action.option_strings[-1]} {action.metavar}" for action in every if action.required
+        f"{action.option_strings[-1]} {action.metavar}"
+        for action in every
+        if action.required
     ]
     operands = [command.prog, *(str(action.metavar) for action in arguments), *required]
     formatter.add_text(f"usage: {' '.join(operands)} [options]")
@@ -406,7 +456,9 @@ def short_help(command: argparse.ArgumentParser) -> str:
         formatter.end_section()
     formatter.add_text(command.epilog)
     if options:
-        formatter.add_text(f"help for all {len(every)} options: {command.prog} --help all")
+        formatter.add_text(
+            f"help for all {len(every)} options: {command.prog} --help all"
+        )
     return formatter.format_help()
 
 

@@ -74,7 +74,9 @@ class ThrusterAuthority(NamedTuple):
             return ""
         text = f"{counted(self.thrusters, 'thruster')} alone "
         if not self.every_way:
-            return folded([f"{text}cannot produce a force and a torque in every direction"])
+            return folded(
+                [f"{text}cannot produce a force and a torque in every direction"]
+            )
         text += "produce forces and torques in every direction"
         if not self.bounded:
             text += "; some of them have no limit (max)"
@@ -99,8 +101,12 @@ class PointProperties(NamedTuple):
         moments, axes = np.linalg.eigh(self.inertia)
         axes = axes * np.sign(axes[np.abs(axes).argmax(axis=0), range(3)])
         rows = [["inertia", *_AXES, "principal", *(f"axis {axis}" for axis in _AXES)]]
-        for row, moment, axis, name in zip(self.inertia, moments, axes.T, _AXES, strict=True):
-            shown = ["." if abs(x) < _ROUNDING * moments[-1] else f"{x:.5g}" for x in row]
+        for row, moment, axis, name in zip(
+            self.inertia, moments, axes.T, _AXES, strict=True
+        ):
+            shown = [
+                "." if abs(x) < _ROUNDING * moments[-1] else f"{x:.5g}" for x in row
+            ]
             along = ["." if abs(x) < _ROUNDING else f"{x:.4f}" for x in axis]
             rows.append([name, *shown, f"{moment:.5g}", *along])
         head = (
@@ -172,7 +178,9 @@ def thruster_authority(robot: Robot, q: Array, center: Array) -> ThrusterAuthori
     bounded = bool(np.isfinite(high).all())
     if not (every_way and bounded and count <= _MANY):
         return ThrusterAuthority(count, every_way, bounded)
-    torque, force = (least_reach(W, low, high, part) for part in np.hsplit(np.eye(6), 2))
+    torque, force = (
+        least_reach(W, low, high, part) for part in np.hsplit(np.eye(6), 2)
+    )
     return ThrusterAuthority(count, every_way, bounded, force, torque)
 
 
@@ -233,14 +241,19 @@ def least_reach(W: Array, low: Array, high: Array, kept: Array) -> float:
     least = math.inf
     while chunk := list(islice(subsets, _FACETS)):
         chosen = columns[:, np.array(chunk)].transpose(1, 0, 2)  # (normals, m, m - 1)
-        minors = [np.linalg.det(np.delete(chosen, row, axis=1)) for row in range(len(W))]
+        minors = [
+            np.linalg.det(np.delete(chosen, row, axis=1)) for row in range(len(W))
+        ]
         normals = np.stack(minors, axis=1) * (-1.0) ** np.arange(len(W))
         normals = normals[np.linalg.norm(normals, axis=1) > _ROUNDING]
         within = np.linalg.norm(normals / scale @ kept, axis=1)
         crossing = within > _ROUNDING * np.linalg.norm(normals / scale, axis=1)
         along = (normals / scale)[crossing] @ W
         for components in (along, -along):
-            reach = np.maximum(components * low, components * high).sum(axis=1) / within[crossing]
+            reach = (
+                np.maximum(components * low, components * high).sum(axis=1)
+                / within[crossing]
+            )
             least = min(least, float(reach.min(initial=math.inf)))
     return least
 

@@ -56,13 +56,19 @@ def saturation(
     low, high = input_limits(robot, limits)
     within = Saturation(low, high)
     names = [name for _, group in robot.named_inputs for name in group]
-    motors = {name: motor_of(names, name) for name in wheels if f"qdot_m.{name}" in limits}
+    motors = {
+        name: motor_of(names, name) for name in wheels if f"qdot_m.{name}" in limits
+    }
     driven = {name: motor for name, motor in motors.items() if motor is not None}
     if driven:
         spun, at = [*driven], [*driven.values()]
         of_v = [robot.joint(name).idx_v for name in spun]
-        mobility = pin.computeMinverse(robot.model, robot.create_data(), q).diagonal()[of_v]
-        least_speed, most_speed = np.array([limits[f"qdot_m.{name}"] for name in spun]).T
+        mobility = pin.computeMinverse(robot.model, robot.create_data(), q).diagonal()[
+            of_v
+        ]
+        least_speed, most_speed = np.array(
+            [limits[f"qdot_m.{name}"] for name in spun]
+        ).T
         limited = rules.Wheels(
             at=np.array(at),
             row=np.array([6 + robot.joint_names.index(name) for name in spun]),
@@ -83,7 +89,8 @@ def saturation(
     if (short := least > most * time).any() or not time:
         name, item = thrusters[at[int(short.argmax())]]
         why = (
-            "is pulsed, which needs sampled commands; give sample= (--sample), or a sampled policy"
+            "is pulsed, which needs sampled commands; give sample= (--sample), "
+            "or a sampled policy"
         )
         if time:
             why = (
@@ -102,7 +109,12 @@ def saturation(
 
 
 def warn_beyond(
-    robot: str, where: str, units: Mapping[str, str], asked: Array, low: Array, high: Array
+    robot: str,
+    where: str,
+    units: Mapping[str, str],
+    asked: Array,
+    low: Array,
+    high: Array,
 ) -> None:
     """Warn about inputs whose commands `asked` (N, nu) are not between `low` and `high` (nu,).
 
@@ -139,7 +151,11 @@ class Law:
         """Return the command (nu,), or raise `InputError` if its shape or a value is invalid."""
         u = self.policy(t, q.copy(), v.copy())
         is_double = type(u) is np.ndarray and u.dtype is DOUBLE
-        u = np.array(u) if is_double else as_double(f"policy(t, q, v) at t = {t:g} s", u)
+        u = (
+            np.array(u)
+            if is_double
+            else as_double(f"policy(t, q, v) at t = {t:g} s", u)
+        )
         names = self.names
         shape = (len(self.names),)
         if u.shape == shape and math.isfinite(u.dot(u)):
@@ -158,7 +174,9 @@ class Law:
         return u
 
 
-def channel_of(limits: Saturation, initial: Array, sample: int, delay: int) -> rules.Channel:
+def channel_of(
+    limits: Saturation, initial: Array, sample: int, delay: int
+) -> rules.Channel:
     """Return the kernel's channel for limits, a sample time [steps] and a delay [steps].
 
     Until the first command arrives, the channel applies the inputs `initial` (nu,), saturated at
@@ -182,7 +200,12 @@ def channel_of(limits: Saturation, initial: Array, sample: int, delay: int) -> r
 
 
 def channelled(
-    law: Inputs, speeds: Inputs, limits: Saturation, initial: Array, sample: int, delay: int
+    law: Inputs,
+    speeds: Inputs,
+    limits: Saturation,
+    initial: Array,
+    sample: int,
+    delay: int,
 ) -> Inputs:
     """Return f(step, *point), which sends a command through a channel and returns inputs (nu,).
 

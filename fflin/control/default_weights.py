@@ -78,7 +78,8 @@ class Pace(NamedTuple):
     bandwidth: float = BANDWIDTH  # [rad/s]
     fraction: float = 1.0  # factor on the design displacements
     hold: float = 0.0  # [s], hold time of the inputs; 0 if they are continuous
-    held: float = _HELD  # [rad], largest permitted product of mode frequency and hold time
+    # [rad], largest permitted product of mode frequency and hold time
+    held: float = _HELD
 
 
 class Limit(NamedTuple):
@@ -88,7 +89,9 @@ class Limit(NamedTuple):
     what: str
 
 
-def default_weights(lin: LinearModel, pace: Pace, momenta: Mapping[str, float]) -> Weights:
+def default_weights(
+    lin: LinearModel, pace: Pace, momenta: Mapping[str, float]
+) -> Weights:
     """Return the weights (10.7), with which a displaced robot returns without exceeding its limits.
 
     `momenta` maps the speed of each wheel that has a motor to the largest momentum [N m s] that the
@@ -157,17 +160,25 @@ def _of_inertia(
     on_positions = to_modes.T @ (np.sqrt(ratios)[:, None] * to_modes)
     on_positions = 0.5 * (on_positions + on_positions.T)
     # Gain (nu, m) from coordinates to inputs, for a bandwidth of 1 rad/s.
-    gain = (S / cost).T @ np.linalg.solve(reach, back.T @ (ratios[:, None] ** 0.75 * to_modes))
+    gain = (S / cost).T @ np.linalg.solve(
+        reach, back.T @ (ratios[:, None] ** 0.75 * to_modes)
+    )
     rates = ratios**0.375
     mass = np.ones(m) if (lin.M == M).all() else np.diag(T.T @ lin.M @ T)
     # `room` contains the limits on the rates of the coordinates, and on the momenta that the inputs
     # add to wheels.
-    room = {name: lin.limits.get(name, math.inf) for name in lin.state_names[m:]} | {**momenta}
+    room = {name: lin.limits.get(name, math.inf) for name in lin.state_names[m:]} | {
+        **momenta
+    }
     added = (S / cost).T @ np.linalg.solve(reach, lin.M @ T)
-    motors = [motor_of(lin.input_names, name.removeprefix("qdot_m.")) for name in momenta]
+    motors = [
+        motor_of(lin.input_names, name.removeprefix("qdot_m.")) for name in momenta
+    ]
     taken = np.vstack((T, added[np.array(motors, dtype=np.intp)]))
     use = _largest_use(gain, size, lin.state_names)
-    speeds = _limits_on("speed", room, _fastest(taken, rates, to_modes, size, lin, mass), 1.0)
+    speeds = _limits_on(
+        "speed", room, _fastest(taken, rates, to_modes, size, lin, mass), 1.0
+    )
     efforts = _limits_on("effort", _efforts_left(lin), use, 2.0)
     limit = min([Limit(pace.bandwidth, ""), *speeds, *efforts])
     achieved = ""
@@ -177,7 +188,10 @@ def _of_inertia(
         growth, mode = _growth(lin)
         limit = max(limit, Limit(_OF_GROWTH * growth, mode))
     if pace.hold:
-        limit = min(limit, Limit(pace.held / (pace.hold * float(rates[-1])), "the sampling time"))
+        limit = min(
+            limit,
+            Limit(pace.held / (pace.hold * float(rates[-1])), "the sampling time"),
+        )
     damped = (lin.M != M).any()
     on_velocities = _on_velocities(lin, S, cost, D / unit, damped) if loaded else None
 
@@ -245,7 +259,10 @@ def _on_velocities(
     values, directions = np.linalg.eigh((S / cost) @ S.T / np.outer(size, size))
     root = size[:, None] * directions * np.sqrt(values.clip(_LEAST_REACH))
     L = np.linalg.solve(lin.M, root)
-    F, H = np.linalg.solve(L, X[m:, :m] @ X[:m, m:] @ L), np.linalg.solve(L, X[m:, m:] @ L)
+    F, H = (
+        np.linalg.solve(L, X[m:, :m] @ X[:m, m:] @ L),
+        np.linalg.solve(L, X[m:, m:] @ L),
+    )
     _, stiffness, modes = np.linalg.svd(F)
     damping_term = H.T @ H * damped
     back = np.linalg.inv(L)
@@ -278,7 +295,9 @@ def _radius_of_gyration(lin: LinearModel) -> float:
     """
     M = lin.M
     mass = lin.M[3, 3]
-    center = np.array((M[4, 2] - M[5, 1], M[5, 0] - M[3, 2], M[3, 1] - M[4, 0])) / (2.0 * mass)
+    center = np.array((M[4, 2] - M[5, 1], M[5, 0] - M[3, 2], M[3, 1] - M[4, 0])) / (
+        2.0 * mass
+    )
     moment = np.trace(M[:3, :3]) - 2.0 * mass * center @ center
     return math.sqrt(max(float(moment) / (2.0 * mass), 1e-300))
 
@@ -324,32 +343,46 @@ def _fastest(
     return largest
 
 
-def _rule(lin: LinearModel, size: Array, limit: Limit, achieved: str, turn: float) -> str:
+def _rule(
+    lin: LinearModel, size: Array, limit: Limit, achieved: str, turn: float
+) -> str:
     groups = [name.partition(".")[0] for name in lin.state_names[: len(size)]]
     base = list[str]()
     if "q_b" in groups:
         base.append(f"{turn:g} deg")
     if "r_b" in groups:
         base.append(f"{size[groups.index('r_b')]:.2g} m")
-    sizes = [x for x in zip(lin.state_units, size, groups, strict=False) if x[2] == "q_m"]
+    sizes = [
+        x for x in zip(lin.state_units, size, groups, strict=False) if x[2] == "q_m"
+    ]
     units = dict.fromkeys(unit for unit, *_ in sizes if unit != "kg^0.5 m")
-    largest = {unit: max(d for joint_unit, d, _ in sizes if joint_unit == unit) for unit in units}
+    largest = {
+        unit: max(d for joint_unit, d, _ in sizes if joint_unit == unit)
+        for unit in units
+    }
     from_where = list[str]()
     if base:
         from_where.append(f"{' and '.join(base)} of the base")
     if largest:
         offsets = " or ".join(f"{d:.2g} {unit}" for unit, d in largest.items())
         from_where.append(f"{offsets} of the joints")
-    source = "the limits of the URDF" if lin.limits else "mass and size (the URDF has no limits)"
+    source = (
+        "the limits of the URDF"
+        if lin.limits
+        else "mass and size (the URDF has no limits)"
+    )
     slow = ""
     if limit.what:
         slow = f"; bandwidth limited by {limit.what}"
     if beyond := [name for name, room in _efforts_left(lin).items() if room <= 0.0]:
         slow += (
-            f"; inputs already at or beyond the URDF limit at the operating point: {listed(beyond)}"
+            "; inputs already at or beyond the URDF limit at the operating point: "
+            f"{listed(beyond)}"
         )
     pace = achieved or f"bandwidth at least {limit.bandwidth:.3g} rad/s"
-    return f"from {source}, for displacements of {' and '.join(from_where)}: {pace}{slow}"
+    return (
+        f"from {source}, for displacements of {' and '.join(from_where)}: {pace}{slow}"
+    )
 
 
 def _largest_use(K: Array, size: Array, names: tuple[str, ...]) -> Array:
@@ -367,14 +400,19 @@ def _largest_use(K: Array, size: Array, names: tuple[str, ...]) -> Array:
     return total
 
 
-def _limits_on(kind: str, room: Mapping[str, float], used: Array, power: float) -> list[Limit]:
+def _limits_on(
+    kind: str, room: Mapping[str, float], used: Array, power: float
+) -> list[Limit]:
     """Return, for each limited signal, the factor on the bandwidth at which it reaches its limit.
 
     `room` maps the name of each signal to its limit. With a factor of 1, the largest values of the
     signals are `used`. The values are proportional to the factor raised to the power `power`.
     """
     return [
-        Limit((most / size) ** (1.0 / power), f"the {kind} of {name.partition('_m.')[2] or name}")
+        Limit(
+            (most / size) ** (1.0 / power),
+            f"the {kind} of {name.partition('_m.')[2] or name}",
+        )
         for (name, most), size in zip(room.items(), used.tolist(), strict=True)
         if 0.0 < most < math.inf and size > 0.0
     ]
@@ -392,7 +430,9 @@ def _growth(lin: LinearModel) -> Limit:
     rates = rates_of(poles, lin.dt).real
     fastest, k = float(rates.max()), int(rates.argmax())
     moving = listed(_moving_most(lin, modes[:, [k]]))
-    return Limit(fastest, f"the unstable mode that grows by {fastest:.3g} 1/s ({moving})")
+    return Limit(
+        fastest, f"the unstable mode that grows by {fastest:.3g} 1/s ({moving})"
+    )
 
 
 def _slowed(
@@ -450,9 +490,12 @@ def _slowed(
         # only an estimate. The bandwidth is therefore reduced in steps.
         limit = max(Limit(min(max(left, 0.3), 0.8) * w, effort), least)
     if not trials:
-        return limit, ""  # the later design of the regulator also fails, and reports the reason
+        # the later design of the regulator also fails, and reports the reason
+        return limit, ""
     enough = _IN_VAIN * max(left for left, *_ in trials)
-    _, effort, (w, reason), description, required = next(x for x in trials if x[0] >= enough)
+    _, effort, (w, reason), description, required = next(
+        x for x in trials if x[0] >= enough
+    )
     high = np.array([lin.limits.get(name, math.inf) for name in lin.input_names])
     where = "to return from the displacements of the default weights"
     units = dict(zip(lin.input_names, lin.input_units, strict=True))
@@ -473,7 +516,9 @@ def _moving_most(lin: LinearModel, modes: Complex) -> list[str]:
     m = len(lin.M)
     large = np.abs(modes[:m]) * np.sqrt(lin.M.diagonal())[:, None]
     among = (large > 0.5 * large.max(axis=0, initial=0.0)).any(axis=1)
-    return [name for name, moves in zip(lin.state_names[:m], among, strict=False) if moves]
+    return [
+        name for name, moves in zip(lin.state_names[:m], among, strict=False) if moves
+    ]
 
 
 # Along a trajectory, the design displacements are multiplied by _BESIDE. They should decay within
@@ -485,4 +530,6 @@ _BESIDE, _CONSTANTS, _FASTEST, _HELD_ALONG = 0.1, 15.0, 1.5, 1.0
 
 def pace_along(duration: float, hold: float) -> Pace:
     """Return the pace along a trajectory of `duration` [s], with inputs held for `hold` [s]."""
-    return Pace(min(max(_CONSTANTS / duration, BANDWIDTH), _FASTEST), _BESIDE, hold, _HELD_ALONG)
+    return Pace(
+        min(max(_CONSTANTS / duration, BANDWIDTH), _FASTEST), _BESIDE, hold, _HELD_ALONG
+    )

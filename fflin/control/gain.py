@@ -146,7 +146,9 @@ class Gain(ModelDesign):
         states = self.regulated or self.state_names
         require_known("state", states, self.state_names)
         if not 0 < len(self.poles) <= len(states):
-            raise InputError(f"{len(self.poles)} poles for {len(states)} regulated states")
+            raise InputError(
+                f"{len(self.poles)} poles for {len(states)} regulated states"
+            )
 
     def _report(self) -> str:
         """Return the report with the gain, poles, residual, margins, weights and warnings."""
@@ -157,7 +159,11 @@ class Gain(ModelDesign):
             shown = f"\n\n{matrix(self.K, self.input_names, self.state_names)}"
         else:
             shown = " is too large to show; save() (-o FILE) writes every entry"
-        left = [name for name in self.state_names if self.regulated and name not in self.regulated]
+        left = [
+            name
+            for name in self.state_names
+            if self.regulated and name not in self.regulated
+        ]
         not_regulated = ""
         if left:
             not_regulated = f"{listed(left)} ({_why_not_regulated(left)})"
@@ -174,7 +180,9 @@ class Gain(ModelDesign):
             f"changes of all inputs: gain {margins.gain[0]:.3g} to {margins.gain[1]:.3g}, phase "
             f"{margins.phase:.3g} deg (disk margin {margins.disk:.3g})"
         )
-        head = f"{summary_of_poles(self)}\n{fold(f'{head}, frame {self.frame}, {time}')}"
+        head = (
+            f"{summary_of_poles(self)}\n{fold(f'{head}, frame {self.frame}, {time}')}"
+        )
         notes = [fold(f"{label}: {text}") for label, text in more.items() if text]
         return "\n\n".join(
             (
@@ -212,7 +220,9 @@ class Gain(ModelDesign):
             If two signals differ only by a dot or an underscore, because python-control has no dots
             in names.
         """
-        return state_space(([], [], [], -self.K), self.dt, (), self.state_names, self.input_names)
+        return state_space(
+            ([], [], [], -self.K), self.dt, (), self.state_names, self.input_names
+        )
 
     def to(self, tool: str) -> ToolGain:
         """Return the gain, u0 and reference in another tool's coordinates, see `LinearModel.to`.
@@ -243,13 +253,21 @@ class Gain(ModelDesign):
         # Steinbuch, Systems and Control Letters 14(4), 1990.
         S = selection(self.regulated or self.state_names, self.state_names)
         scale = np.sqrt(self.R.diagonal())
-        F, G, H = S @ self.closed_loop @ S.T, S @ self.B / scale, -scale[:, None] * self.K @ S.T
+        F, G, H = (
+            S @ self.closed_loop @ S.T,
+            S @ self.B / scale,
+            -scale[:, None] * self.K @ S.T,
+        )
         D = 0.5 * np.eye(len(H))
         if self.dt:
             # The bilinear map s = (z - 1)/(z + 1) preserves the H-infinity norm.
             inverse, unit = np.linalg.inv(F + np.eye(len(F))), np.eye(len(F))
             D = D - H @ inverse @ G
-            F, G, H = inverse @ (F - unit), 2.0**0.5 * inverse @ G, 2.0**0.5 * H @ inverse
+            F, G, H = (
+                inverse @ (F - unit),
+                2.0**0.5 * inverse @ G,
+                2.0**0.5 * H @ inverse,
+            )
         disk = min(1.0 / largest_gain(F, G, H, D)[0], 2.0)
         most = math.inf
         if disk < 2.0:
@@ -317,7 +335,9 @@ def cautions(gain: Gain) -> list[str]:
         )
     keys = zip(input_keys(gain), gain.input_names, gain.K, gain.u0, strict=True)
     thrusters = [
-        name for key, name, row, at in keys if group_of(key) == "thrust" and row.any() and at <= 0.0
+        name
+        for key, name, row, at in keys
+        if group_of(key) == "thrust" and row.any() and at <= 0.0
     ]
     if thrusters:
         messages.append(
@@ -419,7 +439,9 @@ def _has_margin_of_kalman(gain: Gain) -> bool:
     least 1 / (1 + 1/2). See Safonov and Athans, IEEE Trans. Automatic Control 22(2), 1977.
     """
     diagonal = np.count_nonzero(gain.R) == np.count_nonzero(gain.R.diagonal())
-    return bool(diagonal and not gain.dt and not gain.N.any() and gain.residual <= _SOLVED)
+    return bool(
+        diagonal and not gain.dt and not gain.N.any() and gain.residual <= _SOLVED
+    )
 
 
 class Margins(NamedTuple):
@@ -458,7 +480,9 @@ def largest_gain(A: Array, B: Array, C: Array, D: Array) -> tuple[float, float]:
         bound = peak[0] * (1.0 + ACCURACY)
         crossings, on_axis = gain_crossings(A, B, C, D, bound)
         frequencies = np.sort(np.abs(crossings.imag[on_axis]))
-        between = np.concatenate((frequencies, 0.5 * (frequencies[1:] + frequencies[:-1])))
+        between = np.concatenate(
+            (frequencies, 0.5 * (frequencies[1:] + frequencies[:-1]))
+        )
         best = max(map(gain, between.tolist()), default=peak)
         if best[0] <= bound:
             return max(peak, best)
@@ -484,7 +508,9 @@ def _largest_among(
     return max(gains.values())
 
 
-def gain_crossings(A: Array, B: Array, C: Array, D: Array, bound: float) -> tuple[Values, Mask]:
+def gain_crossings(
+    A: Array, B: Array, C: Array, D: Array, bound: float
+) -> tuple[Values, Mask]:
     """Return the eigenvalues (.., 2 nx) of a Hamiltonian matrix, and a mask of the imaginary ones.
 
     At the frequency of each imaginary eigenvalue, a singular value of the frequency response equals

@@ -18,7 +18,15 @@ from fflin.base.errors import DetectabilityError, InputError, listed, located
 from fflin.base.names import input_keys
 from fflin.base.process import in_one_thread
 from fflin.base.tables import folded
-from fflin.base.validation import Array, ArrayLike, Poles, Vector, dimension, instance, shaped
+from fflin.base.validation import (
+    Array,
+    ArrayLike,
+    Poles,
+    Vector,
+    dimension,
+    instance,
+    shaped,
+)
 from fflin.control.gain import Gain, ModelDesign, summary_of_poles, table_of_poles
 from fflin.control.lqr import at_fixed_point
 from fflin.control.optimal import differential_riccati as riccati
@@ -108,10 +116,18 @@ class Estimator(ModelDesign):
         parts = [f"{summary_of_poles(self)}\n{folded([head])}"]
         parts.append(table_of_poles(self, "A - L C"))
         parts.append(f"Riccati residual {self.residual:.1e}")
-        left = [name for name in self.state_names if self.estimated and name not in self.estimated]
+        left = [
+            name
+            for name in self.state_names
+            if self.estimated and name not in self.estimated
+        ]
         if left:
             parts.append(
-                folded([f"not estimated: {listed(left)}, which have no effect on the other states"])
+                folded(
+                    [
+                        f"not estimated: {listed(left)}, which have no effect on the other states"
+                    ]
+                )
             )
         return "\n\n".join(parts)
 
@@ -128,7 +144,12 @@ class Estimator(ModelDesign):
         """
         L = self.L
         both = (*self.input_names, *self.output_names)
-        system = self.A - L @ self.C, np.hstack((self.B - L @ self.D, L)), np.eye(len(L)), 0.0
+        system = (
+            self.A - L @ self.C,
+            np.hstack((self.B - L @ self.D, L)),
+            np.eye(len(L)),
+            0.0,
+        )
         return state_space(system, self.dt, self.state_names, both, self.state_names)
 
 
@@ -309,7 +330,9 @@ def kalman(
     )
 
 
-def _estimated_part(lin: LinearModel, disturbed: Array, wheel_speeds: bool | None) -> LinearModel:
+def _estimated_part(
+    lin: LinearModel, disturbed: Array, wheel_speeds: bool | None
+) -> LinearModel:
     """Return the model of the estimated states: the states that `lqr` regulates, or all states.
 
     A model without wheels whose inputs do not push the base is estimated completely if the outputs
@@ -358,8 +381,12 @@ def lqg(gain: Gain, estimator: Estimator) -> Compensator:
     0.1
     """
     instance("gain", gain, Gain, "a Gain, as fflin.lqr returns it")
-    e = instance("estimator", estimator, Estimator, "an Estimator, as fflin.kalman returns it")
-    if gain.dt != e.dt or not (np.array_equal(gain.A, e.A) and np.array_equal(gain.B, e.B)):
+    e = instance(
+        "estimator", estimator, Estimator, "an Estimator, as fflin.kalman returns it"
+    )
+    if gain.dt != e.dt or not (
+        np.array_equal(gain.A, e.A) and np.array_equal(gain.B, e.B)
+    ):
         raise InputError(
             "the gain and the estimator belong to different models; use one model for both"
         )
@@ -466,24 +493,36 @@ def tvkalman(
     if asks_steady(P0, "P0", "a covariance"):
         start, early = steady_end(traj, 0), intensity(float(traj.t[0]))
         lin = start.of_trajectory(traj.robot)
-        with located("give P0, because no steady filter exists at the start of the trajectory"):
+        with located(
+            "give P0, because no steady filter exists at the start of the trajectory"
+        ):
             P = kalman(lin.discretize(dt), held_cost(lin.A.T, early, dt), V).P
     else:
         P = weight("P0", P0, traj.state_names)
-    held, at_samples, nx = list(transitions(traj, dt)), along(traj.resampled(dt)), len(P)
+    held, at_samples, nx = (
+        list(transitions(traj, dt)),
+        along(traj.resampled(dt)),
+        len(P),
+    )
     maps = np.array([whole for _, whole in held])
-    disturbed = np.zeros((len(held), nx, nx))  # covariance that the disturbance adds per sample
+    # covariance that the disturbance adds per sample
+    disturbed = np.zeros((len(held), nx, nx))
     with riccati.bounded_by("a smaller W or a larger V"):
         for covariance, (steps, _) in zip(disturbed, held, strict=True):
             early, late = (
-                np.array([intensity(t) for t in times]) for times in steps.nodes.T.tolist()
+                np.array([intensity(t) for t in times])
+                for times in steps.nodes.T.tolist()
             )
-            added = held_cost(steps.F[:, :nx, :nx].mT, HEAVY * early + LIGHT * late, steps.h)
+            added = held_cost(
+                steps.F[:, :nx, :nx].mT, HEAVY * early + LIGHT * late, steps.h
+            )
             for step, step_noise in zip(steps.maps[:, :, :nx], added, strict=True):
                 covariance[:] = step @ covariance @ step.T + step_noise
         stages = [
             (block_diag(process_noise, V), np.hstack((whole[:, :nx].T, C.T)))
-            for process_noise, whole, C in zip(disturbed, maps, at_samples.C, strict=False)
+            for process_noise, whole, C in zip(
+                disturbed, maps, at_samples.C, strict=False
+            )
         ]
         K, P, residual = riccati.samples_back(stages, P)
     L = K.transpose(0, 2, 1)

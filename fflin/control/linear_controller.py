@@ -29,7 +29,8 @@ from fflin.linear.holding import held_if_possible, wheel_notes
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
 
-_NUMBERED = re.compile(r"([a-z]\[\d+\])?")  # default signal names such as u[0], or no name
+# default signal names such as u[0], or no name
+_NUMBERED = re.compile(r"([a-z]\[\d+\])?")
 
 
 class System(NamedTuple):
@@ -127,16 +128,26 @@ class LinearController(OutputSensing, Feedback):
     def __post_init__(self) -> None:
         self.lin = lin = held_if_possible(about_point(self.lin))
         if number("sign", self.sign) not in (1.0, -1.0):
-            raise InputError(f"sign is {self.sign!r}, expected 1, or -1 for negative feedback")
+            raise InputError(
+                f"sign is {self.sign!r}, expected 1, or -1 for negative feedback"
+            )
         if self.noise is not None and not callable(self.noise):
-            raise InputError(f"noise is {self.noise!r}, expected noise(t) -> (ny,), a function")
+            raise InputError(
+                f"noise is {self.noise!r}, expected noise(t) -> (ny,), a function"
+            )
         controller = _system_of(self.system)
         # Expand the system to all outputs and inputs of the model, and multiply its output by the
         # sign of the feedback.
         columns = _indices(
-            "input", controller.inputs, controller.D.shape[1], "output", lin.output_names
+            "input",
+            controller.inputs,
+            controller.D.shape[1],
+            "output",
+            lin.output_names,
         )
-        rows = _indices("output", controller.outputs, len(controller.D), "input", lin.input_names)
+        rows = _indices(
+            "output", controller.outputs, len(controller.D), "input", lin.input_names
+        )
         nz, (nu, ny) = len(controller.A), lin.D.T.shape
         B, C, D = np.zeros((nz, ny)), np.zeros((nu, nz)), np.zeros((nu, ny))
         B[:, columns] = controller.B
@@ -162,7 +173,9 @@ class LinearController(OutputSensing, Feedback):
                 "continuous); give a controller with the dt of the model, or give the continuous "
                 "model"
             )
-        self.system = System(controller.A, B, C, D, dt, lin.output_names, lin.input_names)
+        self.system = System(
+            controller.A, B, C, D, dt, lin.output_names, lin.input_names
+        )
         self.dt: float = dt
         self.sign = 1.0  # `system` contains the sign from here on
 
@@ -199,7 +212,9 @@ class LinearController(OutputSensing, Feedback):
         """Return notes on unstable poles of the linear loop and of the controller by itself."""
         hint = "; if it was designed for negative feedback, set sign=-1 (--negative-feedback)"
         of_loop = unstable_note("linear loop", self.loop, self.dt, hint)
-        return of_loop + unstable_note("controller by itself", self.system.A, self.dt, "")
+        return of_loop + unstable_note(
+            "controller by itself", self.system.A, self.dt, ""
+        )
 
     def held_for(self, seconds: float) -> Policy:
         """Return the controller, sampled if it is continuous."""
@@ -321,7 +336,12 @@ class OutputFeedback(LinearController):
     def __init__(
         self, lin: LinearModel, compensator: Compensator, noise: Noise | None = None
     ) -> None:
-        instance("compensator", compensator, Compensator, "a Compensator, as fflin.lqg returns it")
+        instance(
+            "compensator",
+            compensator,
+            Compensator,
+            "a Compensator, as fflin.lqg returns it",
+        )
         super().__init__(compensator, lin, noise=noise)
         self.compensator = compensator
         if not lin.dt:
@@ -343,10 +363,16 @@ def _system_of(given: Any) -> System:
                 f"system has {len(given)} parts, expected (A, B, C, D) or (A, B, C, D, dt)"
             )
         return _checked(*given)
-    if not hasattr(given, "A") and (hasattr(given, "to_ss") or hasattr(given, "ninputs")):
+    if not hasattr(given, "A") and (
+        hasattr(given, "to_ss") or hasattr(given, "ninputs")
+    ):
         tool = type(given).__name__
         try:
-            given = given.to_ss() if hasattr(given, "to_ss") else import_module("control").ss(given)
+            given = (
+                given.to_ss()
+                if hasattr(given, "to_ss")
+                else import_module("control").ss(given)
+            )
         except Exception as error:  # each tool raises its own types
             raise InputError(
                 f"the {tool} cannot be converted to a state space: {reason(error)}; a transfer "
@@ -361,7 +387,9 @@ def _system_of(given: Any) -> System:
     # dt = None means that the sample time is not given.
     if dt is None and not inputs:
         dt = 0.0
-    return _checked(given.A, given.B, given.C, getattr(given, "D", None), dt, inputs, outputs)
+    return _checked(
+        given.A, given.B, given.C, getattr(given, "D", None), dt, inputs, outputs
+    )
 
 
 def _checked(*given: Any) -> System:
@@ -372,7 +400,9 @@ def _checked(*given: Any) -> System:
     *matrices, dt, inputs, outputs = System(*given)
     defaults = (), (), (), 0.0
     A, B, C, D = (
-        np.atleast_2d(as_double(f"controller's {key}", default if matrix is None else matrix))
+        np.atleast_2d(
+            as_double(f"controller's {key}", default if matrix is None else matrix)
+        )
         for key, matrix, default in zip("ABCD", matrices, defaults, strict=True)
     )
     nz = len(A) if A.size else 0
@@ -398,7 +428,9 @@ def _read(path: Path) -> System:
     check_ending(path, RECORDS)
     with reading(path, "controller"):
         entries, _ = read_record(path)
-        if len(entries) == 1 and isinstance(struct := next(iter(entries.values())), dict):
+        if len(entries) == 1 and isinstance(
+            struct := next(iter(entries.values())), dict
+        ):
             entries = struct  # a MATLAB struct
         dt = entries.get("dt", entries.get("Ts"))
         if dt is not None:

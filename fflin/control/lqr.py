@@ -179,7 +179,9 @@ def regulator(
     if Q is None and R is None and N is None:
         Q, R, N, rule = rule_weights(lin, weights, Pace(hold=lin.dt), wheel_speeds)
     elif weights is not None or Q is None or R is None:
-        raise InputError("give either both Q and R, or only weights='urdf' or 'identity'")
+        raise InputError(
+            "give either both Q and R, or only weights='urdf' or 'identity'"
+        )
     Q, R, cross = cost_weights(lin, Q, R, N)
     part = regulated_part(lin, wheel_speeds)
     if part is not lin:
@@ -303,7 +305,12 @@ def acceleration_lqr(lin: LinearModel, Qp: Weight, Qv: Weight, Ra: Weight) -> Ga
 
 
 def _diagonal(
-    what: str, value: Weight, names: Sequence[str], kept: Sequence[str], *, definite: bool
+    what: str,
+    value: Weight,
+    names: Sequence[str],
+    kept: Sequence[str],
+    *,
+    definite: bool,
 ) -> Array:
     """Return the diagonal of a weight on the states `kept`, from a weight on all states `names`."""
     if not isinstance(value, Mapping) and dimension(what, value) == 2:
@@ -311,7 +318,9 @@ def _diagonal(
             f"{what} is a matrix, expected the diagonal of a weight; for a full weight matrix use "
             "lqr"
         )
-    diagonal = weight(what, value, names).diagonal()[[names.index(name) for name in kept]]
+    diagonal = weight(what, value, names).diagonal()[
+        [names.index(name) for name in kept]
+    ]
     return weight(what, diagonal, kept, definite=definite).diagonal()
 
 
@@ -330,7 +339,9 @@ def at_fixed_point(lin: LinearModel) -> LinearModel:
         "orbit --relative-equilibrium), or about a steady motion with moving=True"
     )
     if lin.moving:
-        advice = "the reference is not a steady motion; use fflin.tvlqr along its trajectory"
+        advice = (
+            "the reference is not a steady motion; use fflin.tvlqr along its trajectory"
+        )
         if lin._robot is not None and any(lin._robot.gravity):
             advice += "; in free fall, the errors move as without gravity: set gravity to zero"
     elif not lin.v.any():

@@ -13,7 +13,16 @@ import numpy as np
 from fflin.base.errors import FflinWarning, InputError, listed, optional_package
 from fflin.base.names import by_name, input_keys, stands_for_any, state_keys
 from fflin.base.process import in_one_thread
-from fflin.base.validation import Array, ArrayLike, Indices, Mask, instance, number, vector, whole
+from fflin.base.validation import (
+    Array,
+    ArrayLike,
+    Indices,
+    Mask,
+    instance,
+    number,
+    vector,
+    whole,
+)
 from fflin.control.gain import Gain
 from fflin.control.lqr import at_fixed_point, regulator
 from fflin.control.optimal.differential_riccati import bounded_by, samples_back
@@ -147,10 +156,17 @@ def mpc(
     >>> bool(abs(motion.u[:, 6:]).max() <= 1.0), policy.matrices(motion.x[0]).H.shape
     (True, (90, 90))
     """
-    instance("lin", lin, (LinearModel, LinearTrajectory), "a LinearModel or a LinearTrajectory")
+    instance(
+        "lin",
+        lin,
+        (LinearModel, LinearTrajectory),
+        "a LinearModel or a LinearTrajectory",
+    )
     samples = whole("horizon", horizon, 1)
     if sample is not None and dt is not None:
-        raise InputError("sample and dt are both given, but dt is the former name of sample")
+        raise InputError(
+            "sample and dt are both given, but dt is the former name of sample"
+        )
     if sample is None:
         sample = dt
     if sample is None:
@@ -191,7 +207,11 @@ class _Predictive(Feedback):
         stages = self.horizon.window(max(number("t", t), 0.0))
         nx = len(stages[0].A)
         size = len(horizon.inputs) * horizon.samples
-        start = np.zeros(nx) if e is None else vector("e", e, nx, "a deviation of the state")
+        start = (
+            np.zeros(nx)
+            if e is None
+            else vector("e", e, nx, "a deviation of the state")
+        )
         states, z, limited = condensed(stages, planned=False)
         (low, high, soft), free = horizon.bounds(stages), limited[:, size:] @ start
         double = 2.0 * z[:, :size].T
@@ -239,7 +259,9 @@ def _unplanned(
     """Return a horizon with the limits of a model's signals, but no stages."""
     robot = model.robot if isinstance(model, LinearTrajectory) else model._robot
     if robot is None:
-        raise InputError("lin was loaded from a file, which contains no robot; linearise again")
+        raise InputError(
+            "lin was loaded from a file, which contains no robot; linearise again"
+        )
     inputs, states, outputs = model.input_names, model.state_names, model.output_names
     beside = [name for name in outputs if name not in states]
     known = (*state_keys(robot.joint_names), *input_keys(model))
@@ -248,13 +270,17 @@ def _unplanned(
     for k, part in enumerate(parts):
         if isinstance(part, Mapping) and beside:
             output_keys = [
-                x for x in part if stands_for_any(x, beside) and not stands_for_any(x, known)
+                x
+                for x in part
+                if stands_for_any(x, beside) and not stands_for_any(x, known)
             ]
             ranges = by_name(
                 "output", {key: range_of(key, part[key]) for key in output_keys}, beside
             )
             limit_of |= {beside[i]: limit for i, limit in ranges.items()}
-            parts[k] = {key: limit for key, limit in part.items() if key not in output_keys}
+            parts[k] = {
+                key: limit for key, limit in part.items() if key not in output_keys
+            }
     end = model.v[-1] if isinstance(model, LinearTrajectory) else model.v
     given = parts[0] if len(parts) == 1 else parts
     acting = chosen_limits(robot, given, robot.wheels_at(end))
@@ -302,7 +328,10 @@ def _along(traj: LinearTrajectory, ahead: Horizon, cost: Cost) -> TrajectoryMpc:
     """Design the controller along a trajectory; `ahead` is its horizon, which has no stages yet."""
     (Q, R, Qf, weights), dt = cost, ahead.dt
     schedule = tvlqr(traj, Q, R, Qf, dt, weights=weights)
-    follows, state = TrajectoryFeedback(traj, schedule), StateMap(traj.robot, frame="local")
+    follows, state = (
+        TrajectoryFeedback(traj, schedule),
+        StateMap(traj.robot, frame="local"),
+    )
     models, stages = along(traj.resampled(dt)), list[Stage]()
     rest = rest_or_fall(traj)
     end = rest.of_trajectory(traj.robot)
@@ -325,7 +354,9 @@ def _along(traj: LinearTrajectory, ahead: Horizon, cost: Cost) -> TrajectoryMpc:
     for total, step, K, P, model, u, v in (*designs, last):
         # The base pose in x is zero, because limits of the base pose apply to the error relative to
         # the trajectory.
-        x = np.concatenate((np.zeros(6), state.joint_positions(model.q), state.velocities(v)))
+        x = np.concatenate(
+            (np.zeros(6), state.joint_positions(model.q), state.velocities(v))
+        )
         stages.append(ahead.stage(total, step, K, P, model, u, x))
     stages += stages[-1:] * (ahead.samples - 1)
     return TrajectoryMpc(traj, schedule, replace(ahead, stages=tuple(stages)))
@@ -422,7 +453,14 @@ class Horizon:
     high: Array
 
     def stage(
-        self, total: Array, whole: Array, K: Array, P: Array, lin: LinearModel, u: Array, x: Array
+        self,
+        total: Array,
+        whole: Array,
+        K: Array,
+        P: Array,
+        lin: LinearModel,
+        u: Array,
+        x: Array,
     ) -> Stage:
         """Return the stage of a sample with the gain K.
 
@@ -440,7 +478,9 @@ class Horizon:
 
     def window(self, t: float) -> tuple[Stage, ...]:
         """Return the N stages from time t on, or the last N stages if fewer remain."""
-        k = min(round(min(t / self.dt, len(self.stages))), len(self.stages) - self.samples)
+        k = min(
+            round(min(t / self.dt, len(self.stages))), len(self.stages) - self.samples
+        )
         return self.stages[k : k + self.samples]
 
     def bounds(self, stages: Sequence[Stage]) -> tuple[Array, Array, Mask]:
@@ -512,7 +552,10 @@ class Receding(BoundLaw):
             # Check the soft limits at the end of the last sample. The robot may exceed a limit even
             # if the plan does not, because the robot differs from the model.
             previous, last = self._due
-            reached, width = previous.E @ e + previous.D @ last, previous.high - previous.low
+            reached, width = (
+                previous.E @ e + previous.D @ last,
+                previous.high - previous.low,
+            )
             excess = np.maximum(previous.low - reached, reached - previous.high)
             width = np.where(np.isfinite(width) & (width > 0.0), width, 1.0)
             self._record(_OF_ROBOT, t - self.of.dt, excess, 1.0 / width, _OVER)
@@ -537,25 +580,35 @@ class Receding(BoundLaw):
                     FflinWarning,
                     2,
                 )
-        hard = self.of.at[self.of.at < len(d)]  # indices of limited inputs, whose limits come first
+        # indices of limited inputs, whose limits come first
+        hard = self.of.at[self.of.at < len(d)]
         d[hard] = np.clip(d[hard], now.low[: len(hard)], now.high[: len(hard)])
         self._due = now, d
         return d
 
-    def _record(self, event: str, t: float, excess: Array, unit: Array, least: float) -> None:
+    def _record(
+        self, event: str, t: float, excess: Array, unit: Array, least: float
+    ) -> None:
         """Count a plan or sample that violates a soft limit, and record the largest violation.
 
         A soft limit is violated if its entry of ``excess * unit`` is larger than `least`. The
         entries are ordered by sample, and the first sample starts at time t [s].
         """
         fractions = np.where(self._soft[: len(excess)], excess * unit, 0.0)
-        row, (count, most, description) = int(fractions.argmax()), self._violations[event]
+        row, (count, most, description) = (
+            int(fractions.argmax()),
+            self._violations[event],
+        )
         if fractions[row] > max(most, least):
             sample, at = divmod(row, len(self.of.limited))
             most = float(fractions[row])
             when = t + (sample + 1) * self.of.dt
             description = f"{self.of.limited[at]} by {excess[row]:.2g} at {when:.4g} s"
-        self._violations[event] = count + bool(fractions[row] > least), most, description
+        self._violations[event] = (
+            count + bool(fractions[row] > least),
+            most,
+            description,
+        )
 
     def _change(self, stages: tuple[Stage, ...]) -> None:
         self._stages = stages
@@ -565,7 +618,10 @@ class Receding(BoundLaw):
         self._G, self._free = rows[:, :size], rows[:, size:]
         length = np.linalg.norm(self._G, axis=1)
         moved = length > 1e-12 * length.max()  # False for limits that no input affects
-        self._low, self._high = np.where(moved, low, -np.inf), np.where(moved, high, np.inf)
+        self._low, self._high = (
+            np.where(moved, low, -np.inf),
+            np.where(moved, high, np.inf),
+        )
         self._unit = 1.0 / np.where(moved, length, 1.0)
         width = (self._high - self._low) * self._unit
         width = width[np.isfinite(width)]
@@ -575,16 +631,21 @@ class Receding(BoundLaw):
         self._rows = self._G * self._unit[:, None]
 
     def _start(self) -> None:
-        self._model = optional_package("daqp", "this needs the solver DAQP", "mpc").Model()
+        self._model = optional_package(
+            "daqp", "this needs the solver DAQP", "mpc"
+        ).Model()
         self._model.settings = {"primal_tol": _EXACT * self._size, "iter_limit": _MOST}
         self._model.settings = {"w_soft": _PRICE * self._size, "rho_soft": _YIELDS}
         (m, size), kinds = self._rows.shape, (_SOFT * self._soft).astype(np.int32)
         open_ = np.full(m, _OPEN)
-        self._model.setup(np.eye(size), np.zeros(size), self._rows, open_, -open_, kinds)
+        self._model.setup(
+            np.eye(size), np.zeros(size), self._rows, open_, -open_, kinds
+        )
 
     def _solved(self, free: Array) -> tuple[Array, int]:
         low, high = (
-            np.clip((limit - free) * self._unit, -_OPEN, _OPEN) for limit in (self._low, self._high)
+            np.clip((limit - free) * self._unit, -_OPEN, _OPEN)
+            for limit in (self._low, self._high)
         )
         self._model.update(bupper=high, blower=low)
         z, _, flag, _ = self._model.solve()

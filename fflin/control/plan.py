@@ -35,7 +35,9 @@ _REACHED = 1e-7
 # is checked at the ends of _PARTS equal parts of each interval.
 _BETWEEN, _PARTS = 0.01, 16
 
-_UNKNOWN = "its KKT residuals are unknown, because the last quadratic program cannot be solved"
+_UNKNOWN = (
+    "its KKT residuals are unknown, because the last quadratic program cannot be solved"
+)
 
 
 def plan(
@@ -159,8 +161,12 @@ def plan(
         raise InputError(f"duration is {duration:g} s, expected a positive time")
     if str(hold) not in ("linear", "previous"):
         raise InputError(f"hold is {hold!r}, expected 'linear' or 'previous'")
-    if not (isinstance(free, list | tuple) and all(isinstance(name, str) for name in free)):
-        raise InputError(f"free is {free!r}, expected a list of state names, such as ['r_b']")
+    if not (
+        isinstance(free, list | tuple) and all(isinstance(name, str) for name in free)
+    ):
+        raise InputError(
+            f"free is {free!r}, expected a list of state names, such as ['r_b']"
+        )
     t, actuation = np.linspace(0.0, duration, knots), Actuation(state)
     wheels = robot.wheels_at(end[1])
     shooting = Shooting(robot, t, hold == "previous", wheels)
@@ -185,7 +191,9 @@ def plan(
         inputs = np.array((low, high))
         cost = _knot_weights(shooting)[:, None] * weights
         size = np.abs(np.where(np.isfinite(bounds), bounds, 0.0)).max(axis=0)
-        search = Search(shooting, start, end, asked, bounds, inputs, size, cost, _PARTS, line.say)
+        search = Search(
+            shooting, start, end, asked, bounds, inputs, size, cost, _PARTS, line.say
+        )
         first = initial_guess(shooting, guess, start, end, asked, bounds, weights)
         made = _least(search, first)
     if made.reached:
@@ -197,7 +205,9 @@ def plan(
             warnings.warn(text, FflinWarning, stacklevel=2)
         note += f"\n{made.optimality or _UNKNOWN}"
         note += _largest(shooting, actuation, made, np.hstack((bounds, inputs)))
-        return Trajectory(robot, t, q, v, u, hold=hold, _note=note, _optimality=made.optimality)
+        return Trajectory(
+            robot, t, q, v, u, hold=hold, _note=note, _optimality=made.optimality
+        )
     raise _failure(shooting, made, asked, duration)
 
 
@@ -209,7 +219,8 @@ class _Made(NamedTuple):
     u: Array
     missed: Array  # error at the goal (nx,)
     at_knots: Array  # largest limit violations at the knots (nx,)
-    beyond: Array  # limit violations (N, parts, nx) at the ends of all parts, relative to limits
+    # limit violations (N, parts, nx) at the ends of all parts, relative to limits
+    beyond: Array
     most: float  # largest entry of `beyond`
     optimality: Optimality | None  # None if it could not be computed
 
@@ -220,7 +231,8 @@ class _Made(NamedTuple):
 
 
 def _goal_point(
-    state: StateMap, goal: LinearModel | tuple[ArrayLike | None, ArrayLike | None] | ArrayLike
+    state: StateMap,
+    goal: LinearModel | tuple[ArrayLike | None, ArrayLike | None] | ArrayLike,
 ) -> Point:
     """Return q (nq,) and v (nv,) of a goal: the point of a model, (q, v), or a state x (nx,)."""
     robot = state.robot
@@ -272,13 +284,16 @@ def _least(search: Search, guess: tuple[Array, Array, Array]) -> _Made:
         if optimality is not None:
             optimality = replace(optimality, effort=unit * optimality.effort)
         if shooting.held:
-            u = np.vstack((u[:-1], u[-2]))  # the last row repeats the input of the last interval
+            # the last row repeats the input of the last interval
+            u = np.vstack((u[:-1], u[-2]))
         missed = np.abs(shooting.between((q[-1], v[-1]), search.end)) * search.asked
         within = shooting.inside(shooting.motions(q, v, u), _PARTS)
         beyond = excess(bounds[:, None, None] - within)
         beyond /= np.where(search.size > 0.0, search.size, 1.0)
         at_knots = excess(bounds[:, None] - shooting.limited_values(q, v)).max(axis=0)
-        attempts.append(_Made(q, v, u, missed, at_knots, beyond, float(beyond.max()), optimality))
+        attempts.append(
+            _Made(q, v, u, missed, at_knots, beyond, float(beyond.max()), optimality)
+        )
         if attempts[-1].reached and attempts[-1].most <= _BETWEEN:
             break
     return max(attempts, key=lambda made: (made.reached, -made.most))
@@ -303,14 +318,19 @@ def _require_within(
         raise InputError(f"the {which_end} is outside the limits: {listed(outside)}")
 
 
-def _failure(shooting: Shooting, made: _Made, asked: Mask, duration: float) -> InputError:
+def _failure(
+    shooting: Shooting, made: _Made, asked: Mask, duration: float
+) -> InputError:
     """Return the error for a failed search, with the largest violations of the last trial."""
     robot, state = shooting.state.robot, shooting.state
     units = ["rad"] * 3 + [*state.units[3:]]
     names = [f"the attitude about {axis}" for axis in "xyz"] + [*state.names[3:]]
     misses = [
         f"{words} {names[i]} by {far[i]:.3g} {units[i]}"
-        for words, far in (("misses", made.missed), ("exceeds the limit of", made.at_knots))
+        for words, far in (
+            ("misses", made.missed),
+            ("exceeds the limit of", made.at_knots),
+        )
         for i in np.argsort(-far)[:3]
         if far[i] > _REACHED
     ]
@@ -318,7 +338,9 @@ def _failure(shooting: Shooting, made: _Made, asked: Mask, duration: float) -> I
         "give a longer duration, wider limits or more knots, or leave the final value of some "
         "states free with `free` (--free-end)"
     )
-    internal = all(isinstance(item, JointTorque | ReactionWheel) for item in robot.inputs)
+    internal = all(
+        isinstance(item, JointTorque | ReactionWheel) for item in robot.inputs
+    )
     if internal and asked[state.groups.omega_b].any() and asked[state.groups.v_b].any():
         advice = (
             "the inputs cannot change the momentum, so omega_b and v_b at the end cannot be "
@@ -367,7 +389,9 @@ def _note(shooting: Shooting, made: _Made) -> str:
     return f"the integrated motion {most} (checked at {_PARTS} points per interval)"
 
 
-def _largest(shooting: Shooting, actuation: Actuation, made: _Made, limits: Array) -> str:
+def _largest(
+    shooting: Shooting, actuation: Actuation, made: _Made, limits: Array
+) -> str:
     """Describe, for each group of signals, the state or input that is nearest to its limit.
 
     `limits` (2, k) contains the lower and upper limits of all states and inputs.
@@ -383,7 +407,9 @@ def _largest(shooting: Shooting, actuation: Actuation, made: _Made, limits: Arra
         k = int(shares[:, i].argmax())
         text = f"{names[i]} {abs(values[k, i]):.3g} of {bound[k, i]:.3g} {units[i]}"
         group = group_of(names[i]), names[i].removeprefix("qdot_m.") in wheels
-        nearest[group] = max(nearest.get(group, (0.0, text)), (float(shares[k, i]), text))
+        nearest[group] = max(
+            nearest.get(group, (0.0, text)), (float(shares[k, i]), text)
+        )
     text = ", ".join(text.replace(" ", "\u00a0") for _, text in nearest.values())
     if not text:
         return ""

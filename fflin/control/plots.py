@@ -9,10 +9,26 @@ import numpy as np
 
 from fflin.analysis.modes import Modes
 from fflin.base.errors import InputError
-from fflin.base.figures import COLORS, Axes, Figure, cycle, drawing, letters_of, logarithmic
+from fflin.base.figures import (
+    COLORS,
+    Axes,
+    Figure,
+    cycle,
+    drawing,
+    letters_of,
+    logarithmic,
+)
 from fflin.base.names import input_keys, runs
 from fflin.base.tables import counted, rounding
-from fflin.base.validation import Array, Mask, Values, dimension, instance, number, refuse_masked
+from fflin.base.validation import (
+    Array,
+    Mask,
+    Values,
+    dimension,
+    instance,
+    number,
+    refuse_masked,
+)
 from fflin.control.gain import Gain
 from fflin.linear.check import Check
 from fflin.linear.model import LinearModel
@@ -66,7 +82,10 @@ def plot_matrices(
         from matplotlib.colors import LogNorm
 
         panel = figure.subplots(1, 2, gridspec_kw={"width_ratios": (nx, nu)})
-        drawn = [np.ma.masked_where(np.abs(m) <= rounding(m), np.abs(m)) for m in (lin.A, lin.B)]
+        drawn = [
+            np.ma.masked_where(np.abs(m) <= rounding(m), np.abs(m))
+            for m in (lin.A, lin.B)
+        ]
         entries = np.concatenate([m.compressed() for m in drawn])
         top = float(entries.max(initial=0.0)) or 1.0
         norm = LogNorm(float(entries.min(initial=top)), 1.01 * top)
@@ -75,7 +94,9 @@ def plot_matrices(
             ("B", lin.input_names, input_keys(lin), lin.input_units),
         )
         letters = letters_of(1, 72.0 * cell)
-        for ax, sizes, (title, names, keys, units) in zip(panel, drawn, signals, strict=True):
+        for ax, sizes, (title, names, keys, units) in zip(
+            panel, drawn, signals, strict=True
+        ):
             image = ax.imshow(sizes, cmap="viridis_r", norm=norm)
             ax.grid(visible=False)
             ax.spines[:].set_visible(True)
@@ -96,7 +117,9 @@ def plot_matrices(
     return figure
 
 
-def plot_modes(modes: Modes, path: str | Path | None = None, *, axes: Axes | None = None) -> Figure:
+def plot_modes(
+    modes: Modes, path: str | Path | None = None, *, axes: Axes | None = None
+) -> Figure:
     """Draw the frequency, damping and shape of each mode.
 
     Parameters
@@ -134,7 +157,9 @@ def plot_modes(modes: Modes, path: str | Path | None = None, *, axes: Axes | Non
         colors = dict(zip(dict.fromkeys(units), COLORS, strict=False))
         labels = []
         for line, mode in enumerate(modes.modes):
-            _draw_shape(panel, line, mode.shape[:half], [colors[unit] for unit in units])
+            _draw_shape(
+                panel, line, mode.shape[:half], [colors[unit] for unit in units]
+            )
             growth = "grows" if mode.unstable else "decays"
             label = f"real, {growth} in {mode.time_constant:.3g} s"
             if mode.oscillates:
@@ -145,10 +170,15 @@ def plot_modes(modes: Modes, path: str | Path | None = None, *, axes: Axes | Non
         panel.set_xticks(range(half), names, rotation=90, fontsize=8)
         panel.set_yticks(range(count), labels, fontsize=8)
         panel.set(ylim=(count - 0.5, -0.5), xlim=(-0.6, half - 0.4))
-        patches = [Patch(color=color, label=f"[{unit}]") for unit, color in colors.items()]
+        patches = [
+            Patch(color=color, label=f"[{unit}]") for unit, color in colors.items()
+        ]
         legend_title = "largest entry: 1; outline: modulus of an entry out of phase"
         figure.legend(
-            handles=patches, title=legend_title, loc="outside lower center", ncols=len(colors)
+            handles=patches,
+            title=legend_title,
+            loc="outside lower center",
+            ncols=len(colors),
         )
         figure.suptitle(title)
     return figure
@@ -170,7 +200,9 @@ def _draw_shape(axes: Axes, line: int, shape: Values, colors: Sequence[str]) -> 
     axes.bar(x[late], modulus[late], 0.7, line, fill=False, edgecolor=outline, lw=0.6)
 
 
-def plot_check(check: Check, path: str | Path | None = None, *, axes: Axes | None = None) -> Figure:
+def plot_check(
+    check: Check, path: str | Path | None = None, *, axes: Axes | None = None
+) -> Figure:
     """Draw each error of a check together with its tolerance.
 
     Parameters
@@ -193,7 +225,8 @@ def plot_check(check: Check, path: str | Path | None = None, *, axes: Axes | Non
     tests = list(dict.fromkeys(row.test for row in rows))
     main_tests = ("ABA derivatives", "differences")
     labels = {
-        row: row.block if row.test in main_tests else f"{row.test}: {row.block}" for row in rows
+        row: row.block if row.test in main_tests else f"{row.test}: {row.block}"
+        for row in rows
     }
     names = list(dict.fromkeys(labels.values()))
     with drawing(path, 7.5, 2.2 + 0.2 * len(names), axes=axes) as figure:
@@ -201,18 +234,26 @@ def plot_check(check: Check, path: str | Path | None = None, *, axes: Axes | Non
         for shift, test, color in zip(_SHIFTS, tests, COLORS, strict=False):
             shown = [row for row in rows if row.test == test]
             lines = [names.index(labels[row]) + shift for row in shown]
-            panel.plot([row.error for row in shown], lines, "o", color=color, ms=4, label=test)
+            panel.plot(
+                [row.error for row in shown], lines, "o", color=color, ms=4, label=test
+            )
             panel.plot([row.tolerance for row in shown], lines, "|", color=color, ms=7)
         bad = check.failures
-        panel.plot([row.error for row in bad], [names.index(labels[row]) for row in bad], "rx")
+        panel.plot(
+            [row.error for row in bad], [names.index(labels[row]) for row in bad], "rx"
+        )
         panel.set_yticks(range(len(names)), names, fontsize=8)
         panel.set(xscale="log", ylim=(max(len(names), 1) - 0.5, -0.5))
         panel.set_xlabel("relative error (dot) and tolerance (bar)")
         verdict = f"OK: {len(check.rows)} errors within tolerance"
         if bad:
-            verdict = f"FAILED: {len(bad)} of {len(check.rows)} errors exceed their tolerance"
+            verdict = (
+                f"FAILED: {len(bad)} of {len(check.rows)} errors exceed their tolerance"
+            )
         exact = len(check.rows) - len(rows)
-        panel.set_title(f"{check.title}\n{verdict}; {exact} are zero (not drawn)", loc="left")
+        panel.set_title(
+            f"{check.title}\n{verdict}; {exact} are zero (not drawn)", loc="left"
+        )
         figure.legend(loc="outside lower center", ncols=len(tests) or 1)
     return figure
 
@@ -258,14 +299,18 @@ def plot_poles(
     dt = next((given_dt for _, given_dt in pole_sets.values() if given_dt), dt)
     with drawing(path, 6.0, 5.0, axes=axes) as figure:
         panel = figure.add_subplot()
-        _pole_map(panel, {label: values for label, (values, _) in pole_sets.items()}, dt)
+        _pole_map(
+            panel, {label: values for label, (values, _) in pole_sets.items()}, dt
+        )
         panel.set_title(title)
         if any(sets):
             figure.legend(loc="outside lower center", ncols=4)
     return figure
 
 
-def plot_loops(gain: Gain, path: str | Path | None = None, *, axes: Axes | None = None) -> Figure:
+def plot_loops(
+    gain: Gain, path: str | Path | None = None, *, axes: Axes | None = None
+) -> Figure:
     """Plot the loop gain at each input with the other loops closed: Bode plot, margins and poles.
 
     Parameters
@@ -298,7 +343,13 @@ def plot_loops(gain: Gain, path: str | Path | None = None, *, axes: Axes | None 
         lines = sizes.get_lines()[: len(loops)]
         legend_title = "margins at each input: phase, gain factors"
         letters = letters_of(1.3 * len(loops), 72.0 * (tall - 1.5))
-        figure.legend(lines, names, title=legend_title, loc="outside right upper", fontsize=letters)
+        figure.legend(
+            lines,
+            names,
+            title=legend_title,
+            loc="outside right upper",
+            fontsize=letters,
+        )
         rates, title, time = gain.poles, "poles of A - B K", ""
         if gain.dt:
             # Discrete-time poles z lie close together near 1, so ln(z)/dt is drawn instead of z.
@@ -353,7 +404,8 @@ def input_loops(gain: Gain) -> tuple[Array, Values, list[LoopMargins]]:
         signs = np.signbit(value(values[:, i]))
         at = np.flatnonzero((signs[1:] != signs[:-1]) & among[1:] & among[:-1])
         frequencies = (
-            brentq(lambda w: value(response(w)[i]), *grid[k : k + 2], xtol=1e-12) for k in at
+            brentq(lambda w: value(response(w)[i]), *grid[k : k + 2], xtol=1e-12)
+            for k in at
         )
         return [complex(response(w)[i]) for w in frequencies]
 
@@ -420,7 +472,9 @@ def _poles_of(given: object) -> tuple[Values, float]:
     refuse_masked("poles", given)
     flat = dimension("poles", given) == 1
     poles = np.asarray(given)
-    if not (flat and poles.dtype.kind in "fiuc" and poles.size and np.isfinite(poles).all()):
+    if not (
+        flat and poles.dtype.kind in "fiuc" and poles.size and np.isfinite(poles).all()
+    ):
         raise InputError(
             f"poles has type {type(given).__name__} of shape {poles.shape}, expected finite "
             "numbers (k,), a Gain, a LinearModel or {label: poles}"

@@ -186,7 +186,8 @@ def _require_designed_for(gain: Gain, lin: LinearModel) -> None:
         "inputs": gain.input_names == lin.input_names,
         "sampling time": bool(np.isclose(gain.dt, lin.dt)),
         "frame": gain.frame == lin.frame,
-        "point": gain.x0.shape == lin.x0.shape and bool(np.allclose(gain.x0, lin.x0, atol=1e-9)),
+        "point": gain.x0.shape == lin.x0.shape
+        and bool(np.allclose(gain.x0, lin.x0, atol=1e-9)),
         "reference": bool(np.allclose(gain.placement, lin.placement, atol=1e-9)),
     }
     different = [name for name, agrees in same.items() if not agrees]
@@ -348,7 +349,9 @@ class Allocation(Policy):
                 f"the design's joints differ from the joints of '{robot.name}'; give the same "
                 "robot, with other inputs, as the design"
             )
-        require_turns(f"the design was made for '{self.design.name}'", self.design.nq, robot)
+        require_turns(
+            f"the design was made for '{self.design.name}'", self.design.nq, robot
+        )
         return AllocatedPolicy(self, robot)
 
 
@@ -357,7 +360,9 @@ class AllocatedPolicy(BoundLaw):
 
     def __init__(self, allocation: Allocation, robot: Robot) -> None:
         frame, reference = allocation.axes
-        self._design = Actuation(StateMap(allocation.design, reference=reference, frame=frame))
+        self._design = Actuation(
+            StateMap(allocation.design, reference=reference, frame=frame)
+        )
         self._robot = Actuation(StateMap(robot, reference=reference, frame=frame))
         names = self._design.names
         free = np.full(len(names), np.inf)
@@ -365,7 +370,10 @@ class AllocatedPolicy(BoundLaw):
         self._command = Law(inner, names, (-free, free), np.inf)
         self._inner = inner if isinstance(inner, BoundLaw) else None
         self.advance = self._inner.advance if self._inner else None
-        self._data, self._design_data = robot.create_data(), allocation.design.create_data()
+        self._data, self._design_data = (
+            robot.create_data(),
+            allocation.design.create_data(),
+        )
         self._limits = input_limits(robot, limits_of(robot))
 
     @property
@@ -374,7 +382,9 @@ class AllocatedPolicy(BoundLaw):
         notes = self._inner.notes if self._inner else ()
         if self._design.names == self._robot.names:
             return notes
-        asked, given = (", ".join(actuation.groups) for actuation in (self._design, self._robot))
+        asked, given = (
+            ", ".join(actuation.groups) for actuation in (self._design, self._robot)
+        )
         return (f"allocation: the commanded {asked} are realised by {given}", *notes)
 
     def __call__(self, t: float, q: Array, v: Array) -> Array:
@@ -386,7 +396,9 @@ class AllocatedPolicy(BoundLaw):
         chart = state.unchecked_chart(q)
         u = self._design.in_base_axes(chart, self._command(t, q, v))
         force = self._design.columns(self._data, q) @ u
-        columns = chart.to_reference(self._robot.held, self._robot.columns(self._data, q).T).T
+        columns = chart.to_reference(
+            self._robot.held, self._robot.columns(self._data, q).T
+        ).T
         M = state.project(pin.crba(state.robot.model, self._design_data, q).T)
         factor = np.linalg.cholesky(M)
         scaled = np.linalg.solve(factor, np.column_stack((columns, force)))
@@ -472,7 +484,12 @@ class Loop(BoundLaw):
     """
 
     def __init__(
-        self, state: StateMap, dt: float, sizes: tuple[int, int], at: At, noise: Noise | None = None
+        self,
+        state: StateMap,
+        dt: float,
+        sizes: tuple[int, int],
+        at: At,
+        noise: Noise | None = None,
     ) -> None:
         self.at, self.dt, self._noise, (nz, self._ny) = at, dt, noise, sizes
         self.estimate: Array = np.zeros(nz)  # z at the next sample or stage
@@ -499,7 +516,9 @@ class Loop(BoundLaw):
         x = measure.state.read(q, v, near=near)
         noise: Array | float = 0.0
         if self._noise is not None:
-            noise = vector("noise(t)", self._noise(t), self._ny, "one value for each output")
+            noise = vector(
+                "noise(t)", self._noise(t), self._ny, "one value for each output"
+            )
 
         def measured(u: Array) -> Array:
             a = self._at_rest

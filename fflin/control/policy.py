@@ -98,7 +98,8 @@ class OutputForm(NamedTuple):
 
     loop: Any  # the bound law, a `policies.Loop`
     terms: Callable[[float], Any]  # `policies.Sample` at a time [s]
-    samples: int | None  # number of different samples from t = 0 on; None if all are the same
+    # number of different samples from t = 0 on; None if all are the same
+    samples: int | None
 
 
 class PathForm(NamedTuple):
@@ -322,7 +323,9 @@ class Policy(ABC):
             f"(lin.discretize({held:g}))"
         )
         loop = sampled.A - sampled.B @ K
-        return unstable_note("sampled linear loop", loop[_on_feedback(lin.A, K)], held, advice)
+        return unstable_note(
+            "sampled linear loop", loop[_on_feedback(lin.A, K)], held, advice
+        )
 
     def form(self, robot: Robot) -> Form | None:
         """Return the law as data for the compiled loop; None if it is computed in Python."""
@@ -354,7 +357,9 @@ class FunctionPolicy(Policy):
     def __post_init__(self) -> None:
         if isinstance(self.given, type):
             name = self.given.__name__
-            raise InputError(f"policy is the class {name}, expected an object of it: {name}(...)")
+            raise InputError(
+                f"policy is the class {name}, expected an object of it: {name}(...)"
+            )
         if not (callable(self.given) or callable(getattr(self.given, "bind", None))):
             raise InputError(
                 f"policy has type {type(self.given).__name__}, expected policy(t, q, v) -> u, such "

@@ -12,7 +12,14 @@ from fflin.base.errors import EquilibriumError, InputError
 from fflin.base.names import by_name
 from fflin.base.validation import Array, instance
 from fflin.control.kalman import kalman
-from fflin.control.policies import Allocation, Deviation, Feedback, Loop, OutputSensing, Sample
+from fflin.control.policies import (
+    Allocation,
+    Deviation,
+    Feedback,
+    Loop,
+    OutputSensing,
+    Sample,
+)
 from fflin.control.policy import (
     Command,
     Noise,
@@ -222,19 +229,26 @@ class TrajectoryFeedback(Feedback):
             if turn[3] < 0.0:
                 turn = -turn
             e[:3] = turn[:3]
-        return chart.to_pinocchio(moved_by(self.frame, chart.to_state(q, v)[None], e[None])[0])
+        return chart.to_pinocchio(
+            moved_by(self.frame, chart.to_state(q, v)[None], e[None])[0]
+        )
 
     def gain(self, t: float) -> Array:
         """Return the gain K (nu, nx) at time t of the run."""
         knots = self.schedule.t
         if t > self.over:
             return self.end_gain
-        return self.schedule.gain(float(knots[0]) + min(max(t, 0.0), float(knots[-1] - knots[0])))
+        return self.schedule.gain(
+            float(knots[0]) + min(max(t, 0.0), float(knots[-1] - knots[0]))
+        )
 
     def state_map(self, robot: Robot) -> StateMap:
         """Return the robot's states in base axes; `InputError` if the robot does not fit."""
         origin = self.trajectory.robot
-        state, design_state = StateMap(robot, frame="local"), StateMap(origin, frame="local")
+        state, design_state = (
+            StateMap(robot, frame="local"),
+            StateMap(origin, frame="local"),
+        )
         made = f"the trajectory was made for '{origin.name}'"
         for kind in ("input", "state"):
             require_same(made, state, kind, *signals_of(design_state, kind))
@@ -361,7 +375,9 @@ class TrajectoryOutputFeedback(OutputSensing, TrajectoryFeedback):
 
         dt = self.filter.dt
         sizes = self.filter.L.shape[1:]
-        return Loop(home, dt, sizes, lambda t: (self.terms(t).step, *expected_at(t)), self.noise)
+        return Loop(
+            home, dt, sizes, lambda t: (self.terms(t).step, *expected_at(t)), self.noise
+        )
 
     @property
     def sensors(self) -> tuple[str, ...]:
@@ -384,7 +400,9 @@ class TrajectoryOutputFeedback(OutputSensing, TrajectoryFeedback):
         gains, seen = self.schedule, self.filter
         k, jump = round(t / seen.dt), np.zeros(len(seen.state_names))
         if k < len(seen.A):
-            A, B, K, L, C, D = (x[k] for x in (seen.A, seen.B, gains.K, seen.L, seen.C, seen.D))
+            A, B, K, L, C, D = (
+                x[k] for x in (seen.A, seen.B, gains.K, seen.L, seen.C, seen.D)
+            )
             u, y = self.commanded(t)[2], seen.y[k]
         else:
             (lin, L), K = self._rest, self.end_gain
@@ -393,5 +411,7 @@ class TrajectoryOutputFeedback(OutputSensing, TrajectoryFeedback):
                 # At this sample, the reference changes from the trajectory to the robot at rest, so
                 # the velocity error jumps.
                 stop = self.reference(self.duration)[1] - lin.v
-                jump[len(jump) // 2 :] = StateMap(self.trajectory.robot).velocities(stop)
+                jump[len(jump) // 2 :] = StateMap(self.trajectory.robot).velocities(
+                    stop
+                )
         return Sample(A - B @ K - L @ (C - D @ K), L, -K, 0.0 * D.T, u, y, jump)

@@ -167,7 +167,9 @@ class GainSchedule(Schedule):
         x = t - self.starts[k]
         square = x * x
         fourth = square * square
-        powers = np.array((1.0, x, square, square * x, fourth, fourth * x, fourth * square))
+        powers = np.array(
+            (1.0, x, square, square * x, fourth, fourth * x, fourth * square)
+        )
         K = powers.dot(self.pieces[k]).reshape(self.K.shape[1:])
         return K
 
@@ -362,9 +364,15 @@ def tvlqr(
         pace = pace_along(float(traj.t[-1] - traj.t[0]), dt)
         Q, R, _, rule = rule_weights(steady_end(traj).model, weights, pace)
     elif weights is not None or Q is None or R is None:
-        raise InputError("give either both Q and R, or only weights='urdf' or 'identity'")
+        raise InputError(
+            "give either both Q and R, or only weights='urdf' or 'identity'"
+        )
     Q, R, _ = cost_weights(traj, Q, R, None)
-    Qf = steady_regulator(steady_end(traj), Q, R, sample)[0] if steady else weight("Qf", Qf, names)
+    Qf = (
+        steady_regulator(steady_end(traj), Q, R, sample)[0]
+        if steady
+        else weight("Qf", Qf, names)
+    )
 
     def at(times: Array) -> Array:
         A, B = traj.matrices_at(times)

@@ -8,7 +8,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fflin.analysis.ranks import null_space
-from fflin.analysis.reduction import ignorable_wheels, regulated_part, rigid_forces, without
+from fflin.analysis.reduction import (
+    ignorable_wheels,
+    regulated_part,
+    rigid_forces,
+    without,
+)
 from fflin.base.errors import InputError, listed, require_known, unknown
 from fflin.base.names import by_name, input_keys, matching, stands_for_any
 from fflin.base.validation import (
@@ -89,11 +94,20 @@ def bryson(lin: LinearModel | LinearTrajectory, largest: Mapping[str, float]) ->
     >>> fflin.lqr(lin, Q, R).K.shape
     (9, 18)
     """
-    instance("lin", lin, (LinearModel, LinearTrajectory), "a LinearModel or a LinearTrajectory")
+    instance(
+        "lin",
+        lin,
+        (LinearModel, LinearTrajectory),
+        "a LinearModel or a LinearTrajectory",
+    )
     if not isinstance(largest, Mapping) or not largest:
-        raise InputError(f"largest is {largest!r}, expected {{name: largest acceptable value}}")
+        raise InputError(
+            f"largest is {largest!r}, expected {{name: largest acceptable value}}"
+        )
     keys = (*lin.state_names, *input_keys(lin))
-    indices = {index for name in largest for index in matching("state or input", name, keys)}
+    indices = {
+        index for name in largest for index in matching("state or input", name, keys)
+    }
     if len({index < len(lin.state_names) for index in indices}) > 1:
         raise InputError(
             f"largest has states and inputs ({', '.join(map(repr, largest))}); call bryson once "
@@ -105,18 +119,24 @@ def bryson(lin: LinearModel | LinearTrajectory, largest: Mapping[str, float]) ->
     for key, size in sizes.items():
         if key.startswith("q_b"):
             require_chart(f"largest value of '{key}'", size)
-    values = {key: inverse_square(f"largest value of '{key}'", x) for key, x in sizes.items()}
+    values = {
+        key: inverse_square(f"largest value of '{key}'", x) for key, x in sizes.items()
+    }
     return _diagonal("largest", values, names, complete=of_inputs)
 
 
 def inverse_square(what: str, size: float) -> float:
     """Return ``1 / size^2``, or raise `InputError` if `size` is not between 1e-150 and 1e150."""
     if not 1e-150 <= size <= 1e150:
-        raise InputError(f"{what} is {size:g}, expected a positive number, 1e-150 to 1e150")
+        raise InputError(
+            f"{what} is {size:g}, expected a positive number, 1e-150 to 1e150"
+        )
     return size**-2
 
 
-def weight(what: str, value: Weight, names: Sequence[str], *, definite: bool = False) -> Array:
+def weight(
+    what: str, value: Weight, names: Sequence[str], *, definite: bool = False
+) -> Array:
     """Return a weight (k, k) from a matrix, a diagonal, a number, or {name or pattern: number}."""
     size = len(names)
     rounding = 0.0
@@ -143,7 +163,11 @@ def weight(what: str, value: Weight, names: Sequence[str], *, definite: bool = F
 
 
 def require_semidefinite(
-    what: str, matrix: Array, names: Sequence[str], rounding: float, definite: bool = False
+    what: str,
+    matrix: Array,
+    names: Sequence[str],
+    rounding: float,
+    definite: bool = False,
 ) -> None:
     """Raise `InputError` if a matrix is not positive semidefinite.
 
@@ -170,7 +194,9 @@ def cost_weights(
     """Check the weights Q, R and N, and return them as matrices; N is zero by default."""
     Q = weight("Q", Q, model.state_names)
     R = weight("R", R, input_keys(model), definite=True)
-    cross = np.zeros((len(Q), len(R))) if N is None else shaped("N", N, (len(Q), len(R)))
+    cross = (
+        np.zeros((len(Q), len(R))) if N is None else shaped("N", N, (len(Q), len(R)))
+    )
     if cross.any():
         with np.errstate(over="ignore", invalid="ignore"):
             reduced = Q - cross @ np.linalg.solve(R, cross.T)
@@ -250,7 +276,9 @@ def sampled_cost(
     F[:nx] = np.hstack((lin.A, lin.B))
     total = held_cost(F, W, h)
     if not np.isfinite(total).all():
-        raise InputError(f"dt is {h:g} s, within which the model overflows; give a shorter dt")
+        raise InputError(
+            f"dt is {h:g} s, within which the model overflows; give a shorter dt"
+        )
     return SampledCost(total[:nx, :nx], total[nx:, nx:], total[:nx, nx:])
 
 
@@ -260,7 +288,9 @@ def _diagonal(
     checked = numbers(what, values, "name", "weight of")
     value_at = by_name(f"entry of {what}", checked, names)
     if complete and len(value_at) < len(names):
-        missing = next(name for index, name in enumerate(names) if index not in value_at)
+        missing = next(
+            name for index, name in enumerate(names) if index not in value_at
+        )
         raise InputError(
             f"{what} has no value for {missing}; give a value for every entry of {what}"
         )
@@ -294,12 +324,16 @@ def rule_weights(
         rule = "1 for every state and every input (identity)"
     else:
         raise unknown("rule of weights", str(name), ("urdf", "identity"))
-    if weights := _weights_of(lin, robot_weights, of_robot=True) | _weights_of(lin, given):
+    if weights := _weights_of(lin, robot_weights, of_robot=True) | _weights_of(
+        lin, given
+    ):
         # By Bryson's rule, each signal with a largest value from the user costs 1 at this value.
         # To match this scale, Q and R of the rule are multiplied by a common factor, which does not
         # change the gain of the rule. With this factor, the geometric mean of the costs of the same
         # signals is 1 at the largest values of the rule.
-        costs = [terms[i] for i, (_, _, largest) in weights.items() if largest and terms[i]]
+        costs = [
+            terms[i] for i, (_, _, largest) in weights.items() if largest and terms[i]
+        ]
         scale = 1.0
         if costs:
             scale = math.exp(-np.log(costs).mean())
@@ -347,10 +381,14 @@ def _of_regulated(
     most = np.array([lin.limits[name] for name in names])
     # For a wheel that is already at its speed limit, `room` is computed as for a wheel at rest. The
     # report names the wheel.
-    room = np.where(spin < most, most - spin, most) / np.linalg.inv(lin.M).diagonal()[at]
+    room = (
+        np.where(spin < most, most - spin, most) / np.linalg.inv(lin.M).diagonal()[at]
+    )
     momenta = dict(zip(names, room, strict=True))
     Q, R, rule, bandwidth, terms = default_weights(body, pace, momenta)
-    if beyond := [name for name, x, y in zip(names, spin, most, strict=True) if x >= y > 0.0]:
+    if beyond := [
+        name for name, x, y in zip(names, spin, most, strict=True) if x >= y > 0.0
+    ]:
         rule += (
             "; wheel speeds already at or beyond the URDF limit at the operating point: "
             f"{listed(beyond)}"
@@ -380,12 +418,19 @@ def _weights_of(
     inputs = input_keys(lin)
     given_weights = dict[int, _Given]()
     every = (*states, *inputs)
-    kinds = ("q", "state", states), ("r", "input", inputs), ("bryson", "state or input", every)
+    kinds = (
+        ("q", "state", states),
+        ("r", "input", inputs),
+        ("bryson", "state or input", every),
+    )
     for part, kind, known in kinds:
         values = dict[str, _Given]()
-        for key, value in numbers(part, given.get(part, {}), "name", f"{part} of").items():
+        for key, value in numbers(
+            part, given.get(part, {}), "name", f"{part} of"
+        ).items():
             if of_robot and not stands_for_any(key, known):
-                continue  # a reduced model may lack states that the robot's weights name
+                # a reduced model may lack states that the robot's weights name
+                continue
             label = f"largest value of '{key}' (--bryson)"
             largest = part == "bryson"
             if largest and key.startswith("q_b"):

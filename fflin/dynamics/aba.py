@@ -15,7 +15,9 @@ def scaled_inverse(matrix: Array) -> Array:
     Without the scaling, a matrix of coordinates of very different inertia would lose digits.
     """
     scale = 1.0 / np.sqrt(np.diagonal(matrix))
-    inverse: Array = scale[:, None] * np.linalg.inv(scale[:, None] * matrix * scale) * scale
+    inverse: Array = (
+        scale[:, None] * np.linalg.inv(scale[:, None] * matrix * scale) * scale
+    )
     return inverse
 
 
@@ -36,7 +38,9 @@ class Aba:
         self._resists = bool(np.any(robot.springs))
         self._none = pin.StdVec_Force(robot.model.njoints, pin.Force.Zero())
 
-    def acceleration(self, q: Array, v: Array, u: Array, tau: Array | None = None) -> Array:
+    def acceleration(
+        self, q: Array, v: Array, u: Array, tau: Array | None = None
+    ) -> Array:
         """Return dv/dt (nv,) in Pinocchio's order.
 
         In `u`, the torque and force on the base are in base axes. `tau` (nv,) is an additional
@@ -60,7 +64,9 @@ class Aba:
         """Return dv/dt (N, nv) at N points, computed as in `acceleration`."""
         state = self.state
         if self.field or state.robot.followers or state.robot.stored_momentum:
-            return np.array([self.acceleration(*point) for point in zip(q, v, u, strict=True)])
+            return np.array(
+                [self.acceleration(*point) for point in zip(q, v, u, strict=True)]
+            )
         forces = u @ self.actuation.fixed.T
         if self._resists:
             forces += self._passive_force(q, v)
@@ -80,7 +86,11 @@ class Aba:
         M = state.project(pin.crba(self._model, data, q).T)
         columns = self.actuation.columns(data, q)
         bias = state.forces(pin.nonLinearEffects(self._model, data, q, v))
-        forces = np.abs(columns) @ np.abs(u) + np.abs(bias) + np.abs(self._passive_force(q, v))
+        forces = (
+            np.abs(columns) @ np.abs(u)
+            + np.abs(bias)
+            + np.abs(self._passive_force(q, v))
+        )
         total: Array = np.abs(np.linalg.inv(M)) @ forces
         return total
 
@@ -103,20 +113,28 @@ class Aba:
         external = self._wrenches(q, v, u)
         if state.robot.followers:
             assert state.S is not None
-            by_q, by_v, by_force = self._constrained_derivatives(q, v, external, tau, state.S)
+            by_q, by_v, by_force = self._constrained_derivatives(
+                q, v, external, tau, state.S
+            )
         else:
-            slopes = pin.computeABADerivatives(self._model, self._data, q, v, tau, external)
+            slopes = pin.computeABADerivatives(
+                self._model, self._data, q, v, tau, external
+            )
             by_q, by_v, by_force = state.velocities(np.array(slopes).mT).mT
             by_q, by_v = state.columns(by_q), state.columns(by_v)
             by_force = state.velocities(by_force)
         self.inverse = by_force
         at_rest = np.zeros_like(v)
         for joint, momentum in state.robot.stored_momentum:
-            pin.computeForwardKinematicsDerivatives(self._model, self._data, q, v, at_rest)
+            pin.computeForwardKinematicsDerivatives(
+                self._model, self._data, q, v, at_rest
+            )
             local = self._model, self._data, joint, pin.ReferenceFrame.LOCAL
             # Derivatives, with respect to q and v, of the angular velocity of the link that carries
             # the wheel. They are in the axes of this link.
-            turning, jacobian = (x[PIN_ANGULAR] for x in pin.getJointVelocityDerivatives(*local))
+            turning, jacobian = (
+                x[PIN_ANGULAR] for x in pin.getJointVelocityDerivatives(*local)
+            )
             torque = by_force @ state.forces(jacobian.T) @ skew(momentum)
             by_q += torque @ state.columns(turning)
             by_v += torque @ state.columns(jacobian)
@@ -158,11 +176,18 @@ class Aba:
         return force
 
     def _accelerate(
-        self, model: pin.Model, q: Array, v: Array, forces: Array, external: pin.StdVec_Force
+        self,
+        model: pin.Model,
+        q: Array,
+        v: Array,
+        forces: Array,
+        external: pin.StdVec_Force,
     ) -> Array:
         state = self.state
         if not state.robot.followers:
-            rates: Array = pin.aba(model, self._data, q, v, state.lift(forces), external)
+            rates: Array = pin.aba(
+                model, self._data, q, v, state.lift(forces), external
+            )
             return rates
         # Mimic joints: solve S^T M S nudot = S^T (tau - b) with M from CRBA.
         M = state.project(pin.crba(model, self._data, q))

@@ -53,10 +53,14 @@ def frame_of(robot: Robot, frame: object) -> Frame:
     if frame is None:
         return ORBITAL[0] if robot.orbit else "hybrid"
     if not isinstance(frame, str) or frame not in get_args(Frame):
-        raise InputError(f"frame is {frame!r}, expected one of {', '.join(get_args(Frame))}")
+        raise InputError(
+            f"frame is {frame!r}, expected one of {', '.join(get_args(Frame))}"
+        )
     if (frame in ORBITAL) != bool(robot.orbit):
         where = "in no orbit"
-        remedy = "use hybrid, local or world, or give the robot an orbit (orbit=, --orbit)"
+        remedy = (
+            "use hybrid, local or world, or give the robot an orbit (orbit=, --orbit)"
+        )
         if robot.orbit:
             where = "in an orbit"
             remedy = f"use {' or '.join(ORBITAL)}"
@@ -135,9 +139,13 @@ class Chart:
         if quaternion.ndim == 1:
             if quaternion[3] < 0.0:
                 quaternion = -quaternion
-            return cls(quaternion[:3], float(quaternion[3]), rotation_matrix(quaternion))
+            return cls(
+                quaternion[:3], float(quaternion[3]), rotation_matrix(quaternion)
+            )
         quaternion = quaternion * np.where(quaternion[..., 3:] < 0.0, -1.0, 1.0)
-        return cls(quaternion[..., :3], quaternion[..., 3:], rotation_matrices(quaternion))
+        return cls(
+            quaternion[..., :3], quaternion[..., 3:], rotation_matrices(quaternion)
+        )
 
     @cached_property
     def N(self) -> Array:
@@ -148,7 +156,10 @@ class Chart:
     def J(self) -> Array:
         """Matrix J (.., 3, 3) of ``d theta = J d q_b``, with d theta in base axes (1.3)."""
         # Q^-1 = Q^T + q_b q_b^T / q0.
-        return 2.0 * (2.0 * self.N.mT + self.q_b[..., :, None] * (self.q_b / self.q0)[..., None, :])
+        return 2.0 * (
+            2.0 * self.N.mT
+            + self.q_b[..., :, None] * (self.q_b / self.q0)[..., None, :]
+        )
 
     def rate(self, omega: Array) -> Array:
         """Return d q_b/dt (.., 3) for the angular velocity omega (.., 3) in base axes (1.2)."""
@@ -169,7 +180,9 @@ class Chart:
         """
         if self.standing:
             return -0.5 * crossed
-        return -0.5 * (crossed + omega[..., :, None] * (self.q_b / self.q0)[..., None, :])
+        return -0.5 * (
+            crossed + omega[..., :, None] * (self.q_b / self.q0)[..., None, :]
+        )
 
     def over_q_b(self, by_turn: Array) -> Array:
         """Return derivatives (.., k, 3) with respect to q_b.
@@ -239,7 +252,9 @@ def states_of(state: StateMap, q: Array, nu: Array) -> Array:
 
     nu is in base axes. The arguments are not checked.
     """
-    return state.compose(state.charts(q), state.positions(q), state.joint_positions(q), nu)
+    return state.compose(
+        state.charts(q), state.positions(q), state.joint_positions(q), nu
+    )
 
 
 def unwound(state: StateMap, x: Array, near: Array | float = 0.0) -> Array:
@@ -283,7 +298,9 @@ def readout(
     of_q[:, cos] = 0.0
     of_angles[6 + circling] = np.eye(len(circling))
     of_v[6 + robot.n :] = state.velocities(np.eye(robot.nv)).T
-    for group, of_part in compress(((g.omega_b, of_angular), (g.v_b, of_linear)), state.axes):
+    for group, of_part in compress(
+        ((g.omega_b, of_angular), (g.v_b, of_linear)), state.axes
+    ):
         of_v[group] = 0.0
         of_part[group] = at.rotation
     gains = -K @ S
@@ -314,7 +331,11 @@ def readout(
 
 
 def state_history(
-    state: StateMap, q: Array, v: Array, near: Array | None = None, t: Array | None = None
+    state: StateMap,
+    q: Array,
+    v: Array,
+    near: Array | None = None,
+    t: Array | None = None,
 ) -> Array:
     """Return the states (N, nx) of a motion, with the angles of continuous joints unwrapped.
 
@@ -341,7 +362,9 @@ def attitude_errors(x: Array, target: Array) -> Array:
     `target` is one state (nx,) for all rows of x, or one state for each row (N, nx).
     """
     turned, scalar = _apart(x, target)
-    angles: Array = 2.0 * np.arctan2(np.linalg.norm(turned, axis=1), np.abs(scalar[:, 0]))
+    angles: Array = 2.0 * np.arctan2(
+        np.linalg.norm(turned, axis=1), np.abs(scalar[:, 0])
+    )
     return np.degrees(angles)
 
 
@@ -352,9 +375,12 @@ def _apart(x: Array, target: Array) -> tuple[Array, Array]:
     """
     at, to = x[:, :3], target[..., :3]
     w, d = (
-        np.sqrt(np.maximum(0.0, 1.0 - (q_b * q_b).sum(axis=-1, keepdims=True))) for q_b in (at, to)
+        np.sqrt(np.maximum(0.0, 1.0 - (q_b * q_b).sum(axis=-1, keepdims=True)))
+        for q_b in (at, to)
     )
-    return d * at - w * to - np.cross(to, at), w * d + (at * to).sum(axis=-1, keepdims=True)
+    return d * at - w * to - np.cross(to, at), w * d + (at * to).sum(
+        axis=-1, keepdims=True
+    )
 
 
 def moving_errors(frame: str, x: Array, target: Array) -> Array:
@@ -404,10 +430,15 @@ def _in_reference(frame: str, nx: int) -> list[Indices]:
     The frame named `frame` determines the axes of omega_b and v_b.
     """
     velocities = np.arange(nx)[nx // 2 :]
-    return [velocities[part] for part in compress((ANGULAR, LINEAR), IN_REFERENCE_AXES[frame])]
+    return [
+        velocities[part]
+        for part in compress((ANGULAR, LINEAR), IN_REFERENCE_AXES[frame])
+    ]
 
 
-def moving_error(state: StateMap, q_star: Array, v_star: Array, q: Array, v: Array) -> Array:
+def moving_error(
+    state: StateMap, q_star: Array, v_star: Array, q: Array, v: Array
+) -> Array:
     """Return the error (nx,) of (q, v) from a moving reference (q_star, v_star), as in (5.1).
 
     Attitude and position errors are in the axes of the reference. The velocity error is v - v_star

@@ -59,10 +59,13 @@ class Impact(FrozenArrays):
     event: str
     # Robot, configuration and velocity just before the impact.
     _before: tuple[Robot, Array, Array] = field(kw_only=True)
-    _units: tuple[str, ...] = field(default=(), kw_only=True)  # units of the impulses of `jam`
+    # units of the impulses of `jam`
+    _units: tuple[str, ...] = field(default=(), kw_only=True)
 
     def __repr__(self) -> str:
-        return f"{type(self).__name__}('{self.robot.name}', {self.energy_lost:.4g} J lost)"
+        return (
+            f"{type(self).__name__}('{self.robot.name}', {self.energy_lost:.4g} J lost)"
+        )
 
     def __str__(self) -> str:
         return folded([f"{self.robot.name}, {self.robot.n} joints: {self.told}"])
@@ -130,7 +133,11 @@ def jam(
     """
     state = StateMap(robot)
     keys = [joints] if isinstance(joints, str) else joints
-    if not isinstance(keys, Sequence) or not keys or not all(isinstance(k, str) for k in keys):
+    if (
+        not isinstance(keys, Sequence)
+        or not keys
+        or not all(isinstance(k, str) for k in keys)
+    ):
         raise InputError(f"joints is {joints!r}, expected names of joints")
     modes = {joint.name for joint in robot.modes}
     stoppable = [name for name in robot.joint_names if name not in modes]
@@ -353,15 +360,22 @@ def capture(
         alone = body_alone(payload, prefix)
         other = replace(alone, gravity=robot.gravity, orbit=robot.orbit)
     else:
-        instance("payload", payload, Robot, "a pin.Inertia or a fflin.Robot").require_unchanged()
-        other = replace(payload)  # a copy, since the payload may be the same object as the robot
+        instance(
+            "payload", payload, Robot, "a pin.Inertia or a fflin.Robot"
+        ).require_unchanged()
+        # a copy, since the payload may be the same object as the robot
+        other = replace(payload)
         _require_same_environment(robot, other)
     if other.stored_momentum:
         raise InputError(
             "a wheel of the payload has a momentum but no inertia, so its momentum would be "
             "lost; give the wheel an inertia, and its speed in payload_v"
         )
-    at = pin.SE3.Identity() if placement is None else checked_placement("placement", placement)
+    at = (
+        pin.SE3.Identity()
+        if placement is None
+        else checked_placement("placement", placement)
+    )
     q = robot.neutral() if q is None else robot.checked_configuration(q)
     v = np.zeros(robot.nv) if v is None else robot.checked_velocity(v)
     whole = joined(robot, frame, other, at, prefix)
@@ -372,7 +386,9 @@ def capture(
     parts = [(robot, q, v), (other, other_q, other_v)]
     hit = struck(whole, parts, prefix, f"{prefix} of {other.mass:.6g} kg caught")
     of_impact = vars(hit) | {"impulse": hit.impulse[robot.nv : robot.nv + 6]}
-    return Capture(**of_impact, payload=other, payload_q=other_q, payload_v=other_v, prefix=prefix)
+    return Capture(
+        **of_impact, payload=other, payload_q=other_q, payload_v=other_v, prefix=prefix
+    )
 
 
 def _require_same_environment(robot: Robot, payload: Robot) -> None:
@@ -386,19 +402,25 @@ def _require_same_environment(robot: Robot, payload: Robot) -> None:
             )
 
 
-def _beside(other: Robot, at: pin.SE3, q: Array | None, v: Array | None) -> tuple[Array, Array]:
+def _beside(
+    other: Robot, at: pin.SE3, q: Array | None, v: Array | None
+) -> tuple[Array, Array]:
     """Return the checked configuration and velocity of a payload, with its base placed at `at`.
 
     `at` is a placement in the world. If q is None, the joints are at their neutral positions. If v
     is None, the payload is at rest. If v is a twist (6,), the joints are at rest.
     """
-    configuration = other.neutral() if q is None else other.checked_configuration(q).copy()
+    configuration = (
+        other.neutral() if q is None else other.checked_configuration(q).copy()
+    )
     root = other.model.jointPlacements[ROOT]
     configuration[:7] = pin.SE3ToXYZQUAT(root.actInv(at))
     if v is None:
         return configuration, np.zeros(other.nv)
     if other.n and dimension("payload_v", v) == 1 and len(v) == 6:
-        v = np.concatenate((vector("payload_v", v, 6, "a twist"), np.zeros(other.nv - 6)))
+        v = np.concatenate(
+            (vector("payload_v", v, 6, "a twist"), np.zeros(other.nv - 6))
+        )
     expected = "the twist (linear, angular) of the payload"
     if other.n:
         expected += ", and its joints"

@@ -70,7 +70,8 @@ class _Body(NamedTuple):
     """
 
     parent: int
-    place: pin.SE3  # of the frame relative to the parent's frame, at the joint position 0
+    # of the frame relative to the parent's frame, at the joint position 0
+    place: pin.SE3
     joint: pin.JointModel
     screw: Screw | None
     inertia: pin.Inertia
@@ -105,7 +106,11 @@ def screw_of(model: pin.Model, joint: pin.JointModel) -> Screw | None:
     # Pinocchio.
     if np.abs(linear - slide * axis).max() > 1e-12:
         return None
-    rotation = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), axis).normalized().matrix()
+    rotation = (
+        pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), axis)
+        .normalized()
+        .matrix()
+    )
     # For an axis along x, y or z, all entries are 0 or 1. Rounding errors in their place would move
     # a planar robot out of its plane.
     whole = rotation.round()
@@ -186,7 +191,9 @@ def _sums(robot: Robot, bodies: list[_Body], q: Array, v: Array) -> Integrals:
         velocity = _plus(motion.linear, _cross(motion.angular, lever))
         # Angular velocity and angular momentum in the axes of the body
         rates = tuple(_dot(axis, motion.angular) for axis in motion.axes)
-        turning = _turned(tuple(zip(*body.inertia.inertia.tolist(), strict=True)), rates)
+        turning = _turned(
+            tuple(zip(*body.inertia.inertia.tolist(), strict=True)), rates
+        )
         center, momentum = _plus(motion.origin, lever), _times(velocity, mass)
         centers.append(center)
         momenta.append(momentum)

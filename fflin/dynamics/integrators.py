@@ -79,7 +79,9 @@ class Integrator(ABC):
         is exp(Re z).
         """
 
-    def step(self, f: Acceleration, t: float, q: Array, v: Array) -> tuple[Array, Array]:
+    def step(
+        self, f: Acceleration, t: float, q: Array, v: Array
+    ) -> tuple[Array, Array]:
         """Return q and v one step later; `f(t, q, v)` returns the acceleration."""
         model = self.model
         stages = self._stages
@@ -91,7 +93,9 @@ class Integrator(ABC):
             done = stages[..., : k + 1, :]
             begins.append(q)
             q = integrate(
-                model, begins[self.origins[k - 1]], self._displacement[k - 1, : k + 1].dot(done)
+                model,
+                begins[self.origins[k - 1]],
+                self._displacement[k - 1, : k + 1].dot(done),
             )
             v = self._speed[k - 1, : k + 1].dot(done)
         return integrate(model, q, self._displacement[-1].dot(stages)), v
@@ -218,7 +222,9 @@ def held_derivatives(
     n = len(A)
     both = np.zeros((*dA.shape[:-2], 2 * n, 2 * n))
     both[..., :n, :n], both[..., :n, n:], both[..., n:, n:] = A, dA, A
-    forced = np.concatenate((d_driven, np.broadcast_to(driven, d_driven.shape)), axis=-2)
+    forced = np.concatenate(
+        (d_driven, np.broadcast_to(driven, d_driven.shape)), axis=-2
+    )
     exponential, held = held_exponential(both, forced, h)
     return exponential[..., :n, n:], held[..., :n, :]
 

@@ -127,7 +127,9 @@ class OrbitField:
         # [t]x of the torque t = 3 n^2 r x (I r).
         turn = self._inertia @ (back @ self.tide @ R)
         turn -= turn.swapaxes(1, 2)
-        torque = turn[:, (2, 0, 1), (1, 2, 0)] + (self._levers @ force[..., None])[..., 0]
+        torque = (
+            turn[:, (2, 0, 1), (1, 2, 0)] + (self._levers @ force[..., None])[..., 0]
+        )
         return [self._none, *map(pin.Force, force, torque)]
 
     def slopes(self, data: pin.Data) -> Array:
@@ -142,7 +144,9 @@ class OrbitField:
         model, (R, centers) = self.robot.model, self._bodies(data)
         joints = range(ROOT, model.njoints)
         local = pin.ReferenceFrame.LOCAL
-        J = np.array([pin.getJointJacobian(model, data, joint, local) for joint in joints])
+        J = np.array(
+            [pin.getJointJacobian(model, data, joint, local) for joint in joints]
+        )
         moved = J.copy()
         moved[:, :, PIN_LINEAR] = 0.0
         linear, turned = moved[:, PIN_LINEAR], moved[:, PIN_ANGULAR]
@@ -176,7 +180,9 @@ class OrbitField:
         v. They are changed in place to the derivatives of (14.2) at q and v.
         """
         R, position = self.base(q)
-        fall = R.T @ (self.pull @ position - self.tide @ self.base(np.r_[0.0, 0.0, 0.0, q[3:]])[1])
+        fall = R.T @ (
+            self.pull @ position - self.tide @ self.base(np.r_[0.0, 0.0, 0.0, q[3:]])[1]
+        )
         spin, W, V = (skew(x) for x in (R.T @ self.rate, v[PIN_ANGULAR], v[PIN_LINEAR]))
         # The next lines differentiate the relative accelerations (14.2), which are c_w + w x s and
         # c_v + fall - 2 s x v - w x v. Here s is `rate` in base axes, and (c_w, c_v) is the
@@ -201,7 +207,10 @@ class OrbitField:
         # and is named G in the next lines.
         R, center = self._bodies(data)
         G, inertia = self.pull, self._inertia
-        second = 0.5 * np.trace(inertia, axis1=1, axis2=2)[:, None, None] * np.eye(3) - inertia
+        second = (
+            0.5 * np.trace(inertia, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+            - inertia
+        )
         flying = (self._mass[..., None] * center.swapaxes(1, 2) @ G @ center).sum()
         energy = -0.5 * float(flying + (R.swapaxes(1, 2) @ G @ R * second).sum())
         for joint, momentum in self._stored:
@@ -232,7 +241,8 @@ class GravityGradient(NamedTuple):
     2 n^2 for the radial direction, -n^2 for the direction of flight and -n^2 for the orbit normal.
     """
 
-    turns: tuple[tuple[float, Array], ...]  # (weight, unit vector (3,)) of each rotation
+    # (weight, unit vector (3,)) of each rotation
+    turns: tuple[tuple[float, Array], ...]
     spin: Array  # angular velocity (3,) of the orbital frame [rad/s]
     # Acceleration (3,) [m/s^2], relative to the orbital frame, of a free mass that is at rest in
     # this frame at the base's origin.
@@ -244,10 +254,14 @@ class GravityGradient(NamedTuple):
         field.require_near(q)
         R, position = field.base(q)
         n = mean_motion(field.robot)
-        turns = zip((weight * n * n for weight in _WEIGHTS), (R.T @ field.axes).T, strict=True)
+        turns = zip(
+            (weight * n * n for weight in _WEIGHTS), (R.T @ field.axes).T, strict=True
+        )
         return cls(tuple(turns), R.T @ field.rate, R.T @ (field.pull @ position))
 
-    def force(self, model: pin.Model, data: pin.Data, q: Array) -> tuple[Array, Array, Array]:
+    def force(
+        self, model: pin.Model, data: pin.Data, q: Array
+    ) -> tuple[Array, Array, Array]:
         """Return the generalised force P (nv,) of the field at q, with its derivatives (14.4).
 
         P excludes the free fall of the base's origin, and does not depend on the base pose in q.

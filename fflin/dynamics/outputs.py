@@ -45,7 +45,8 @@ class Point(NamedTuple):
 
     model: pin.Model
     data: pin.Data
-    q: Array  # (nq,) with the base at the world's origin and aligned with the world's axes
+    # (nq,) with the base at the world's origin and aligned with the world's axes
+    q: Array
     v: Array  # (nv,) without the linear velocity of the base
     R: Array  # rotation (3, 3) of the base relative to the reference
     r_b: Array  # position (3,) of the base relative to the reference
@@ -54,7 +55,8 @@ class Point(NamedTuple):
     # (joint, momentum) for each wheel that is modelled without a joint of its own. The wheel is
     # mounted on this joint, and its angular momentum (3,) is in the axes of the joint.
     stored: tuple[tuple[int, Array], ...]
-    spin: Array  # angular velocity (3,) of the orbital frame in base axes; zero without an orbit
+    # angular velocity (3,) of the orbital frame in base axes; zero without an orbit
+    spin: Array
 
     def placement(self, frame: Carried) -> pin.SE3:
         """Return the placement of a frame of the moved robot in the world."""
@@ -62,7 +64,9 @@ class Point(NamedTuple):
 
     def jacobian(self, frame: Carried) -> Array:
         """Return the Jacobian (6, nv) of a frame of the robot, in the axes of this frame."""
-        of_frame = pin.getFrameVelocityDerivatives(self.model, self.data, *frame, _LOCAL)
+        of_frame = pin.getFrameVelocityDerivatives(
+            self.model, self.data, *frame, _LOCAL
+        )
         return np.asarray(of_frame[1])
 
 
@@ -90,7 +94,9 @@ def _center_of_mass(world: Measuring, _: object) -> Array:
 def _momentum_derivatives(at: Point, to: Sensed) -> None:
     # The last argument is an acceleration. It affects only the derivatives of dh/dt, which are not
     # used here, so v is given in its place.
-    by_q, _, _, by_v = pin.computeCentroidalDynamicsDerivatives(at.model, at.data, at.q, at.v, at.v)
+    by_q, _, _, by_v = pin.computeCentroidalDynamicsDerivatives(
+        at.model, at.data, at.q, at.v, at.v
+    )
     mass = pin.computeTotalMass(at.model)
     h = at.data.hg
     to.y[:3] = at.R.dot(h.angular)
@@ -134,13 +140,17 @@ def _pose_derivatives(at: Point, to: Sensed, frame: Carried, *other: Carried) ->
         to.by_q[:, :6] = 0.0  # a motion of the base moves both frames alike
 
 
-def _pose(world: Measuring, before: Sequence[Array], frame: Carried, *other: Carried) -> Array:
+def _pose(
+    world: Measuring, before: Sequence[Array], frame: Carried, *other: Carried
+) -> Array:
     origin, rotation = world.reference, world.reference.rotation
     if other:
         origin, rotation = world.placement(*other), before[1]
     relative = origin.actInv(world.placement(frame))
     attitude = rotation.T @ before[0]
-    return np.concatenate((relative.translation, pin.log3(attitude.T @ relative.rotation)))
+    return np.concatenate(
+        (relative.translation, pin.log3(attitude.T @ relative.rotation))
+    )
 
 
 def _frame_velocity_derivatives(at: Point, to: Sensed, frame: Carried) -> None:
@@ -152,7 +162,9 @@ def _frame_velocity_derivatives(at: Point, to: Sensed, frame: Carried) -> None:
     # frame, and v_b, which is in base axes. R and `at.R` rotate these two terms to reference axes.
     # The skew terms are the derivatives of these two rotations.
     to.y[3:] = R.dot(velocity.linear) + at.R.dot(at.v_b)
-    to.by_q[3:] = R.dot(by_q[PIN_LINEAR] - skew(velocity.linear).dot(jacobian[PIN_ANGULAR]))
+    to.by_q[3:] = R.dot(
+        by_q[PIN_LINEAR] - skew(velocity.linear).dot(jacobian[PIN_ANGULAR])
+    )
     to.by_q[3:, PIN_ANGULAR] -= at.R.dot(skew(at.v_b))
     to.by_v[3:] = R.dot(jacobian[PIN_LINEAR])
 
@@ -174,7 +186,8 @@ def _gyroscope_derivatives(at: Point, to: Sensed, frame: Carried) -> None:
     _angular_derivatives(at, to, frame)
     spin = at.placement(frame).rotation.T.dot(at.spin)
     to.y[:] += spin
-    to.by_q[:] += skew(spin).dot(to.by_v)  # `to.by_v` is the angular Jacobian of the frame
+    # `to.by_v` is the angular Jacobian of the frame
+    to.by_q[:] += skew(spin).dot(to.by_v)
 
 
 def _gyroscope(world: Measuring, _: object, frame: Carried) -> Array:
@@ -188,7 +201,9 @@ def _accelerometer_derivatives(at: Point, to: Sensed, frame: Carried) -> None:
     _, by_q, by_v, by_a = pin.getPointClassicAccelerationDerivatives(
         at.model, at.data, *frame, _LOCAL
     )
-    to.y[:] = pin.getFrameClassicalAcceleration(at.model, at.data, *frame, _LOCAL).linear
+    to.y[:] = pin.getFrameClassicalAcceleration(
+        at.model, at.data, *frame, _LOCAL
+    ).linear
     to.by_q[:], to.by_v[:], to.by_a[:] = by_q, by_v, by_a
     # The next terms are the derivatives of -g with respect to a rotation of the base, and of
     # omega_b x v_b with respect to omega_b. The vector g is constant in world axes. The derivative
@@ -251,17 +266,23 @@ class Sensing:
             if type(output) in KINDS:
                 frames = [find_frame(robot.model, name) for name in output.frames]
                 signals += output.signals
-                self._kinds.append((slice(at, len(signals)), KINDS[type(output)][0], frames))
+                self._kinds.append(
+                    (slice(at, len(signals)), KINDS[type(output)][0], frames)
+                )
             else:
                 indices = state_indices(state, output)
                 self.states += enumerate(indices, start=at)
-                signals += [(state.names[index], state.units[index]) for index in indices]
+                signals += [
+                    (state.names[index], state.units[index]) for index in indices
+                ]
         # Outputs of frames are evaluated first, because the other outputs overwrite the data that
         # the outputs of frames read.
         self._kinds.sort(key=lambda kind: not kind[2])
         self.names = tuple(name for name, _ in signals)
         self.units = tuple(unit for _, unit in signals)
-        twice = [name for index, name in enumerate(self.names) if name in self.names[:index]]
+        twice = [
+            name for index, name in enumerate(self.names) if name in self.names[:index]
+        ]
         if twice:
             raise InputError(f"output '{twice[0]}' is given twice; remove one")
         inertial = [x.WORD for x in outputs if x.WORD in ("accelerometer", "momentum")]
@@ -335,11 +356,20 @@ class Measuring:
         # Angular velocity (3,) of the orbital frame in its own axes; zero without an orbit.
         self.spin = np.zeros(3) if field is None else field.rate
         pin.forwardKinematics(self.model, self.data, q)
-        frames = [[find_frame(self.model, x) for x in output.frames] for output in robot.outputs]
-        attitudes = [[np.array(self.placement(f).rotation) for f in group] for group in frames]
+        frames = [
+            [find_frame(self.model, x) for x in output.frames]
+            for output in robot.outputs
+        ]
+        attitudes = [
+            [np.array(self.placement(f).rotation) for f in group] for group in frames
+        ]
         # Indices of the states that make up an output; empty for outputs in `KINDS`.
-        states = [[] if type(x) in KINDS else state_indices(state, x) for x in robot.outputs]
-        self._outputs = tuple(zip(robot.outputs, frames, attitudes, states, strict=True))
+        states = [
+            [] if type(x) in KINDS else state_indices(state, x) for x in robot.outputs
+        ]
+        self._outputs = tuple(
+            zip(robot.outputs, frames, attitudes, states, strict=True)
+        )
 
     def __call__(self, x: Array, q: Array, v: Array, a: Array) -> Array:
         """Return y (ny,) at a point, which is given as the state x and also as q and v.
@@ -373,7 +403,9 @@ def state_indices(state: StateMap, output: Output) -> list[int]:
     if isinstance(output, BasePose):
         return list(range(groups.q_b.start, groups.r_b.stop))
     if not isinstance(output, JointOutput):
-        raise InputError(f"{output!r} is not an output; expected one such as FramePose('tool')")
+        raise InputError(
+            f"{output!r} is not an output; expected one such as FramePose('tool')"
+        )
     group = groups.q_m if isinstance(output, JointPositions) else groups.qdot_m
     names = robot.joint_names
     asked = names if output.joints is None else output.joints

@@ -16,7 +16,8 @@ from fflin.robot.inputs import named_wheels
 from fflin.robot.joints import ROOT, Joint, by_joint
 from fflin.robot.robot import Robot
 
-LARGEST_SPEED = 1e50  # [rad/s|m/s], so that squared speeds and their sums do not overflow
+# [rad/s|m/s], so that squared speeds and their sums do not overflow
+LARGEST_SPEED = 1e50
 
 
 def configuration(
@@ -141,7 +142,9 @@ def point_of(
     robot = state.robot
     if x0 is not None:
         if q0 is not None or v0 is not None:
-            raise InputError("x0 is given together with q0 or v0; give either x0, or q0 and v0")
+            raise InputError(
+                "x0 is given together with q0 or v0; give either x0, or q0 and v0"
+            )
         return state.to_pinocchio(x0)
     if q0 is None and v0 is None:
         return default()
@@ -185,9 +188,12 @@ def velocity(robot: Robot, values: Mapping[str, float]) -> Array:
     state = StateMap(robot)
     for name, _ in named_wheels(robot.inputs):
         if name in checked and name not in robot.joint_names:
-            robot.joint(name)  # raises an error that explains why the wheel has no velocity
+            # raises an error that explains why the wheel has no velocity
+            robot.joint(name)
     rates = rates_by_name(robot.joint_names, checked)
-    return state.spread(np.array([rates.get(name, 0.0) for name in state.names[6 + robot.n :]]))
+    return state.spread(
+        np.array([rates.get(name, 0.0) for name in state.names[6 + robot.n :]])
+    )
 
 
 def effort(robot: Robot, values: Mapping[str, float]) -> Array:

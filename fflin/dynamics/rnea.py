@@ -31,7 +31,8 @@ WARNING_COUPLING, _LARGEST_COUPLING = 1e-9 / _EPS, 1e-2 / _EPS
 # couplings exceeds the following limit, M^-1 is computed by a Cholesky factor of M instead.
 _QUICK_COUPLING = 1e-11 / _EPS
 
-STROKE = 1.0  # [m] largest displacement of a prismatic joint for which `inertia_bounds` holds
+# [m] largest displacement of a prismatic joint for which `inertia_bounds` holds
+STROKE = 1.0
 
 # If M has more rows than this, LAPACK factorises it faster than Pinocchio's sparse method.
 _DENSE_SIZE = 64
@@ -58,7 +59,9 @@ class Inertia:
         self._constrained = state.S is not None
         simple = not (robot.followers or robot.modes)
         self._bounds = inertia_bounds(robot.model) if simple else None
-        self._slides = [*map(attrgetter("idx_q"), filter(attrgetter("prismatic"), robot.joints))]
+        self._slides = [
+            *map(attrgetter("idx_q"), filter(attrgetter("prismatic"), robot.joints))
+        ]
         # M does not depend on the base's pose. Pinocchio works in world axes, and would lose digits
         # if the base were far away. So the base is placed at the origin.
         self._still: Array = pin.neutral(robot.model)
@@ -91,7 +94,11 @@ class Inertia:
             _compute_inverse(self._model, self._data, still)
             self._state.project(self._inverse, out)
             # If a pivot is zero, the couplings are NaN, and this comparison is false.
-            if self.least_coupling < bounds.dot(self._inverse_diagonal) < _QUICK_COUPLING:
+            if (
+                self.least_coupling
+                < bounds.dot(self._inverse_diagonal)
+                < _QUICK_COUPLING
+            ):
                 return
         upper = _crba(self._model, self._data, still)
         if self._constrained or len(upper) > _DENSE_SIZE:
@@ -115,10 +122,13 @@ class Inertia:
         name = self._state.robot.name
         scale = np.sqrt(np.maximum(M.diagonal(), 0.0))
         scale[scale == 0.0] = 1.0
-        lost = not self.least_coupling < coupling < _LARGEST_COUPLING  # true for NaN as well
+        # true for NaN as well
+        lost = not self.least_coupling < coupling < _LARGEST_COUPLING
         mode = np.linalg.eigh(M / scale / scale[:, None])[1][:, 0]
         names = coordinate_names(self._state.robot)
-        involved = listed([names[i] for i in np.argsort(-np.abs(mode)) if abs(mode[i]) > 0.1])
+        involved = listed(
+            [names[i] for i in np.argsort(-np.abs(mode)) if abs(mode[i]) > 0.1]
+        )
         if lost:
             raise SingularInertiaError(
                 f"the mass matrix of '{name}' is singular at this configuration, because a "
@@ -233,13 +243,19 @@ class Accelerations:
         # are for the position of the base, and are always zero.
         rows = np.zeros((2 * self._nv, self._nv))
         self._force_slopes = rows.T
-        self._by_turn, self._by_q_m, self._by_nu = rows[:3], rows[6 : self._nv], rows[self._nv :]
+        self._by_turn, self._by_q_m, self._by_nu = (
+            rows[:3],
+            rows[6 : self._nv],
+            rows[self._nv :],
+        )
         self._by_linear = self._by_nu[LINEAR]
         # These are views of the diagonals to which stiffness and damping are added.
         self._of_stiffness = np.einsum("ii->i", self._by_q_m[:, 6:])
         self._of_damping = np.einsum("ii->i", self._by_nu[6:, 6:])
         self._minus_inverse = np.empty((self._nv, self._nv))
-        self._stored = [(mounted, skew(momentum)) for mounted, momentum in robot.stored_momentum]
+        self._stored = [
+            (mounted, skew(momentum)) for mounted, momentum in robot.stored_momentum
+        ]
         self._field = state.field
         self._still = np.zeros(robot.nv)
 
@@ -251,7 +267,12 @@ class Accelerations:
         u is in base axes too, and `nu` is v in state order. The derivatives are written to the
         C-contiguous arrays `slopes` and `by_u`, and the result refers to these arrays.
         """
-        model, data, state, actuation = self._model, self._data, self._state, self._actuation
+        model, data, state, actuation = (
+            self._model,
+            self._data,
+            self._state,
+            self._actuation,
+        )
         tide = self._field and GravityGradient.at(self._field, q)
         # Here, the base is in its neutral pose and has no linear velocity, because large values
         # would make Pinocchio's derivatives less accurate. Without an orbit, c does not depend on
@@ -335,7 +356,9 @@ class Accelerations:
         force, by_q, by_v = np.zeros(nv), np.zeros((nv, nv)), np.zeros((nv, nv))
         pin.computeForwardKinematicsDerivatives(model, data, q, v, np.zeros(nv))
         for joint, momentum in self._stored:
-            slopes = pin.getJointVelocityDerivatives(model, data, joint, pin.ReferenceFrame.LOCAL)
+            slopes = pin.getJointVelocityDerivatives(
+                model, data, joint, pin.ReferenceFrame.LOCAL
+            )
             turned, jacobian = (part[PIN_ANGULAR] for part in slopes)
             torque = momentum @ data.v[joint].angular
             wrenches[joint] += pin.Force(np.zeros(3), torque)

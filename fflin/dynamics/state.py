@@ -15,7 +15,14 @@ from fflin.base import rotation as turning
 from fflin.base.errors import ChartError, InputError
 from fflin.base.validation import Array, ArrayLike, Indices, instance, placement, vector
 from fflin.dynamics import coordinates as names
-from fflin.dynamics.coordinates import ANGULAR, IN_REFERENCE_AXES, LINEAR, SMALLEST_Q0, Chart, Frame
+from fflin.dynamics.coordinates import (
+    ANGULAR,
+    IN_REFERENCE_AXES,
+    LINEAR,
+    SMALLEST_Q0,
+    Chart,
+    Frame,
+)
 from fflin.dynamics.orbital import OrbitField
 from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.robot import Robot
@@ -90,7 +97,11 @@ class StateMap:
         return f"StateMap('{self.robot.name}', nx={self.nx}, frame='{self.frame}')"
 
     def __init__(
-        self, robot: Robot, *, reference: pin.SE3 | None = None, frame: Frame | None = None
+        self,
+        robot: Robot,
+        *,
+        reference: pin.SE3 | None = None,
+        frame: Frame | None = None,
     ) -> None:
         instance("robot", robot, Robot, "a fflin.Robot; fflin.load makes one")
         robot.require_unchanged()
@@ -107,7 +118,9 @@ class StateMap:
         self.names, self.units = zip(*names.state_units(robot).items(), strict=True)
         joints = robot.joints
         # For each velocity of the state, its index in Pinocchio's v.
-        self._order = np.array([3, 4, 5, 0, 1, 2, *map(attrgetter("idx_v"), joints)], dtype=np.intp)
+        self._order = np.array(
+            [3, 4, 5, 0, 1, 2, *map(attrgetter("idx_v"), joints)], dtype=np.intp
+        )
         # For each entry of Pinocchio's v, the index of this velocity in nu. Mimic joints have no
         # velocity in nu, and `spread` writes their entries of v afterwards.
         self._place = np.zeros(robot.nv, dtype=np.intp)
@@ -133,7 +146,11 @@ class StateMap:
         # Whether gravity or the motion in orbit accelerates the base's origin relative to the
         # reference.
         self.falls = self._pulled or robot.orbit is not None
-        oMref = pin.SE3.Identity() if reference is None else placement("reference", reference)
+        oMref = (
+            pin.SE3.Identity()
+            if reference is None
+            else placement("reference", reference)
+        )
         self._refer(oMref)
 
     def about(self, reference: pin.SE3) -> StateMap:
@@ -163,7 +180,9 @@ class StateMap:
     @property
     def origin(self) -> pin.SE3:
         """Base placement relative to the reference if q[:7] is 0, 0, 0, 0, 0, 0, 1."""
-        return pin.XYZQUATToSE3(np.concatenate((self._position, self.origin_quaternion)))
+        return pin.XYZQUATToSE3(
+            np.concatenate((self._position, self.origin_quaternion))
+        )
 
     def chart(self, q: Array) -> Chart:
         """Return the attitude chart at a valid configuration q (nq,).
@@ -306,10 +325,14 @@ class StateMap:
                 "is rotated by 180 deg from the reference, where the attitude chart is singular"
             )
         relative = np.concatenate((x[:, g.q_b], np.sqrt(square)), axis=1)
-        chart = Chart(relative[:, :3], relative[:, 3:], turning.rotation_matrices(relative))
+        chart = Chart(
+            relative[:, :3], relative[:, 3:], turning.rotation_matrices(relative)
+        )
         q = np.empty((len(x), self.robot.nq))
         q[:, :3] = turning.row_products(x[:, g.r_b] - self._position, self._rotation)
-        turned = turning.row_products(relative, turning.product_matrix(self.origin_quaternion))
+        turned = turning.row_products(
+            relative, turning.product_matrix(self.origin_quaternion)
+        )
         q[:, 3:7] = turned / np.linalg.norm(turned, axis=1, keepdims=True)
         angles = x[:, g.q_m]
         q[:, self._idx_q] = angles * self._scale[6:]
@@ -369,7 +392,9 @@ class StateMap:
     def project_transposed(self, matrix: Array, out: Array) -> None:
         """Write the last k rows of ``(S.T @ matrix @ S).T`` to a C-contiguous array (k, 6 + n)."""
         if self.S is None:
-            matrix.take(self._flat_transposed[out.shape[1] - len(out) :], out=out, mode="clip")
+            matrix.take(
+                self._flat_transposed[out.shape[1] - len(out) :], out=out, mode="clip"
+            )
         else:
             out[:] = (self.S.T @ matrix @ self.S).T[out.shape[1] - len(out) :]
 
@@ -399,9 +424,13 @@ class StateMap:
 
     def joints_apart(self, before: Array, q: Array) -> Array:
         """Return the change of q_m (n,) between the valid configurations `before` and `q` (nq,)."""
-        apart: Array = (q.take(self._idx_q) - before.take(self._idx_q)) / self._scale[6:]
+        apart: Array = (q.take(self._idx_q) - before.take(self._idx_q)) / self._scale[
+            6:
+        ]
         if self._cos.size:
-            s, c, s_0, c_0 = (x.take(at) for x in (q, before) for at in (self._sin, self._cos))
+            s, c, s_0, c_0 = (
+                x.take(at) for x in (q, before) for at in (self._sin, self._cos)
+            )
             apart[self.unbounded] = np.arctan2(s * c_0 - c * s_0, c * c_0 + s * s_0)
         return apart
 
@@ -456,7 +485,9 @@ class Actuation:
             self.groups.setdefault(item.GROUP, []).extend(range(at, len(columns)))
         if len({*names}) < len(names):
             twice = next(name for name in names if names.count(name) > 1)
-            raise InputError(f"two inputs are named '{twice}'; give one of them another name")
+            raise InputError(
+                f"two inputs are named '{twice}'; give one of them another name"
+            )
         # Linear models have the attributes `input_names` and `input_units`. They are defined here
         # too, so that some functions accept either object.
         self.names = self.input_names = tuple(names)
@@ -468,7 +499,9 @@ class Actuation:
         self.fixed: Array = np.column_stack(columns) if columns else np.zeros((nv, 0))
         # Whether the inputs are tau_b, F_b and all joint torques in state order, so that B_u is the
         # identity.
-        self.default = self.fixed.shape == (nv, nv) and bool((self.fixed == identity).all())
+        self.default = self.fixed.shape == (nv, nv) and bool(
+            (self.fixed == identity).all()
+        )
         # (joint, indices, wrenches) for each joint in `carried`. The indices (k,) are the positions
         # in u of the k inputs that are mounted on the joint. The wrenches (6, k) of unit inputs are
         # in the frame of the joint.
@@ -476,7 +509,9 @@ class Actuation:
         self._of_carried: list[int] = []
         for joint, items in carried.items():
             places, wrenches = zip(*items, strict=True)
-            self.wrench_columns.append((joint, np.array(places), np.column_stack(wrenches)))
+            self.wrench_columns.append(
+                (joint, np.array(places), np.column_stack(wrenches))
+            )
             self._of_carried += places
         self.carried = bool(carried)  # whether columns depend on the configuration
 
@@ -487,7 +522,9 @@ class Actuation:
         columns = self.fixed.copy()
         pin.computeJointJacobians(self._model, data, q)
         forces = [
-            pin.getJointJacobian(self._model, data, joint, pin.ReferenceFrame.LOCAL).T.dot(wrenches)
+            pin.getJointJacobian(
+                self._model, data, joint, pin.ReferenceFrame.LOCAL
+            ).T.dot(wrenches)
             for joint, _, wrenches in self.wrench_columns
         ]
         columns[:, self._of_carried] = self.state.forces(np.concatenate(forces, axis=1))

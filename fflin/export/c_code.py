@@ -122,10 +122,18 @@ def write_c(
         raise InputError(f"real is {real!r}, expected 'double' or 'float'")
     target = as_path(folder)
     title, texts = _texts(law_of(law, robot, limits), name, real)
-    contents = {target / f"{name}{ending}": text.encode() for ending, text in texts.items()}
+    contents = {
+        target / f"{name}{ending}": text.encode() for ending, text in texts.items()
+    }
     with failing(target, "written"):
-        old = next((x for x in contents if target.exists() and x in {*target.iterdir()}), None)
-        new = [directory for directory in (target, *target.parents) if not directory.exists()]
+        old = next(
+            (x for x in contents if target.exists() and x in {*target.iterdir()}), None
+        )
+        new = [
+            directory
+            for directory in (target, *target.parents)
+            if not directory.exists()
+        ]
     written_title = None
     with suppress(FileError, TypeError):
         written_title = _description(target / f"{name}.json")["title"]
@@ -148,7 +156,9 @@ def write_c(
 
 def digest_of(about: dict[str, object], header: bytes, source: bytes) -> str:
     """Return the SHA-256 of a law's description, header and source, to detect any change."""
-    return content_digest({"about": json.dumps(about).encode(), "header": header, "source": source})
+    return content_digest(
+        {"about": json.dumps(about).encode(), "header": header, "source": source}
+    )
 
 
 def _description(path: Path) -> dict[str, Any]:
@@ -223,27 +233,35 @@ class CLaw(Policy):
         with failing(as_path(folder), "read"):
             source = as_path(folder).resolve()
             pairs = sorted(x.stem for x in source.iterdir() if x.suffix == ".json")
-            names = [x for x in pairs if name in (None, x) and (source / f"{x}.c").is_file()]
+            names = [
+                x for x in pairs if name in (None, x) and (source / f"{x}.c").is_file()
+            ]
         self._made = partial(CLaw, source, name=name, compiler=compiler)
         if not names:
             wanted = f"C code named '{name}'" if name else "C code"
             raise FileError(f"{source}: contains no {wanted} that fflin.write_c wrote")
         if len(names) > 1:
-            raise FileError(f"{source}: contains the laws {listed(names)}; choose one with name=")
+            raise FileError(
+                f"{source}: contains the laws {listed(names)}; choose one with name="
+            )
         [self.name] = names
         self._about = _description(source / f"{self.name}.json")
         self.dt: float = self._about["dt"]
         self.frame: Frame = self._about["frame"]
         self.initial_inputs: Array = frozen(np.array(self._about["u0"], dtype=float))
         placement = self._about["reference"]
-        self.origin = None if placement is None else pin.XYZQUATToSE3(np.array(placement))
+        self.origin = (
+            None if placement is None else pin.XYZQUATToSE3(np.array(placement))
+        )
         if self._about["kind"] == "output" and placement is None:
             raise InputError(
                 "the C code was written from a Compensator, which does not contain the model and "
                 "its outputs; write the C code from an OutputFeedback"
             )
         self._real = np.float64 if self._about["real"] == "double" else np.float32
-        self._step = getattr(_compiled(source / f"{self.name}.c", compiler), f"{self.name}_step")
+        self._step = getattr(
+            _compiled(source / f"{self.name}.c", compiler), f"{self.name}_step"
+        )
 
     @property
     def sample_time(self) -> float:
@@ -260,11 +278,14 @@ class CLaw(Policy):
         return self.initial_inputs
 
     def __reduce__(self) -> tuple[Callable[[], CLaw], tuple[()]]:
-        return self._made, ()  # compile again, because a loaded library cannot be copied
+        # compile again, because a loaded library cannot be copied
+        return self._made, ()
 
     def __repr__(self) -> str:
         about = self._about
-        return f"CLaw('{self.name}', {about['kind']}, {about['real']}, dt={self.dt:g} s)"
+        return (
+            f"CLaw('{self.name}', {about['kind']}, {about['real']}, dt={self.dt:g} s)"
+        )
 
     def bind(self, robot: Robot) -> Command:
         """Return the function policy(t, q, v) -> u for a robot.
@@ -277,7 +298,9 @@ class CLaw(Policy):
             If the robot and the C code have different states, inputs or outputs.
         """
         made = f"the C code '{self.name}' was made from the {self._about['title']}"
-        state = StateMap(robot, reference=self.origin, frame=frame_of(robot, self.frame))
+        state = StateMap(
+            robot, reference=self.origin, frame=frame_of(robot, self.frame)
+        )
         for kind, (names, units) in self._about["signals"].items():
             require_same(made, state, kind, tuple(names), tuple(units))
         require_turns(made, self._about["nq"], robot)
@@ -287,13 +310,19 @@ class CLaw(Policy):
             x = state.read(q, v)
             sizes = (self._about["memory"], 0)
             return Loop(
-                state, self.dt, sizes, lambda t: (partial(self._output_step, t), measuring, x)
+                state,
+                self.dt,
+                sizes,
+                lambda t: (partial(self._output_step, t), measuring, x),
             )
         world = StateMap(robot, frame=state.frame)
         n = robot.n
         # C has no empty arrays. So the C arrays for the joints have one entry if there is no joint.
         room = max(n, 1)
-        given, u = (np.zeros(size, self._real) for size in (13 + 2 * room, len(self._about["u0"])))
+        given, u = (
+            np.zeros(size, self._real)
+            for size in (13 + 2 * room, len(self._about["u0"]))
+        )
         at = [*range(7 + n), *range(7 + room, 13 + n + room)]
         samples = self._about["kind"] == "samples"
 
@@ -314,7 +343,10 @@ class CLaw(Policy):
         """
         u = np.array(self._about["u0"])
         for _ in range(2):
-            memory, out = np.append(z, 0.0).astype(self._real), np.zeros(len(u), self._real)
+            memory, out = (
+                np.append(z, 0.0).astype(self._real),
+                np.zeros(len(u), self._real),
+            )
             y = measure(u).astype(self._real)
             self._call(t, memory.ctypes, y.ctypes, out.ctypes)
             u = out.astype(float)
@@ -332,7 +364,9 @@ class CLaw(Policy):
 def _compiled(source: Path, compiler: str) -> ctypes.CDLL:
     """Compile a C source file to a shared library, and return the loaded library."""
     if not isinstance(compiler, str) or "\0" in compiler:
-        raise InputError(f"compiler is {compiler!r}, expected the name of a C compiler, such as cc")
+        raise InputError(
+            f"compiler is {compiler!r}, expected the name of a C compiler, such as cc"
+        )
     program = shutil.which(compiler)
     if program is None:
         raise MissingPackageError(
@@ -345,11 +379,15 @@ def _compiled(source: Path, compiler: str) -> ctypes.CDLL:
             command = [program, *flags, "-o", str(library), str(source), "-lm"]
             done = subprocess.run(command, capture_output=True, text=True, check=False)
             if done.returncode:
-                line = next((x for x in done.stderr.splitlines() if "error" in x), done.stderr)
+                line = next(
+                    (x for x in done.stderr.splitlines() if "error" in x), done.stderr
+                )
                 raise InputError(f"{source}: cannot be compiled: {line}")
             return ctypes.CDLL(str(library))
     except OSError as error:
-        raise InputError(f"'{compiler}' made no library from {source}: {error}") from None
+        raise InputError(
+            f"'{compiler}' made no library from {source}: {error}"
+        ) from None
 
 
 def _texts(law: Law, name: str, real: str) -> tuple[str, dict[str, str]]:
@@ -377,18 +415,27 @@ def _texts(law: Law, name: str, real: str) -> tuple[str, dict[str, str]]:
         numbers = map(array, (case.given, out, error * case.scale))
         status = int((out != case.out).any())
         vectors.append(f"{{{case.sample}UL, {', '.join(numbers)}, {status}}}")
-    outs = [*map(_plain, names), *(f"next z[{k}]" for k in range(len(out) - len(names)))]
+    outs = [
+        *map(_plain, names),
+        *(f"next z[{k}]" for k in range(len(out) - len(names))),
+    ]
     of_type = _DOUBLE if real == "double" else _FLOAT
     signal = "x" if state else "y"
     words: dict[str, object] = {
         **of_type,
         **{key: array(table) for key, table in tables.items()},
         **{"name": name, "NAME": name.upper(), "real": real, "count": CASES},
-        **{"law": law.title, "frame": frame or "not known", "robot": _plain(robot.name)},
+        **{
+            "law": law.title,
+            "frame": frame or "not known",
+            "robot": _plain(robot.name),
+        },
         "sha256": robot.urdf_sha256 or "not known",
         "world": ", the orbital frame" if robot.orbit else "",
         **{"fflin_version": __version__, "pinocchio_version": pin.__version__},
-        "sample_time": f"{law.dt!r} s" if law.dt else "none, the law is continuous in time",
+        "sample_time": f"{law.dt!r} s"
+        if law.dt
+        else "none, the law is continuous in time",
         "error": f"{error:.2g}",
         "tolerances": _listed("u", names, sizes),
         **{"inputs": len(names), "input_list": _listed("u", names, units), "row": "0"},
@@ -399,7 +446,9 @@ def _texts(law: Law, name: str, real: str) -> tuple[str, dict[str, str]]:
     }
     if state:
         words |= _state_words(law, state)
-        words["interpolation"] = _filled("interpolation.c", words) if "axis_size" in tables else ""
+        words["interpolation"] = (
+            _filled("interpolation.c", words) if "axis_size" in tables else ""
+        )
     else:
         nz = len(tables["A"])
         words |= {"states": nz, "states_max": max(nz, 1), "outputs": len(tables["y0"])}
@@ -448,7 +497,9 @@ def _state_words(law: Law, state: StateMap) -> dict[str, object]:
         }
     if points is not None:
         axes, room = points.shape
-        joints = ", ".join(_plain(state.robot.joint_names[i]) for i in law.tables["axis_joint"])
+        joints = ", ".join(
+            _plain(state.robot.joint_names[i]) for i in law.tables["axis_joint"]
+        )
         words |= {
             **{"axis_count": axes, "axis_room": room, "corners": 2**axes},
             "feedback": "feed_back_between(measured, x, u);",

@@ -63,7 +63,8 @@ class Law:
     lin: LinearModel | None
     # Tables of the C code, by name. Every law has the tables u0, low, high and continuous.
     tables: dict[str, Array]
-    operations: float  # bound on the number of rounded operations between an argument and a result
+    # bound on the number of rounded operations between an argument and a result
+    operations: float
     cases: list[Case]
 
 
@@ -72,7 +73,10 @@ def measured(world: StateMap, q: Array, v: Array) -> Array:
 
     `world` is a state map of the robot whose reference is the world. q and v are not checked.
     """
-    attitude, nu = quaternion_product(world.origin_quaternion, q[3:7]), world.velocities(v)
+    attitude, nu = (
+        quaternion_product(world.origin_quaternion, q[3:7]),
+        world.velocities(v),
+    )
     pose = attitude, world.positions(q), world.joint_positions(q)
     return np.concatenate((*pose, nu[:3], world.rotation(q) @ nu[3:6], nu[6:]))
 
@@ -101,7 +105,9 @@ def law_of(given: object, robot: object, limits: object) -> Law:
     if robot is None:
         raise _robot_error(given, "is not known")
     if robot.urdf_sha256 != getattr(lin or given, "urdf_sha256", robot.urdf_sha256):
-        raise _robot_error(given, f"has another URDF or other masses than '{robot.name}'")
+        raise _robot_error(
+            given, f"has another URDF or other masses than '{robot.name}'"
+        )
     law = _law_of(given, robot)
     high = np.full(len(law.inputs[0]), np.inf)
     low = -high
@@ -141,7 +147,9 @@ def _law_of(given: Design, robot: Robot) -> Law:
         policy = TrajectoryFeedback(policy.trajectory(robot), policy)
     if isinstance(policy, Gain):
         made = f"the gain was designed for '{policy.robot}'"
-        model = policy._lin or model_of(policy, robot, made, pin.XYZQUATToSE3(policy.placement))
+        model = policy._lin or model_of(
+            policy, robot, made, pin.XYZQUATToSE3(policy.placement)
+        )
         policy = StateFeedback(model, policy.K)
     form = policy.form(robot)
     if isinstance(form, StateForm) and policy.model:
@@ -149,7 +157,9 @@ def _law_of(given: Design, robot: Robot) -> Law:
         return _state_law(title, policy, dt, form, robot)
     if isinstance(form, PathForm):
         state = form.policy.state_map(robot)
-        return _law_of_states(title, policy, state, _samples(form.policy, state), {}, robot)
+        return _law_of_states(
+            title, policy, state, _samples(form.policy, state), {}, robot
+        )
     lin = policy.model
     if isinstance(form, OutputForm) and not form.samples and lin:
         return _output_law(
@@ -164,7 +174,9 @@ def _law_of(given: Design, robot: Robot) -> Law:
     raise _not_written(given)
 
 
-def _state_law(title: str, policy: Policy, dt: float, form: StateForm, robot: Robot) -> Law:
+def _state_law(
+    title: str, policy: Policy, dt: float, form: StateForm, robot: Robot
+) -> Law:
     """Convert a state feedback about the point of a model."""
     lin = policy.model
     assert lin is not None
@@ -176,7 +188,9 @@ def _state_law(title: str, policy: Policy, dt: float, form: StateForm, robot: Ro
         "u0": lin.u0[None],
         "K": form.gains,
     }
-    return _law_of_states(title, policy, state, tables, form.grid, robot, dt=dt, lin=lin)
+    return _law_of_states(
+        title, policy, state, tables, form.grid, robot, dt=dt, lin=lin
+    )
 
 
 def _law_of_states(
@@ -194,7 +208,9 @@ def _law_of_states(
     dt = policy.sample_time if dt is None else dt
     cases = list(_state_cases(state, bound(policy, robot), dt, tables, axes))
     tables["in_reference_axes"] = np.array(state.axes)
-    tables["continuous"] = np.array([joint.unbounded for joint in robot.joints], dtype=bool)
+    tables["continuous"] = np.array(
+        [joint.unbounded for joint in robot.joints], dtype=bool
+    )
     if axes:
         tables["axis_joint"] = np.array([*map(robot.joint_names.index, axes)])
         tables["axis_size"] = sizes = np.array([*map(len, axes.values())])
@@ -245,17 +261,22 @@ def _state_cases(
         if axes and index % 4 == 0:  # joints at and beyond the ends of the grid
             for name, values in axes.items():
                 at = 6 + state.robot.joint_names.index(name)
-                x[at] = random.choice([values[0], values[-1], values[0] - 0.1, values[-1] + 0.1])
+                x[at] = random.choice(
+                    [values[0], values[-1], values[0] - 0.1, values[-1] + 0.1]
+                )
         q, v = state.to_pinocchio(x)
         turn: Array = random.normal(size=4)
         if index % 7 == 0:  # attitude close to half a turn from the reference
             turn[3] = (1e-3, -1e-3, 0.1, -0.1)[index % 4]
-        if index == 0 and (about[3:6] == 0.0).all() and not axes:  # attitude: exactly half a turn
+        # attitude: exactly half a turn
+        if index == 0 and (about[3:6] == 0.0).all() and not axes:
             turn = np.array((1.0, 0.0, 0.0, 0.0))
         turn = quaternion_product(about[3:], turn / norm(turn))
         q[3:7] = quaternion_product(conjugate(world.origin_quaternion), turn)
         origin = world.origin
-        q[:3] = origin.rotation.T @ (about[:3] + random.normal(size=3) - origin.translation)
+        q[:3] = origin.rotation.T @ (
+            about[:3] + random.normal(size=3) - origin.translation
+        )
         given = measured(world, q, v)
         given[7 : 7 + n] += 2.0 * np.pi * turns
         u = np.asarray(policy(row * dt, q, v))
@@ -283,11 +304,14 @@ def _samples(policy: TrajectoryFeedback, state: StateMap) -> dict[str, Array]:
     times = times[: np.searchsorted(times, policy.over, side="right") + 1]
     q, v, u0 = map(np.array, zip(*map(policy.commanded, times), strict=True))
     attitudes = [
-        quaternion_product(state.origin_quaternion, quaternion) for quaternion in q[:, 3:7]
+        quaternion_product(state.origin_quaternion, quaternion)
+        for quaternion in q[:, 3:7]
     ]
     return {
         "reference": np.hstack((state.positions(q), attitudes)),
-        "x0": np.hstack((np.zeros((len(q), 6)), state.joint_positions(q), state.velocities(v))),
+        "x0": np.hstack(
+            (np.zeros((len(q), 6)), state.joint_positions(q), state.velocities(v))
+        ),
         "u0": u0,
         "K": np.array([*map(policy.gain, times)]),
     }
@@ -302,8 +326,14 @@ def _compensator_law(given: Compensator, robot: Robot) -> Law:
     return _output_law(
         type(given).__name__,
         Sample(given.A, given.B, given.C, none, given.u0, given.y0),
-        inputs=(given.output_names, tuple(known.get(x, "unknown") for x in given.output_names)),
-        signals=(given.input_names, tuple(known.get(x, "unknown") for x in given.input_names)),
+        inputs=(
+            given.output_names,
+            tuple(known.get(x, "unknown") for x in given.output_names),
+        ),
+        signals=(
+            given.input_names,
+            tuple(known.get(x, "unknown") for x in given.input_names),
+        ),
         dt=given.dt,
         robot=robot,
         lin=None,
@@ -365,4 +395,6 @@ def _output_cases(sample: Sample, turning: Indices) -> Iterator[Case]:
         of_y = np.abs(y) + np.abs(sample.y0) + np.abs(turns)
         scale = np.abs(sample.u0) + np.abs(sample.C) @ of_z + np.abs(sample.D) @ of_y
         after = np.abs(sample.A) @ of_z + np.abs(sample.B) @ of_y
-        yield Case(0, np.append(z, y + turns), np.append(u, next_z), np.append(scale, after))
+        yield Case(
+            0, np.append(z, y + turns), np.append(u, next_z), np.append(scale, after)
+        )

@@ -30,7 +30,9 @@ _LOW, _HIGH, _FREE, _TRIED = 0, 1, 2, 4
 
 
 class LeastSquares(
-    namedtuple("LeastSquares", "least most columns A Q R b y wanted x s low high state order")
+    namedtuple(
+        "LeastSquares", "least most columns A Q R b y wanted x s low high state order"
+    )
 ):
     """Problem: find bounded inputs x (k,) whose force is as near as possible to a given force.
 
@@ -66,7 +68,9 @@ class Allocation(namedtuple("Allocation", "asking giving point work problem")):
 
 LEAST_SQUARES = Struct(LeastSquares, columns=LANED, state=INDICES, order=INDICES)
 _ROBOTS = {"asking": MECHANICS, "giving": MECHANICS}
-ALLOCATION = Struct(Allocation, **_ROBOTS, point=POINT, work=LANED, problem=LEAST_SQUARES)
+ALLOCATION = Struct(
+    Allocation, **_ROBOTS, point=POINT, work=LANED, problem=LEAST_SQUARES
+)
 
 
 def _row_product(a: Array, first: int, b: Array, second: int, count: int) -> float:
@@ -82,13 +86,17 @@ def row_product(a: Array, first: int, b: Array, second: int, count: int) -> floa
     return a[first : first + count].dot(b[second : second + count])
 
 
-def _add_row(a: Array, first: int, share: float, b: Array, second: int, count: int) -> None:
+def _add_row(
+    a: Array, first: int, share: float, b: Array, second: int, count: int
+) -> None:
     for index in range(count):
         a[first + index] += share * b[second + index]
 
 
 @vec.compiled_as(_add_row)
-def add_row(a: Array, first: int, factor: float, b: Array, second: int, count: int) -> None:
+def add_row(
+    a: Array, first: int, factor: float, b: Array, second: int, count: int
+) -> None:
     """Add `factor` times b[second : second + count] to a[first : first + count], in place."""
     a[first : first + count] += factor * b[second : second + count]
 
@@ -104,7 +112,9 @@ def row_products(a: Array, size: int, b: Array, out: Array) -> None:
     np.dot(a.reshape(len(out), size), b[:size], out)
 
 
-def _remove_components(Q: Array, size: int, count: int, x: Array, out: Array, first: int) -> None:
+def _remove_components(
+    Q: Array, size: int, count: int, x: Array, out: Array, first: int
+) -> None:
     # This is the modified Gram-Schmidt method. The least squares solution is as accurate as with
     # Householder's method, because `_fit` treats the right-hand side as the last column of the
     # matrix.
@@ -115,7 +125,9 @@ def _remove_components(Q: Array, size: int, count: int, x: Array, out: Array, fi
 
 
 @vec.compiled_as(_remove_components)
-def remove_components(Q: Array, size: int, count: int, x: Array, out: Array, first: int) -> None:
+def remove_components(
+    Q: Array, size: int, count: int, x: Array, out: Array, first: int
+) -> None:
     """Make x (size,) orthogonal to the first `count` rows of Q.
 
     These rows must be orthonormal. The components of x along them are written to `out`, from the
@@ -217,7 +229,13 @@ def _write_force(work, robot, point, columns, at):
 @called
 def solve(problem, size, lane):
     """Write the solution x for one lane to `problem.x`; x is NaN if the given force is NaN."""
-    x, A, low, high, wanted = problem.x, problem.A, problem.low, problem.high, problem.wanted
+    x, A, low, high, wanted = (
+        problem.x,
+        problem.A,
+        problem.low,
+        problem.high,
+        problem.wanted,
+    )
     least = problem.least
     most = problem.most
     count = len(problem.least)

@@ -51,8 +51,14 @@ def spatial_inertia_times(work, at, motion):
     m, h = load(work, at), vec.get3(work, at + 1)
     (xx, xy, xz), (yy, yz, zz) = vec.get6(work, at + 4)
     w, v = motion
-    turning = vec.dot((xx, xy, xz), w), vec.dot((xy, yy, yz), w), vec.dot((xz, yz, zz), w)
-    return vec.plus(turning, vec.cross(h, v)), vec.plus(vec.times(v, m), vec.cross(w, h))
+    turning = (
+        vec.dot((xx, xy, xz), w),
+        vec.dot((xy, yy, yz), w),
+        vec.dot((xz, yz, zz), w),
+    )
+    return vec.plus(turning, vec.cross(h, v)), vec.plus(
+        vec.times(v, m), vec.cross(w, h)
+    )
 
 
 def outwards(work, tree, q):
@@ -80,7 +86,9 @@ def outwards(work, tree, q):
         vec.put3(work, at, vec.plus(vec.times(x, cosine), vec.times(y, sine)))
         vec.put3(work, at + 3, vec.minus(vec.times(y, cosine), vec.times(x, sine)))
         vec.put3(work, at + 6, z)
-        vec.put3(work, at + 9, vec.plus(origin, vec.times(z, tree.slides[body] * value)))
+        vec.put3(
+            work, at + 9, vec.plus(origin, vec.times(z, tree.slides[body] * value))
+        )
         _inertia(work, body_inertias + body * INERTIA, at, tree.bodies, body * INERTIA)
 
 
@@ -108,7 +116,11 @@ def inwards(work, tree):
         to = inertias + tree.parent[body] * INERTIA
         vec.add(work, to, m)
         vec.add3(work, to + 1, e)
-        vec.add6(work, to + 4, ((xx + (py + pz), xy, xz), (yy + (px + pz), yz, zz + (px + py))))
+        vec.add6(
+            work,
+            to + 4,
+            ((xx + (py + pz), xy, xz), (yy + (px + pz), yz, zz + (px + py))),
+        )
         above = body
         while above > 0:
             place = places + above * PLACE
@@ -182,7 +194,9 @@ def solve(work, tree, x):
         row = tree.row[k]
         value = load(work, x + k) * load(work, tree.scaled + row + tree.depth[k])
         for t in range(tree.depth[k]):
-            value = value - load(work, packed + row + t) * load(work, x + tree.path[row + t])
+            value = value - load(work, packed + row + t) * load(
+                work, x + tree.path[row + t]
+            )
         store(work, x + k, value)
 
 
@@ -229,7 +243,9 @@ def joint_axis(work, tree, body):
     """Return the motion (angular, linear) of a joint per unit rate of its coordinate."""
     z = vec.get3(work, tree.places + (body * PLACE + 6))
     share = tree.factor[body]
-    return vec.times(z, share * tree.turns[body]), vec.times(z, share * tree.slides[body])
+    return vec.times(z, share * tree.turns[body]), vec.times(
+        z, share * tree.slides[body]
+    )
 
 
 def motion_cross(velocity, along):
@@ -238,7 +254,9 @@ def motion_cross(velocity, along):
     If `along` is fixed in a body with this velocity, the result is the time derivative of `along`.
     """
     w, v = velocity
-    return vec.cross(w, along[0]), vec.plus(vec.cross(w, along[1]), vec.cross(v, along[0]))
+    return vec.cross(w, along[0]), vec.plus(
+        vec.cross(w, along[1]), vec.cross(v, along[0])
+    )
 
 
 def at_joint(work, at, place):
@@ -287,19 +305,26 @@ def load_bodies(work, tree):
         inertia = tree.own + body * INERTIA
         w, v = vec.get6(work, moving + VELOCITY)
         turning, p = spatial_inertia_times(work, inertia, (w, v))
-        moment, force = spatial_inertia_times(work, inertia, vec.get6(work, moving + BIAS))
+        moment, force = spatial_inertia_times(
+            work, inertia, vec.get6(work, moving + BIAS)
+        )
         moment = vec.plus(moment, vec.plus(vec.cross(w, turning), vec.cross(v, p)))
         vec.put6(work, at, (moment, vec.plus(force, vec.cross(w, p))))
     for index in range(len(tree.stored_body)):
         body = tree.stored_body[index]
-        w, h = vec.get3(work, tree.motion + body * MOTION), stored_momentum(work, tree, index)
+        w, h = (
+            vec.get3(work, tree.motion + body * MOTION),
+            stored_momentum(work, tree, index),
+        )
         vec.add3(work, tree.load + body * LOAD + FORCE, vec.cross(w, h))
 
 
 def load_carried(work, tree, u):
     """Subtract the wrenches of the body-fixed inputs in u from the forces of the bodies."""
     for index in range(len(tree.wrench_body)):
-        push = vec.times6(carried_wrench(work, tree, index), -load(u, tree.input[index]))
+        push = vec.times6(
+            carried_wrench(work, tree, index), -load(u, tree.input[index])
+        )
         vec.add6(work, tree.load + tree.wrench_body[index] * LOAD + FORCE, push)
 
 

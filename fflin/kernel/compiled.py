@@ -44,7 +44,8 @@ VERSION = f"py{sys.version_info.major}{sys.version_info.minor}"
 # Times [s] to wait while another process compiles. After _SILENCE, a message is logged. The second
 # wait is at most _LONGEST_WAIT.
 _SILENCE, _LONGEST_WAIT = 2.0, 600.0
-_INTERVAL = 1.0  # [s] between updates of the time that a terminal shows during a compilation
+# [s] between updates of the time that a terminal shows during a compilation
+_INTERVAL = 1.0
 
 _log = logging.getLogger("fflin")
 _TURN, _COMPILING = Lock(), RLock()
@@ -99,7 +100,9 @@ def compiles(engine: object, obstacle: Callable[[], str]) -> bool:
         return False
     reason = obstacle()
     if reason and engine == "compiled":
-        raise InputError(f"engine='compiled' is not possible, because {reason}; leave engine out")
+        raise InputError(
+            f"engine='compiled' is not possible, because {reason}; leave engine out"
+        )
     return not reason
 
 
@@ -117,7 +120,9 @@ def kernel(module: str, name: str) -> Compiled:
 def _prepared(module: str, name: str) -> Compiled:
     from fflin.kernel.machine_code import translated
 
-    compiled = translated(getattr(import_module(f"fflin.kernel.{module}"), name), "compiled")
+    compiled = translated(
+        getattr(import_module(f"fflin.kernel.{module}"), name), "compiled"
+    )
     compile = compiled.compile
     if compiled.stats.cache_path is None:
         compiled.compile = partial(_compile_unstored, compile, name)
@@ -147,7 +152,9 @@ def _prepared(module: str, name: str) -> Compiled:
     return compiled
 
 
-def _compile_unstored(compile: Callable[[object], object], name: str, signature: object) -> object:
+def _compile_unstored(
+    compile: Callable[[object], object], name: str, signature: object
+) -> object:
     """Compile a function whose machine code cannot be stored; say so once per process."""
     with _COMPILING:
         if not _said_unstored:
@@ -198,7 +205,8 @@ def _between_processes(path: Path) -> ExitStack:
             lock.acquire(timeout=_SILENCE)
         except Timeout:
             _log.warning(
-                "fflin: waiting for another process that compiles the code in %s", path.parent
+                "fflin: waiting for another process that compiles the code in %s",
+                path.parent,
             )
             lock.acquire(timeout=_LONGEST_WAIT)
         held.callback(lock.release)
@@ -210,7 +218,9 @@ def is_kept(module: str, name: str) -> bool:
     chosen = os.environ.get("NUMBA_CACHE_DIR")
     kernel_folder = Path(__file__).parent
     folders = (
-        Path(chosen).glob(f"{kernel_folder.name}_*") if chosen else [kernel_folder / "__pycache__"]
+        Path(chosen).glob(f"{kernel_folder.name}_*")
+        if chosen
+        else [kernel_folder / "__pycache__"]
     )
     return any(_stored(folder, module, name)[0] for folder in folders)
 

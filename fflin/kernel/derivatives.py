@@ -33,7 +33,16 @@ from fflin.dynamics.rnea import WARNING_COUPLING
 from fflin.dynamics.state import Actuation, StateMap
 from fflin.kernel import bodies
 from fflin.kernel import vectors as vec
-from fflin.kernel.bodies import FORCE, MOMENTS, MOMENTUM, PSI, PSI2, STORED, at_parent, joint_axis
+from fflin.kernel.bodies import (
+    FORCE,
+    MOMENTS,
+    MOMENTUM,
+    PSI,
+    PSI2,
+    STORED,
+    at_parent,
+    joint_axis,
+)
 from fflin.kernel.bodies import spatial_inertia_times as inertia_times
 from fflin.kernel.compiled import kernel
 from fflin.kernel.tree import INERTIA, LANES, LOAD, MOTION, PLACE, Tree, work_space
@@ -48,7 +57,9 @@ def _coriolis(work, at, w):
     G = vec.get_columns(work, at + MOMENTS)
     trace = G[0][0] + G[1][1] + G[2][2]
     moment = vec.minus(vec.times(w, trace), vec.product(G, w))
-    moment = vec.plus(vec.plus(moment, moment), vec.cross(w, vec.get3(work, at + STORED)))
+    moment = vec.plus(
+        vec.plus(moment, moment), vec.cross(w, vec.get3(work, at + STORED))
+    )
     force = vec.cross(w, vec.get3(work, at + MOMENTUM))
     return moment, vec.plus(force, force)
 
@@ -103,7 +114,9 @@ def differentiate(work, tree):
         momentum = inertia_times(work, inertia, axis)
         coriolis = _coriolis_transposed(work, at, axis)
         moment, force = vec.get6(work, at + FORCE)
-        by_q = vec.plus6(_coriolis(work, at, psi[0]), inertia_times(work, inertia, psi2))
+        by_q = vec.plus6(
+            _coriolis(work, at, psi[0]), inertia_times(work, inertia, psi2)
+        )
         turned = vec.plus(vec.cross(axis[0], moment), vec.cross(axis[1], force))
         by_q = vec.plus6(by_q, (turned, vec.cross(axis[0], force)))
         weight = inertia_times(work, inertia, psi)
@@ -121,7 +134,9 @@ def differentiate(work, tree):
                 moving = tree.motion + above * MOTION
                 psi, psi2 = vec.get6(work, moving + PSI), vec.get6(work, moving + PSI2)
                 vec.add(
-                    work, joint_row + other, vec.dot(coriolis, psi[0]) + vec.dot6(momentum, psi2)
+                    work,
+                    joint_row + other,
+                    vec.dot(coriolis, psi[0]) + vec.dot6(momentum, psi2),
                 )
                 value = vec.dot6(momentum, psi)
                 value = vec.dot(coriolis, axis[0]) + (value + value)
@@ -129,7 +144,9 @@ def differentiate(work, tree):
             momentum = at_parent(work, place, momentum)
             by_q, by_v = at_parent(work, place, by_q), at_parent(work, place, by_v)
             above = tree.parent[above]
-        vec.add3(work, joint_row + (6 + n), vec.plus(coriolis, vec.cross(momentum[0], spin)))
+        vec.add3(
+            work, joint_row + (6 + n), vec.plus(coriolis, vec.cross(momentum[0], spin))
+        )
         bodies.add_column(work, tree.lower + column, width, by_q)
         bodies.add_column(work, tree.lower + (column + 6 + n), width, by_v)
     # Write the derivatives of the base's moment and force with respect to omega_b.
@@ -175,7 +192,9 @@ def _solve(work, tree, slopes):
         vec.clear(work, slopes + row * width, 6)
     for column in range(width % 6 or 6, width, 6):
         for k in range(size):
-            vec.put6(work, tree.held + k * 6, vec.get6(work, tree.lower + column + k * width))
+            vec.put6(
+                work, tree.held + k * 6, vec.get6(work, tree.lower + column + k * width)
+            )
         for row in range(size):
             total = none
             for k in range(size):
@@ -260,7 +279,8 @@ def derive(tree, points, out, lanes, work):
             _unpack(work, slopes, lower, A, first, A.shape[1] - lower)
 
 
-_FARTHEST = 1e6  # [rad] `vectors.cosine_and_sine` is accurate for angles of smaller magnitude
+# [rad] `vectors.cosine_and_sine` is accurate for angles of smaller magnitude
+_FARTHEST = 1e6
 
 
 class Packed(namedtuple("Packed", "q nu force u")):
@@ -303,7 +323,9 @@ class RowAccelerations:
         c = np.empty(nu.shape)
         return c, self._derive((q, nu, force, u), c, A.reshape(len(q), -1), by_u)
 
-    def _derive(self, points: tuple[Array, ...], c: Array, A: Array, by_u: Array) -> Mask:
+    def _derive(
+        self, points: tuple[Array, ...], c: Array, A: Array, by_u: Array
+    ) -> Mask:
         judged = np.empty((len(by_u), 1))
         kernel("derivatives", "derive")(
             self._tree,

@@ -95,7 +95,12 @@ def joint_position(robot, q, joint):
 
 
 def apply_faults(
-    faults: ActuatorFaults, triads: list[int], t: float, h: float, u: Entries, given: Entries
+    faults: ActuatorFaults,
+    triads: list[int],
+    t: float,
+    h: float,
+    u: Entries,
+    given: Entries,
 ) -> None:
     """Write to `given` the inputs that the actuators produce for a command u in a step.
 
@@ -140,7 +145,9 @@ def push(work, tree, pushing):
     for index in range(count):
         u = load(pushing, tree.input[index])
         for row in range(size):
-            vec.add(work, tree.c + row, load(work, tree.columns + row * count + index) * u)
+            vec.add(
+                work, tree.c + row, load(work, tree.columns + row * count + index) * u
+            )
 
 
 @called
@@ -211,8 +218,12 @@ def add_wrench(work, robot, reference, point, weight, moment):
     force, falls = vec.product(axes, force), vec.get3(reference.weight, 0)
     # The weight m g acts at the centre of mass. Its moment about the base's origin is `lever` x g,
     # where `lever` is m times the position of the centre of mass from the base's origin.
-    torque = vec.plus(vec.product(axes, moments), vec.cross(position, vec.plus(force, falls)))
-    torque = vec.plus(torque, vec.cross(vec.times(lever, load(reference.per_mass, 0)), falls))
+    torque = vec.plus(
+        vec.product(axes, moments), vec.cross(position, vec.plus(force, falls))
+    )
+    torque = vec.plus(
+        torque, vec.cross(vec.times(lever, load(reference.per_mass, 0)), falls)
+    )
     force = vec.plus(force, falls)
     vec.add6(reference.sums, STEP_IMPULSE, vec.times6((force, torque), weight))
     vec.add3(reference.sums, STEP_SHIFT, vec.times(force, moment))
@@ -237,7 +248,9 @@ def kept_at(reference, t):
 
     t must be the end of the last finished step.
     """
-    momentum = vec.plus6(vec.get6(reference.start, 0), vec.get6(reference.sums, IMPULSE))
+    momentum = vec.plus6(
+        vec.get6(reference.start, 0), vec.get6(reference.sums, IMPULSE)
+    )
     flown = vec.times(vec.get3(reference.start, 0), t * load(reference.per_mass, 0))
     shift = vec.plus(vec.get3(reference.start, 6), vec.get3(reference.sums, SHIFT))
     return momentum, vec.plus(shift, flown)
@@ -270,7 +283,9 @@ def _momentum_error(work, robot, nu, momentum):
     tree = robot.tree
     # The momentum of the bodies is the product of nu with the six base rows of M. By symmetry, the
     # six entries of a joint in the base rows are the first six entries of the joint's row.
-    error = vec.minus6(momentum, spatial_inertia_times(work, tree.inertias, vec.get6(nu, 0)))
+    error = vec.minus6(
+        momentum, spatial_inertia_times(work, tree.inertias, vec.get6(nu, 0))
+    )
     for index in range(6, len(tree.row)):
         row = vec.get6(work, tree.packed + tree.row[index])
         error = vec.minus6(error, vec.times6(row, load(nu, index)))
@@ -307,6 +322,10 @@ def impose(work, robot, reference, point, t):
     f, g, h = xy + lever[0] * d[1], xz + lever[0] * d[2], yz + lever[1] * d[2]
     x, y, z = b * c - h * h, g * h - f * c, f * h - g * b
     inverse = 1.0 / (a * x + f * y + g * z)
-    adjugate = (x, y, z), (y, a * c - g * g, f * g - a * h), (z, f * g - a * h, a * b - f * f)
+    adjugate = (
+        (x, y, z),
+        (y, a * c - g * g, f * g - a * h),
+        (z, f * g - a * h, a * b - f * f),
+    )
     w = vec.times(vec.product(adjugate, about), inverse)
     vec.add6(nu, 0, (w, vec.plus(vec.times(linear, per_mass), vec.cross(d, w))))

@@ -19,7 +19,9 @@ from fflin.kernel.vectors import Entries, angle, below, chosen, load, root, stor
 
 
 class Wheels(
-    namedtuple("Wheels", "at row least_torque most_torque least_speed most_speed stiffness")
+    namedtuple(
+        "Wheels", "at row least_torque most_torque least_speed most_speed stiffness"
+    )
 ):
     r"""Wheels (k,) with speed limits: :math:`u \le J (w_{max} - w) / dt`.
 
@@ -49,7 +51,9 @@ class Pulses(namedtuple("Pulses", "at on_off most least left level end time")):
 
 
 class Channel(
-    namedtuple("Channel", "low high held pending slots sample delay fresh wheels pulses")
+    namedtuple(
+        "Channel", "low high held pending slots sample delay fresh wheels pulses"
+    )
 ):
     """Channel from commands (nu,) to inputs: limits, sample and hold, delay, wheels and pulses.
 
@@ -63,7 +67,9 @@ class Channel(
 
 
 WHEELS = Struct(Wheels, at=INDICES, row=INDICES)
-PULSES = Struct(Pulses, REALS, {LANED: "left level end"}, at=INDICES, on_off=FLAGS, time=REAL)
+PULSES = Struct(
+    Pulses, REALS, {LANED: "left level end"}, at=INDICES, on_off=FLAGS, time=REAL
+)
 _OF_CHANNEL = {WHOLE: "slots sample", LANED: "held pending delay fresh"}
 CHANNEL = Struct(Channel, REALS, _OF_CHANNEL, wheels=WHEELS, pulses=PULSES)
 
@@ -77,7 +83,9 @@ def clipped(value, low, high):
 def limit(channel: Channel, u: Entries) -> None:
     """Saturate the commands u at the limits of the channel."""
     for index in range(len(channel.low)):
-        value = clipped(load(u, index), load(channel.low, index), load(channel.high, index))
+        value = clipped(
+            load(u, index), load(channel.low, index), load(channel.high, index)
+        )
         store(u, index, value)
 
 
@@ -130,8 +138,12 @@ def transmit(channel: Channel, step: int, nu: Entries, u: Entries) -> None:
     for index in range(len(wheels.at)):
         least, most = load(wheels.least_torque, index), load(wheels.most_torque, index)
         speed, stiffness = load(nu, wheels.row[index]), load(wheels.stiffness, index)
-        low = clipped(stiffness * (load(wheels.least_speed, index) - speed), least, most)
-        high = clipped(stiffness * (load(wheels.most_speed, index) - speed), least, most)
+        low = clipped(
+            stiffness * (load(wheels.least_speed, index) - speed), least, most
+        )
+        high = clipped(
+            stiffness * (load(wheels.most_speed, index) - speed), least, most
+        )
         low, high = chosen(low, 0.0, low, 0.0), chosen(0.0, high, high, 0.0)
         at = wheels.at[index]
         store(u, at, clipped(load(u, at), low, high))
@@ -148,7 +160,9 @@ def _begin_pulses(channel, step, u):
     for index in range(len(pulses.at)):
         most, least = load(pulses.most, index), load(pulses.least, index)
         command = load(u, pulses.at[index])
-        wanted = chosen(most, command, most, command) * pulses.time + load(pulses.left, index)
+        wanted = chosen(most, command, most, command) * pulses.time + load(
+            pulses.left, index
+        )
         mean = clipped(wanted / pulses.time, 0.0, most)
         fired = mean * pulses.time
         if pulses.on_off[index]:
@@ -167,7 +181,10 @@ def _begin_pulses(channel, step, u):
 
 
 class Method(
-    namedtuple("Method", "h origin shift speed nodes weights moments rates along first second u")
+    namedtuple(
+        "Method",
+        "h origin shift speed nodes weights moments rates along first second u",
+    )
 ):
     """Integration method: steps of h [s] with s stages.
 
@@ -200,7 +217,9 @@ class StopConditions(namedtuple("StopConditions", "squares sign")):
 
 
 class Arguments(
-    namedtuple("Arguments", "robot method law channel reference project pushed stop point")
+    namedtuple(
+        "Arguments", "robot method law channel reference project pushed stop point"
+    )
 ):
     """Arguments of `advance`.
 
@@ -307,10 +326,20 @@ def advance(words, clock, last, every, rows, work):
             t = step * h + method.nodes[stage]
             if law.kind != NOTHING and (channel.sample == 0 or stage == 0):
                 if is_asked(channel, step):
-                    command(work, robot, law, point, t, step // max(channel.sample, 1), stage)
+                    command(
+                        work,
+                        robot,
+                        law,
+                        point,
+                        t,
+                        step // max(channel.sample, 1),
+                        stage,
+                    )
                     allocate(law.allocation, point, law.u)
                 transmit(channel, step, point.nu, point.u)
-            forward.apply_faults(robot.faults, robot.triads, step * h, h, point.u, point.pushing)
+            forward.apply_faults(
+                robot.faults, robot.triads, step * h, h, point.u, point.pushing
+            )
             forward.turn_held(robot, point)
             if stage == 0:
                 vec.copy(point.u, 0, method.u, 0, len(point.u))
@@ -322,7 +351,9 @@ def advance(words, clock, last, every, rows, work):
                     vec.put6(rows, at, momentum)
                     vec.put3(rows, at + 6, center)
                     at += 9
-            forward.accelerate(work, robot, point, method.rates, (1 + stage) * len(point.nu))
+            forward.accelerate(
+                work, robot, point, method.rates, (1 + stage) * len(point.nu)
+            )
             if arguments.pushed:
                 weight, moment = method.weights[stage], method.moments[stage]
                 forward.add_wrench(work, robot, kept, point, weight, moment)
@@ -391,7 +422,9 @@ def _compare(stats, step):
     at, followed, sizes, e = stats.at, stats.path.point, stats.sizes, stats.path.e
     if len(stats.q_ref) > 0:
         vec.copy(stats.q_ref, step * len(followed.q), followed.q, 0, len(followed.q))
-        vec.copy(stats.nu_ref, step * len(followed.nu), followed.nu, 0, len(followed.nu))
+        vec.copy(
+            stats.nu_ref, step * len(followed.nu), followed.nu, 0, len(followed.nu)
+        )
         error(stats.robot, stats.path, at)
     else:
         read_state(stats.robot, stats.law, at, 0)
@@ -438,7 +471,11 @@ def take(words, rows, first, count):
             # and the settling time starts anew.
             bound = stats.settled * load(stats.largest, kind)
             bound = chosen(bound, stats.tolerance[kind], stats.tolerance[kind], bound)
-            store(stats.outside, kind, chosen(bound, value, float(step), load(stats.outside, kind)))
+            store(
+                stats.outside,
+                kind,
+                chosen(bound, value, float(step), load(stats.outside, kind)),
+            )
         for index in range(inputs):
             _grow(stats.largest_u, index, _size(load(rows, begin + width + index)))
         if kept < len(stats.steps) and stats.steps[kept] == step:

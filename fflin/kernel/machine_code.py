@@ -68,7 +68,9 @@ class Lanes(Type):
 lanes = Lanes("Lanes")
 
 
-extending.register_model(Lanes)(partial(extending.models.PrimitiveModel, be_type=_VECTOR))
+extending.register_model(Lanes)(
+    partial(extending.models.PrimitiveModel, be_type=_VECTOR)
+)
 
 
 @extending.lower_cast(float64, lanes)
@@ -78,7 +80,9 @@ def _spread(
     """Copy a double to all lanes."""
     nothing = ir.Constant(_VECTOR, ir.Undefined)
     one = builder.insert_element(nothing, value, _INT32(0))
-    return builder.shuffle_vector(one, nothing, ir.Constant(ir.VectorType(_INT32, LANES), None))
+    return builder.shuffle_vector(
+        one, nothing, ir.Constant(ir.VectorType(_INT32, LANES), None)
+    )
 
 
 def _alike(*kinds: Type) -> Signature:
@@ -87,7 +91,9 @@ def _alike(*kinds: Type) -> Signature:
     return kind(*[kind] * len(kinds))
 
 
-def _arithmetic(python: Callable[..., object], generate: Generator, operands: int = 2) -> None:
+def _arithmetic(
+    python: Callable[..., object], generate: Generator, operands: int = 2
+) -> None:
     """Define a Python operator, such as `operator.add`, for operands with lanes."""
 
     def lowered(
@@ -119,7 +125,8 @@ def _operation(
 
     def decorated(generate: Generator) -> Callable[..., object]:
         @extending.intrinsic
-        @wraps(generate)  # numba reads the number of arguments from the signature of `generate`
+        # numba reads the number of arguments from the signature of `generate`
+        @wraps(generate)
         def operation(_: TypingContext, *kinds: Type) -> tuple[Signature, Generator]:
             def generated(
                 context: BaseContext,
@@ -129,7 +136,9 @@ def _operation(
             ) -> ir.Value:
                 given = list(values)
                 if isinstance(kinds[0], Array):
-                    given[0] = context.make_array(kinds[0])(context, builder, values[0]).data
+                    given[0] = context.make_array(kinds[0])(
+                        context, builder, values[0]
+                    ).data
                     if kinds[0].ndim == 2:
                         given[0] = builder.bitcast(given[0], _VECTOR.as_pointer())
                 result = generate(builder, *given)
@@ -156,7 +165,9 @@ def _load(builder: ir.IRBuilder, array: ir.Value, index: ir.Value) -> ir.Value:
 
 
 @_operation(uncompiled.store, lambda array, index, _: void(array, intp, _held(array)))
-def _store(builder: ir.IRBuilder, array: ir.Value, index: ir.Value, value: ir.Value) -> None:
+def _store(
+    builder: ir.IRBuilder, array: ir.Value, index: ir.Value, value: ir.Value
+) -> None:
     builder.store(value, builder.gep(array, [index])).align = _BYTES
 
 
@@ -164,7 +175,9 @@ def _rounding(replaced: Callable[..., object], name: str) -> None:
     def generate(builder: ir.IRBuilder, value: ir.Value) -> ir.Value:
         type_name = f"v{LANES}f64" if value.type == _VECTOR else "f64"
         function = cgutils.get_or_insert_function(
-            builder.module, ir.FunctionType(value.type, [value.type]), f"llvm.{name}.{type_name}"
+            builder.module,
+            ir.FunctionType(value.type, [value.type]),
+            f"llvm.{name}.{type_name}",
         )
         return builder.call(function, [value])
 
@@ -178,7 +191,11 @@ _rounding(uncompiled.root, "sqrt")
 
 @_operation(uncompiled.chosen, _alike)
 def _chosen(
-    builder: ir.IRBuilder, left: ir.Value, right: ir.Value, less: ir.Value, other: ir.Value
+    builder: ir.IRBuilder,
+    left: ir.Value,
+    right: ir.Value,
+    less: ir.Value,
+    other: ir.Value,
 ) -> ir.Value:
     return builder.select(builder.fcmp_ordered("<", left, right), less, other)
 
@@ -200,7 +217,10 @@ def _angle(builder: ir.IRBuilder, sine: ir.Value, cosine: ir.Value) -> ir.Value:
         return builder.call(atan2, [sine, cosine])
     result = ir.Constant(_VECTOR, ir.Undefined)
     for lane in map(_INT32, range(LANES)):
-        pair = builder.extract_element(sine, lane), builder.extract_element(cosine, lane)
+        pair = (
+            builder.extract_element(sine, lane),
+            builder.extract_element(cosine, lane),
+        )
         one = builder.call(atan2, pair)
         result = builder.insert_element(result, one, lane)
     return result
@@ -277,7 +297,11 @@ class PartCompiler(Compiler):
     """numba's compiler pipeline, with the result in a `PartLibrary`."""
 
     def __init__(
-        self, typing: TypingContext, target: BaseContext, library: CodeLibrary, *rest: object
+        self,
+        typing: TypingContext,
+        target: BaseContext,
+        library: CodeLibrary,
+        *rest: object,
     ) -> None:
         super().__init__(typing, target, library, *rest)
         if library is None:
@@ -315,7 +339,11 @@ class _Fields(AttributeTemplate):
 
 @extending.lower_getattr_generic(_StructType)
 def _field(
-    context: BaseContext, builder: ir.IRBuilder, kind: _StructType, words: ir.Value, name: str
+    context: BaseContext,
+    builder: ir.IRBuilder,
+    kind: _StructType,
+    words: ir.Value,
+    name: str,
 ) -> ir.Value:
     field_kind = _numba_type(kind.struct.kinds[name])
     first = kind.struct.places[name]
@@ -355,7 +383,10 @@ def opener(kind: Struct[NamedTuple]) -> Callable[..., object]:
 
     def opened(_: TypingContext, words: Array) -> tuple[Signature, Generator]:
         def generate(
-            context: BaseContext, builder: ir.IRBuilder, _: Signature, values: Sequence[ir.Value]
+            context: BaseContext,
+            builder: ir.IRBuilder,
+            _: Signature,
+            values: Sequence[ir.Value],
         ) -> ir.Value:
             return context.make_array(words)(context, builder, values[0]).data
 
@@ -368,7 +399,11 @@ def opener(kind: Struct[NamedTuple]) -> Callable[..., object]:
 # once. "numpy": a division by zero gives infinity or NaN, and no error. "_nrt": reference counting
 # of arrays would take three quarters of the running time, so it is off. Without reference counting,
 # kernel functions cannot allocate arrays.
-_OPTIONS: dict[str, object] = {"fastmath": {"contract"}, "error_model": "numpy", "_nrt": False}
+_OPTIONS: dict[str, object] = {
+    "fastmath": {"contract"},
+    "error_model": "numpy",
+    "_nrt": False,
+}
 _PART: dict[str, object] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 _PART |= {"pipeline_class": PartCompiler, **_OPTIONS}
 _DECORATORS = {
@@ -400,7 +435,11 @@ def translated(function: FunctionType, how: str = "") -> Compiled:
         if name in names:
             names[name] = _counterpart(names[name])
     twin = FunctionType(
-        function.__code__, names, function.__name__, function.__defaults__, function.__closure__
+        function.__code__,
+        names,
+        function.__name__,
+        function.__defaults__,
+        function.__closure__,
     )
     usual = "called" if function in uncompiled.CALLED else "inlined"
     made = _DECORATORS[how or usual](twin)

@@ -11,15 +11,28 @@ from fflin.kernel import vectors as vec
 from fflin.kernel.allocation import ALLOCATION
 from fflin.kernel.bodies import move_bodies
 from fflin.kernel.forward import COMMON_POINT, joint_position
-from fflin.kernel.tree import FLAG, FLAGS, INDICES, LANED, MOTION, PLACE, REAL, REALS, WHOLE, Struct
+from fflin.kernel.tree import (
+    FLAG,
+    FLAGS,
+    INDICES,
+    LANED,
+    MOTION,
+    PLACE,
+    REAL,
+    REALS,
+    WHOLE,
+    Struct,
+)
 from fflin.kernel.vectors import angle, called, chosen, load, store, whole
 
-_NEAR = 1e-9  # a time nearer to a knot than this fraction of the interval counts as the knot
+# a time nearer to a knot than this fraction of the interval counts as the knot
+_NEAR = 1e-9
 
 
 class Path(
     namedtuple(
-        "Path", "t q u shift speed hold ahead ends held over last starts K order along e point"
+        "Path",
+        "t q u shift speed hold ahead ends held over last starts K order along e point",
     )
 ):
     """A trajectory and its feedback gains, both as piecewise polynomials.
@@ -43,7 +56,9 @@ class Path(
 
 
 _OF_PATH = {FLAG: "hold ends", REAL: "ahead over last"}
-PATH = Struct(Path, REALS, _OF_PATH, held=INDICES, order=WHOLE, e=LANED, point=COMMON_POINT)
+PATH = Struct(
+    Path, REALS, _OF_PATH, held=INDICES, order=WHOLE, e=LANED, point=COMMON_POINT
+)
 
 
 def _cubic(coefficients, k, s, out):
@@ -128,14 +143,24 @@ def track(robot, path, point, u, t):
             value += share * (path.u[(at + 1) * count + index] - value)
         followed.u[index] = value
     if after:
-        vec.copy(path.speed, 4 * (last + 1) * len(followed.nu), followed.nu, 0, len(followed.nu))
+        vec.copy(
+            path.speed,
+            4 * (last + 1) * len(followed.nu),
+            followed.nu,
+            0,
+            len(followed.nu),
+        )
     else:
         _cubic(path.shift, k, s, path.along)
         _cubic(path.speed, k, s, followed.nu)
         vec.displace(robot.tree, followed.q, path.along, followed.q)
     for index in range(len(path.held)):
         at = path.held[index]
-        vec.put3(followed.u, at, vec.across(vec.axes_of(followed.q), vec.get3(followed.u, at)))
+        vec.put3(
+            followed.u,
+            at,
+            vec.across(vec.axes_of(followed.q), vec.get3(followed.u, at)),
+        )
     # Compute the error of the robot and evaluate the gain.
     error(robot, path, point)
     starts = path.starts
@@ -209,8 +234,15 @@ class Filter(namedtuple("Filter", "A B C D u0 y0 jump z rates")):
 
 GRID = Struct(Grid, REALS, {INDICES: "joint first stride"}, at=LANED)
 FILTER = Struct(Filter, z=LANED, rates=LANED)
-_OF_LAW = {WHOLE: "kind", FLAGS: "turned", INDICES: "measured gyros", LANED: "x y added u"}
-LAW = Struct(Law, REALS, _OF_LAW, grid=GRID, filter=FILTER, path=PATH, allocation=ALLOCATION)
+_OF_LAW = {
+    WHOLE: "kind",
+    FLAGS: "turned",
+    INDICES: "measured gyros",
+    LANED: "x y added u",
+}
+LAW = Struct(
+    Law, REALS, _OF_LAW, grid=GRID, filter=FILTER, path=PATH, allocation=ALLOCATION
+)
 
 
 @called
@@ -227,7 +259,9 @@ def read_state(robot, law, point, row):
     vector, scalar = vec.quaternion_times(turn, vec.attitude(q))
     sign = chosen(scalar, 0.0, -1.0, 1.0)
     vec.put3(x, 0, vec.times(vector, sign))
-    vec.put3(x, 3, vec.plus(position, vec.product(vec.columns_of(turn), vec.get3(q, 0))))
+    vec.put3(
+        x, 3, vec.plus(position, vec.product(vec.columns_of(turn), vec.get3(q, 0)))
+    )
     for joint in range(n):
         value = joint_position(robot, q, joint)
         if robot.circling[joint]:
@@ -272,11 +306,17 @@ def command(work, robot, law, point, t, count, stage):
     for index in range(len(gyros)):
         rate = vec.get3(work, tree.motion + gyros[index] * MOTION)
         axes = vec.get_columns(work, tree.places + gyros[index] * PLACE)
-        rate = vec.across(vec.get_columns(law.gyro_axes, 9 * index), vec.across(axes, rate))
+        rate = vec.across(
+            vec.get_columns(law.gyro_axes, 9 * index), vec.across(axes, rate)
+        )
         vec.put3(law.x, 2 * len(point.nu) + 3 * index, rate)
     added = count % max(len(law.added) // max(outputs, 1), 1) * outputs
     for index in range(outputs):
-        store(law.y, index, load(law.x, law.measured[index]) + load(law.added, added + index))
+        store(
+            law.y,
+            index,
+            load(law.x, law.measured[index]) + load(law.added, added + index),
+        )
     if len(law.grid.joint) > 0:
         _feed_back_between(robot, law, point)
     else:
@@ -297,7 +337,9 @@ def _feed_back_between(robot, law, point):
                 at = cell * inputs + row
                 total = vec.peek(grid.offset, at, lane)
                 for column in range(size):
-                    total -= vec.peek(grid.K, at * size + column, lane) * vec.peek(y, column, lane)
+                    total -= vec.peek(grid.K, at * size + column, lane) * vec.peek(
+                        y, column, lane
+                    )
                 vec.poke(u, row, lane, vec.peek(u, row, lane) + weight * total)
 
 
@@ -312,7 +354,9 @@ def _corner(grid, corner, lane):
     for axis in range(len(grid.joint)):
         first = grid.first[axis]
         last = grid.first[axis + 1] - 1
-        value = min(max(vec.peek(grid.at, axis, lane), grid.values[first]), grid.values[last])
+        value = min(
+            max(vec.peek(grid.at, axis, lane), grid.values[first]), grid.values[last]
+        )
         k = first
         while k < last - 1 and value >= grid.values[k + 1]:
             k += 1

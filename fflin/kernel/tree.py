@@ -80,7 +80,9 @@ class Struct(Generic[T_co]):
             others |= dict.fromkeys(fields.split(), kind)
         self.made = made
         self.kinds = {field: others.get(field, rest) for field in made._fields}
-        sizes = [k.size if isinstance(k, Struct) else 1 + k.axes for k in self.kinds.values()]
+        sizes = [
+            k.size if isinstance(k, Struct) else 1 + k.axes for k in self.kinds.values()
+        ]
         ends = np.cumsum([0, *sizes]).tolist()
         self.places = dict(zip(self.kinds, ends, strict=False))
         self.size: int = ends[-1]
@@ -100,12 +102,16 @@ def empty(kind: Struct[T]) -> T:
             parts.append(empty(field_kind))
         else:
             parts.append(
-                np.zeros((0,) * field_kind.axes, field_kind.dtype) if field_kind.axes else 0
+                np.zeros((0,) * field_kind.axes, field_kind.dtype)
+                if field_kind.axes
+                else 0
             )
     return kind.made._make(parts)
 
 
-def laid_out(value: T, kind: Struct[T]) -> tuple[T, NDArray[np.int64], list[tuple[Array, Array]]]:
+def laid_out(
+    value: T, kind: Struct[T]
+) -> tuple[T, NDArray[np.int64], list[tuple[Array, Array]]]:
     """Convert the fields of a named tuple to the kinds that the struct `kind` requires.
 
     Return the converted tuple, the words of the tuple, and one pair for each array with lanes. A
@@ -117,7 +123,9 @@ def laid_out(value: T, kind: Struct[T]) -> tuple[T, NDArray[np.int64], list[tupl
     return _lay_out(value, kind, words, fresh), np.array(words, dtype=np.int64), fresh
 
 
-def _lay_out(value: T, kind: Struct[T], words: list[int], fresh: list[tuple[Array, Array]]) -> T:
+def _lay_out(
+    value: T, kind: Struct[T], words: list[int], fresh: list[tuple[Array, Array]]
+) -> T:
     """Return the converted tuple of `laid_out`, and append to the lists `words` and `fresh`.
 
     The words of the tuple are appended to `words`. One pair for each array with lanes is appended
@@ -140,7 +148,9 @@ def _lay_out(value: T, kind: Struct[T], words: list[int], fresh: list[tuple[Arra
             number = field_kind.dtype(part).item()
             parts.append(number)
             words.append(
-                int(np.float64(number).view(np.int64)) if field_kind == REAL else int(number)
+                int(np.float64(number).view(np.int64))
+                if field_kind == REAL
+                else int(number)
             )
     return value._make(parts)
 
@@ -239,11 +249,17 @@ def batch_tree(robot: Robot) -> Tree | None:
         return None
     places, turns, slides = zip((pin.SE3.Identity(), 0.0, 0.0), *screws, strict=True)
     bodies = len(joints)
-    parent = np.array([max(0, model.parents[ROOT + body] - ROOT) for body in range(bodies)])
+    parent = np.array(
+        [max(0, model.parents[ROOT + body] - ROOT) for body in range(bodies)]
+    )
     fixed, inertias = np.zeros((bodies, 12)), np.zeros((bodies, 10))
     for body, place in enumerate(places):
-        placement = places[parent[body]].inverse() * model.jointPlacements[ROOT + body] * place
-        fixed[body] = np.concatenate((placement.rotation.ravel("F"), placement.translation))
+        placement = (
+            places[parent[body]].inverse() * model.jointPlacements[ROOT + body] * place
+        )
+        fixed[body] = np.concatenate(
+            (placement.rotation.ravel("F"), placement.translation)
+        )
         # Pinocchio's order is m, m c, and I as xx xy yy xz yz zz.
         dynamic = place.actInv(model.inertias[ROOT + body]).toDynamicParameters()
         inertias[body] = dynamic[[0, 1, 2, 3, 4, 5, 7, 6, 8, 9]]
@@ -278,7 +294,9 @@ def batch_tree(robot: Robot) -> Tree | None:
         turned = axes[joint - ROOT].T
         wrench_body += [joint - ROOT] * len(numbers)
         inputs += numbers.tolist()
-        wrenches += [np.r_[turned @ w[PIN_ANGULAR], turned @ w[PIN_LINEAR]] for w in columns.T]
+        wrenches += [
+            np.r_[turned @ w[PIN_ANGULAR], turned @ w[PIN_LINEAR]] for w in columns.T
+        ]
     entries, count = sum(map(len, paths)), len(inputs)
     sizes = [bodies * PLACE, bodies * INERTIA, bodies * INERTIA, entries, entries, size]
     sizes += [size * size, bodies * MOTION, bodies * LOAD, size, size, size * count]
@@ -301,12 +319,16 @@ def batch_tree(robot: Robot) -> Tree | None:
         np.array([len(path) - 1 for path in paths]),
         np.array([index for path in paths for index in path]),
         common,
-        np.where(actuation.fixed.any(axis=0), np.abs(actuation.fixed).argmax(axis=0), -1),
+        np.where(
+            actuation.fixed.any(axis=0), np.abs(actuation.fixed).argmax(axis=0), -1
+        ),
         np.array(wrench_body, dtype=np.intp),
         np.array(wrenches).ravel(),
         np.array(inputs, dtype=np.intp),
         np.array([joint - ROOT for joint, _ in robot.stored_momentum], dtype=np.intp),
-        np.array([axes[joint - ROOT].T @ h for joint, h in robot.stored_momentum]).ravel(),
+        np.array(
+            [axes[joint - ROOT].T @ h for joint, h in robot.stored_momentum]
+        ).ravel(),
         np.array(robot.springs.stiffness),
         np.array(robot.springs.damping),
         *np.cumsum([0, *sizes]).tolist(),
@@ -323,7 +345,9 @@ def _paths(size: int, parent: Array, coordinate: list[int]) -> list[list[int]]:
     # these bodies may be on different branches. The factorisation of M then makes further entries
     # nonzero. So the coordinates of all ancestors must be on one path, as in Liu's elimination
     # tree.
-    reached: list[set[int]] = [set(range(index)) if index < 6 else set() for index in range(size)]
+    reached: list[set[int]] = [
+        set(range(index)) if index < 6 else set() for index in range(size)
+    ]
     for body in range(1, len(parent)):
         above = body
         while above > 0:

@@ -158,7 +158,11 @@ def get_columns(work, at):
 
 def cross(a, b):
     """Return a x b."""
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+    return (
+        a[1] * b[2] - a[2] * b[1],
+        a[2] * b[0] - a[0] * b[2],
+        a[0] * b[1] - a[1] * b[0],
+    )
 
 
 def dot(a, b):
@@ -183,7 +187,9 @@ def times(a, value):
 
 def product(columns, a):
     """Return M a for the matrix M with the given columns."""
-    return plus(plus(times(columns[0], a[0]), times(columns[1], a[1])), times(columns[2], a[2]))
+    return plus(
+        plus(times(columns[0], a[0]), times(columns[1], a[1])), times(columns[2], a[2])
+    )
 
 
 def across(columns, a):
@@ -247,7 +253,8 @@ def cosine_and_sine(x):
 def _series(first):
     """Return the function of x that computes sum_k (-x)^k first! / (first + 2 k)!."""
     shares = [
-        (-1) ** k * math.factorial(first) / math.factorial(first + 2 * k) for k in range(_TERMS)
+        (-1) ** k * math.factorial(first) / math.factorial(first + 2 * k)
+        for k in range(_TERMS)
     ]
     last = shares[-1]
     rest = tuple(shares[-2::-1])
@@ -303,7 +310,8 @@ def displace(tree, q, along, out):
     w, v = get3(along, 0), get3(along, 3)
     square = dot(w, w)
     quarter = 0.25 * square
-    sine, cosine = _sine(quarter), _cosine(quarter)  # sin(a/2) / (a/2) and cos(a/2), with a = |w|
+    # sin(a/2) / (a/2) and cos(a/2), with a = |w|
+    sine, cosine = _sine(quarter), _cosine(quarter)
     shift = plus(times(v, sine * cosine), times(cross(w, v), 0.5 * sine * sine))
     shift = plus(shift, times(w, dot(w, v) * _sixth(square) * (1.0 / 6.0)))
     quaternion = attitude(q)

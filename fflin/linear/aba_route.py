@@ -33,7 +33,9 @@ class Dynamics(NamedTuple):
     by_u: Array
 
 
-def _dynamics(aba: Aba, q: Array, v: Array, u: Array, inertia: Array | None = None) -> Dynamics:
+def _dynamics(
+    aba: Aba, q: Array, v: Array, u: Array, inertia: Array | None = None
+) -> Dynamics:
     """Return the accelerations by ABA and their derivatives; `u` is in base axes.
 
     If M (6 + n, 6 + n) in base axes is given as `inertia`, the result contains M^-1 in place of the
@@ -106,7 +108,10 @@ class Route:
     def __init__(self, robot: Robot, lin: LinearModel) -> None:
         self.state = state = StateMap(robot, reference=lin.reference, frame=lin.frame)
         self.aba = Aba(state)
-        self.q, self.v = robot.checked_configuration(lin.q), robot.checked_velocity(lin.v)
+        self.q, self.v = (
+            robot.checked_configuration(lin.q),
+            robot.checked_velocity(lin.v),
+        )
         self.nu = state.velocities(self.v)
         self._u = self.aba.actuation.in_base_axes(state.chart(self.q), lin.u0)
         self._own = ToolCoordinates(state, moving=lin.moving)
@@ -133,13 +138,19 @@ class Route:
         self.samples = [self._by_state(other) for other in others]
         parts = {"omega_b": ANGULAR, "v_b": LINEAR, "qdot_m": slice(6, None)}
         rates = [other.rates[:, None] for other in self.samples]
-        self.rates_error = sampled(parts, dynamics.rates[:, None], rates, self.base_mobility)[:, 0]
+        self.rates_error = sampled(
+            parts, dynamics.rates[:, None], rates, self.base_mobility
+        )[:, 0]
 
     def _by_state(self, dynamics: Dynamics) -> Accelerations:
         by_y = np.hstack((dynamics.by_q, dynamics.by_v)) + dynamics.by_u @ self.at.H
-        return Accelerations(dynamics.rates, by_y @ self.at.left, dynamics.by_u @ self.at.V)
+        return Accelerations(
+            dynamics.rates, by_y @ self.at.left, dynamics.by_u @ self.at.V
+        )
 
-    def _matrices(self, dynamics: Dynamics, others: list[Dynamics], inverse: Array) -> None:
+    def _matrices(
+        self, dynamics: Dynamics, others: list[Dynamics], inverse: Array
+    ) -> None:
         groups = self.state.groups._asdict()
         inputs = self.aba.actuation.groups
         nv = len(self.M)

@@ -173,7 +173,11 @@ def check(robot: Robot, lin: LinearModel, *, tolerance: float | None = None) -> 
 
 
 def check_all(
-    robot: Robot, models: Iterable[LinearModel], title: str = "", *, tolerance: float | None = None
+    robot: Robot,
+    models: Iterable[LinearModel],
+    title: str = "",
+    *,
+    tolerance: float | None = None,
 ) -> Check:
     """Check models; for each comparison, keep only the row with the largest error / tolerance."""
     if tolerance is not None:
@@ -234,7 +238,9 @@ class References:
         route = self.route
         least = ROUTE_TOLERANCE
         yield from self._blocks("ABA derivatives", lin, route.A, route.B, least)
-        yield from self._blocks("differences", lin, *self._differences, DIFFERENCE_TOLERANCE)
+        yield from self._blocks(
+            "differences", lin, *self._differences, DIFFERENCE_TOLERANCE
+        )
         if self._outputs is None:
             of_C = _largest(lin.C - np.eye(len(lin.x0)))
             yield Row("outputs", "y0", _largest(lin.y0 - lin.x0), least)
@@ -272,8 +278,12 @@ class References:
         scaled = scale[:, None] * inverse * scale
         least = float(np.linalg.eigvalsh((scaled + scaled.T) / 2.0)[0])
         root = np.sqrt(M.diagonal())
-        allowed = min(max(ROUTE_TOLERANCE, _ROUTE_ROUNDING * scaled_condition(M)), _LOOSEST)
-        yield worst("inertia", "M", np.abs(lin.M - M) / np.outer(root, root), ROUTE_TOLERANCE)
+        allowed = min(
+            max(ROUTE_TOLERANCE, _ROUTE_ROUNDING * scaled_condition(M)), _LOOSEST
+        )
+        yield worst(
+            "inertia", "M", np.abs(lin.M - M) / np.outer(root, root), ROUTE_TOLERANCE
+        )
         yield Row("inertia", "M M^-1 = I", inertia_residual(M, inverse), allowed)
         yield Row("inertia", "M^-1 symmetric", _largest(scaled - scaled.T), 1e-12)
         yield Row("inertia", "M^-1 positive", max(0.0, -least), 1e-12)

@@ -191,7 +191,8 @@ def equilibrium(
     state = StateMap(robot, frame=frame, reference=reference)
     tilt = truth("tilt", tilt)
     given = robot.neutral() if q is None else robot.checked_configuration(q)
-    if robot.orbit:  # put the reference at the base, so that forces and inputs are in base axes
+    # put the reference at the base, so that forces and inputs are in base axes
+    if robot.orbit:
         base_pose = robot.model.jointPlacements[ROOT] * pin.XYZQUATToSE3(given[:7])
         linearizer = Linearizer(robot, frame=frame, reference=base_pose)
     else:
@@ -241,12 +242,17 @@ def on_orbit(robot: Robot, q: Array, frame: Frame) -> Array:
 
 
 def _with_other_points(
-    linearizer: Linearizer, state: StateMap, balance: _Balance, given: Array, v: Array | None
+    linearizer: Linearizer,
+    state: StateMap,
+    balance: _Balance,
+    given: Array,
+    v: Array | None,
 ) -> _Balance:
     """Return `balance` if it holds, or a balance with accelerating wheels or on the orbit."""
     robot = linearizer.robot
     wheels = balance.lin.wheels
-    attempts = list[tuple[Array, bool]]()  # configuration, and whether the wheels may accelerate
+    # configuration, and whether the wheels may accelerate
+    attempts = list[tuple[Array, bool]]()
     if wheels:
         attempts.append((given, True))
     if robot.orbit and not given[:3].any() and not _pushed(linearizer):
@@ -279,7 +285,12 @@ def _unbalanced(robot: Robot, balance: _Balance) -> EquilibriumError:
 
 
 def _settled(
-    linearizer: Linearizer, state: StateMap, given: Array, v: Array | None, *, spun: bool
+    linearizer: Linearizer,
+    state: StateMap,
+    given: Array,
+    v: Array | None,
+    *,
+    spun: bool,
 ) -> _Balance:
     """Return the balance after joints with a spring but without a motor have deflected.
 
@@ -313,7 +324,9 @@ def _settled(
     return balance
 
 
-def _tilted(linearizer: Linearizer, state: StateMap, start: _Balance, v: Array | None) -> _Balance:
+def _tilted(
+    linearizer: Linearizer, state: StateMap, start: _Balance, v: Array | None
+) -> _Balance:
     """Tilt the base by Gauss-Newton steps until the inputs balance the forces.
 
     Return `start` if no attitude within 90 deg is found.
@@ -323,7 +336,9 @@ def _tilted(linearizer: Linearizer, state: StateMap, start: _Balance, v: Array |
     for _ in range(_MOST_TILTS):
         step = balance.tilt_step()
         # A long step is shortened, because the force changes its sign beyond 90 deg.
-        step *= min(1.0, _LONGEST_TILT / max(float(np.linalg.norm(step)), _LONGEST_TILT))
+        step *= min(
+            1.0, _LONGEST_TILT / max(float(np.linalg.norm(step)), _LONGEST_TILT)
+        )
         q = balance.lin.q.copy()
         rotation = pin.Quaternion(q[3:7]).matrix() @ pin.exp3(step)
         q[3:7] = pin.Quaternion(rotation).coeffs()
@@ -363,7 +378,9 @@ class _Balance:
         if state.field:
             absolute = state.field.absolute(lin.q, lin.v)
         speed = np.abs(state.velocities(absolute))
-        rounding = max(speed[:3].max(), speed[6:].max(initial=0.0)) * (np.abs(M) @ speed)
+        rounding = max(speed[:3].max(), speed[6:].max(initial=0.0)) * (
+            np.abs(M) @ speed
+        )
         farthest = np.abs(state.joint_positions(lin.q)) + np.abs(springs.rest)
         rounding[6:] += springs.stiffness * farthest
         rounding, wanted = _ROUNDING * rounding, -M @ acceleration
@@ -372,7 +389,9 @@ class _Balance:
             noise = terms + rounding
         wanted[np.abs(wanted) <= noise] = 0.0
         if spun:
-            wheels = np.array([6 + robot.joint_names.index(name) for name in lin.wheels])
+            wheels = np.array(
+                [6 + robot.joint_names.index(name) for name in lin.wheels]
+            )
             others = _without_wheels(M, wheels)
             columns, wanted = others @ columns, others @ wanted
             terms, rounding = np.abs(others) @ terms, np.abs(others) @ rounding
@@ -418,7 +437,9 @@ class _Balance:
         beyond = basis[:, rank:].T
         # A (nv, 3) is the derivative of the accelerations with respect to q_b, half the rotation.
         effect = 0.5 * beyond @ self._by_tilt
-        step: Array = np.linalg.lstsq(effect, -beyond @ self.left, rcond=_SMALL_EFFECT)[0]
+        step: Array = np.linalg.lstsq(effect, -beyond @ self.left, rcond=_SMALL_EFFECT)[
+            0
+        ]
         return step
 
 
@@ -448,10 +469,15 @@ def _require_steady(lin: LinearModel, drift: Array) -> None:
     """
     moving = [
         f"{name} at {rate:.3g} {unit}/s"
-        for name, unit, rate in zip(lin.state_names, lin.state_units, drift.tolist(), strict=True)
+        for name, unit, rate in zip(
+            lin.state_names, lin.state_units, drift.tolist(), strict=True
+        )
         if rate and name.startswith("q_m.") and name not in lin.ignorable
     ]
-    orbiting, (turns, moves) = lin.frame in ORBITAL, np.abs(drift[:6]).reshape(2, 3).max(axis=1)
+    orbiting, (turns, moves) = (
+        lin.frame in ORBITAL,
+        np.abs(drift[:6]).reshape(2, 3).max(axis=1),
+    )
     if moving:
         reason = (
             f"joints move ({listed(moving)}), but only rotors may move, which are joints whose "
@@ -467,7 +493,9 @@ def _require_steady(lin: LinearModel, drift: Array) -> None:
         )
     else:
         return
-    raise EquilibriumError(f"the motion of '{lin.robot}' is not steady under any input: {reason}")
+    raise EquilibriumError(
+        f"the motion of '{lin.robot}' is not steady under any input: {reason}"
+    )
 
 
 _EPS = float(np.finfo(float).eps)
@@ -477,7 +505,9 @@ _EPS = float(np.finfo(float).eps)
 TOLERANCE = 1e-9
 
 
-def least_norm(C: Array, d: Array, one_sided: Indices | list[int]) -> tuple[Array, Array]:
+def least_norm(
+    C: Array, d: Array, one_sided: Indices | list[int]
+) -> tuple[Array, Array]:
     """Return the minimum-norm u that minimises ``|C u - d|``, and the residual ``C u - d``.
 
     The constraint is ``u[one_sided] >= 0``.
@@ -491,7 +521,9 @@ def least_norm(C: Array, d: Array, one_sided: Indices | list[int]) -> tuple[Arra
         bounded = nearest(C, d, least, most)
         # Solve again without bounds, and without the one-sided inputs that are zero. The second
         # solution has smaller rounding errors than the bounded solution.
-        pushing = (least < 0.0) | (bounded > TOLERANCE * np.abs(bounded).max(initial=0.0))
+        pushing = (least < 0.0) | (
+            bounded > TOLERANCE * np.abs(bounded).max(initial=0.0)
+        )
         u = np.zeros(len(u))
         u[pushing] = _pseudo_solve(C[:, pushing], d)
         if (u[one_sided] < 0.0).any():
@@ -563,16 +595,17 @@ class RelativeEquilibria(tuple[RelativeEquilibrium, ...]):
         """Show a table with one row for each group of four equivalent attitudes."""
         rows = [["radial", "along", "normal [kg m^2]", "", "growth [1/s]"]]
         for one in self[::4]:
-            stability = {True: "stable", False: "unstable", None: "undecided"}[one.stable]
+            stability = {True: "stable", False: "unstable", None: "undecided"}[
+                one.stable
+            ]
             sizes = [f"{moment:.5g}" for moment in one.moments]
             rate = 0.0
             if one.stable is False:
                 rate = float(one.poles.real.max())
             growth = f"{rate:.4g}" if rate else "."
             rows.append([*sizes, stability, growth])
-        return (
-            f"principal moments of inertia; each row stands for 4 attitudes\n{grid(rows, 'rrrlr')}"
-        )
+        title = "principal moments of inertia; each row stands for 4 attitudes"
+        return f"{title}\n{grid(rows, 'rrrlr')}"
 
 
 def relative_equilibria(
@@ -679,4 +712,6 @@ def relative_equilibria(
         margin = float(min(pitch, c, b, b * b - 4.0 * c) / rounding)
         stable = None if abs(margin) <= 1.0 else margin > 0.0
         equilibria.append(RelativeEquilibrium(at, moments, poles, stable, margin))
-    return RelativeEquilibria(sorted(equilibria, key=lambda one: (-one.margin, *one.moments)))
+    return RelativeEquilibria(
+        sorted(equilibria, key=lambda one: (-one.margin, *one.moments))
+    )

@@ -78,7 +78,9 @@ class ToolModel(StateSpace, Design):
     reference: str
 
 
-def transform(robot: Robot, lin: LinearModel, tool: str, *, dt: float | None = None) -> ToolModel:
+def transform(
+    robot: Robot, lin: LinearModel, tool: str, *, dt: float | None = None
+) -> ToolModel:
     r"""Return a linear model in the coordinates, order and axes of another tool.
 
     The deviations x and u of the linear model become x' = T x and u' = T_u u in the tool's
@@ -137,7 +139,9 @@ def transform(robot: Robot, lin: LinearModel, tool: str, *, dt: float | None = N
     whole = lin.generator
     step = step_of(tool, dt)
     if whole is None or (step and sampled):
-        raise InputError("the model is sampled; transform its continuous-time model instead")
+        raise InputError(
+            "the model is sampled; transform its continuous-time model instead"
+        )
     lin, (kind, source, to, rates) = whole, _jacobians_at(robot, whole, tool)
     A, B = transformed(source, to, lin.A, lin.B)
     (q, v), states = kind.vectors(lin.q, lin.v), kind.states()
@@ -164,12 +168,30 @@ def transform(robot: Robot, lin: LinearModel, tool: str, *, dt: float | None = N
         B, f0 = held[:, :-1], held[:, -1]
     inputs = {kind.actuation.names[i]: kind.actuation.units[i] for i in kind.inputs}
     for signal, units in (("state", states), ("input", inputs), ("output", outputs)):
-        fields |= {f"{signal}_names": tuple(units), f"{signal}_units": tuple(units.values())}
+        fields |= {
+            f"{signal}_names": tuple(units),
+            f"{signal}_units": tuple(units.values()),
+        }
     T_u = np.linalg.solve(to.V, source.V)
     about = "moving" if lin.moving else "fixed"
-    fields |= {"q": q, "v": v, "T": to.P @ source.left, "T_left": source.P @ to.left, "T_u": T_u}
-    fields |= {"A": A, "B": B, "f0": f0, "x0": x0, "u0": T_u @ lin.u0, "dt": step or sampled}
-    return ToolModel(tool=tool, robot=lin.robot, reference=about, verified=lin.verified, **fields)
+    fields |= {
+        "q": q,
+        "v": v,
+        "T": to.P @ source.left,
+        "T_left": source.P @ to.left,
+        "T_u": T_u,
+    }
+    fields |= {
+        "A": A,
+        "B": B,
+        "f0": f0,
+        "x0": x0,
+        "u0": T_u @ lin.u0,
+        "dt": step or sampled,
+    }
+    return ToolModel(
+        tool=tool, robot=lin.robot, reference=about, verified=lin.verified, **fields
+    )
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -273,7 +295,9 @@ def from_tool(
     True
     """
     q, v = tool_coordinates(robot, tool).to_pinocchio(q, v)
-    about = partial(linearize, robot, q, v, frame=frame, reference=reference, moving=moving)
+    about = partial(
+        linearize, robot, q, v, frame=frame, reference=reference, moving=moving
+    )
     lin, step = about(), step_of(tool, dt)
     if u is not None:
         u = vector("u", u, len(lin.u0), "the robot's inputs, as the tool has them")
@@ -289,7 +313,8 @@ def from_tool(
     for name, given, expected in zip("AB", (A, B), ours, strict=True):
         change = expected if given is None else shaped(name, given, expected.shape)
         change = change - expected
-        if step:  # use only the velocity rows, because the position rows follow from them
+        # use only the velocity rows, because the position rows follow from them
+        if step:
             nv = len(change) // 2
             change = np.vstack((0.0 * change[:nv], change[nv:] / step))
         changes.append(change)
@@ -310,7 +335,9 @@ def _jacobians_at(
     """Return a tool's coordinates, the model's and the tool's Jacobians, and dy/dt (15.1)."""
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
     if lin.state_names != state.names:
-        raise InputError("lin lacks some states of the robot; use the full model of the robot")
+        raise InputError(
+            "lin lacks some states of the robot; use the full model of the robot"
+        )
     coordinates = ToolCoordinates(state, moving=lin.moving)
     kind = tool_coordinates(robot, tool, moving=lin.moving)
     nu = state.velocities(lin.v)
@@ -327,7 +354,9 @@ def _jacobians_at(
     )
 
 
-def transformed(source: Jacobians, to: Jacobians, A: Array, B: Array) -> tuple[Array, Array]:
+def transformed(
+    source: Jacobians, to: Jacobians, A: Array, B: Array
+) -> tuple[Array, Array]:
     """Transform A and B by (15.3) to (15.5).
 
     `source` contains the Jacobians of the present coordinates, and `to` contains the Jacobians of
@@ -349,7 +378,9 @@ def step_of(tool: str, dt: float | None) -> float:
     return h
 
 
-def euler_step(A: Array, B: Array, rate: Array, h: float, tool: str) -> tuple[Array, Array, Array]:
+def euler_step(
+    A: Array, B: Array, rate: Array, h: float, tool: str
+) -> tuple[Array, Array, Array]:
     """Return A, B and f0 of a semi-implicit Euler step of h [s] (15.6).
 
     A, B and `rate`, the derivative dx'/dt, are in the coordinates of MuJoCo or Crocoddyl. For the

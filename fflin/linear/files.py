@@ -27,7 +27,13 @@ from fflin.base import record
 from fflin.base.errors import FileError, InputError, listed, located, require_known
 from fflin.base.record import Record, figure, figures, read_record, reading, text, texts
 from fflin.base.validation import as_double, frozen, normalised, vector
-from fflin.base.writing import RECORDS, check_ending, csv_table, read_file, write_atomically
+from fflin.base.writing import (
+    RECORDS,
+    check_ending,
+    csv_table,
+    read_file,
+    write_atomically,
+)
 from fflin.dynamics.coordinates import Frame, frame_of
 from fflin.dynamics.state import Actuation, StateMap
 
@@ -60,7 +66,14 @@ _ARRAYS: dict[str, tuple[str, ...]] = {
 _NAMES = [f"{signal}_{field}" for field in ("names", "units") for signal in _SIGNALS]
 _LISTS = (*_NAMES, "locked", "ignorable", "wheels", "limit_names")
 _OPTIONAL = ("wheels",)  # lists that files of earlier versions lack
-_TEXTS = ("frame", "robot", "urdf_sha256", "fflin_version", "pinocchio_version", "weights")
+_TEXTS = (
+    "frame",
+    "robot",
+    "urdf_sha256",
+    "fflin_version",
+    "pinocchio_version",
+    "weights",
+)
 _FIGURES = ("dt", "moving", "mean_motion")
 
 _MATRICES = [key for key, dimensions in _ARRAYS.items() if len(dimensions) == 2]
@@ -103,19 +116,29 @@ def write_model(path: Path, entries: Record, *, checksummed: bool) -> None:
         body = zip(rows, rest.pop(key).tolist(), strict=True)
         tables[key] = [["", *columns], *([name, *row] for name, row in body)]
     for signal in _SIGNALS:
-        vectors = [key for key, dimensions in _ARRAYS.items() if dimensions == (signal,)]
+        vectors = [
+            key for key, dimensions in _ARRAYS.items() if dimensions == (signal,)
+        ]
         keys = (f"{signal}_names", f"{signal}_units", *vectors)
         columns = [np.asarray(rest.pop(key)).tolist() for key in keys]
         lines = zip(*columns, strict=True)
         tables[f"{signal}s"] = [["name", "unit", *vectors], *map(list, lines)]
     tables["info"] = [["name", "value"]]
     for key, value in rest.items():
-        plain = value if key in (*_TEXTS, *_FIGURES) else json.dumps(np.asarray(value).tolist())
+        plain = (
+            value
+            if key in (*_TEXTS, *_FIGURES)
+            else json.dumps(np.asarray(value).tolist())
+        )
         tables["info"].append([key, plain])
-    write_atomically({_csv_path(path, key): csv_table(rows) for key, rows in tables.items()})
+    write_atomically(
+        {_csv_path(path, key): csv_table(rows) for key, rows in tables.items()}
+    )
 
 
-def read_model(path: Path, certificate: Callable[..., T]) -> tuple[dict[str, object], T]:
+def read_model(
+    path: Path, certificate: Callable[..., T]
+) -> tuple[dict[str, object], T]:
     """Read the fields and the certificate of a model from a file; see `LinearModel.load`."""
     with reading(path, "linear model"):
         entries, verified = read_record(path)
@@ -135,7 +158,9 @@ def read_model(path: Path, certificate: Callable[..., T]) -> tuple[dict[str, obj
             array = np.array(entries[key], dtype=float)
             if not np.isfinite(array).all():
                 raise ValueError(f"{key} has entries that are not finite")
-            fields[key] = frozen(array.reshape([sizes[dimension] for dimension in dimensions]))
+            fields[key] = frozen(
+                array.reshape([sizes[dimension] for dimension in dimensions])
+            )
         fields["weights"] = weights = json.loads(fields["weights"])
         if not isinstance(weights, dict) or not all(
             isinstance(x, dict | str) for x in weights.values()
@@ -171,7 +196,9 @@ def foreign_table(path: Path) -> Path | None:
         return None
     keys = (*_MATRICES, *(f"{signal}s" for signal in _SIGNALS), "info")
     tables = [_csv_path(path, key) for key in keys]
-    return next((table for table in tables if table.is_file() and table.stat().st_size), None)
+    return next(
+        (table for table in tables if table.is_file() and table.stat().st_size), None
+    )
 
 
 def _csv_path(path: Path, key: str) -> Path:
@@ -186,13 +213,17 @@ def write_csv(path: Path, traj: Trajectory) -> None:
     content = csv_table(table)
     if traj.verified:
         digest = record.content_digest({"table": content})
-        content = csv_table([[*names, record.CHECKSUM], *([*row, digest] for row in table[1:])])
+        content = csv_table(
+            [[*names, record.CHECKSUM], *([*row, digest] for row in table[1:])]
+        )
     write_atomically({path: content})
 
 
 def trajectory_columns(traj: Trajectory) -> list[str]:
     """Return the names of the columns t, q, v and u of a trajectory."""
-    columns = [f"{name}[{i}]" for name in "qv" for i in range(getattr(traj, name).shape[1])]
+    columns = [
+        f"{name}[{i}]" for name in "qv" for i in range(getattr(traj, name).shape[1])
+    ]
     return ["t", *columns, *Actuation(StateMap(traj.robot)).names]
 
 
@@ -207,17 +238,23 @@ def write_table(path: Path, names: Sequence[str], rows: Array) -> None:
     write_atomically({path: csv_table([names, *rows.tolist()])})
 
 
-def read(source: Path, robot: Robot, hold: str | None, frame: str | None) -> dict[str, Any]:
+def read(
+    source: Path, robot: Robot, hold: str | None, frame: str | None
+) -> dict[str, Any]:
     """Read the arguments of `Trajectory` from a file; see `Trajectory.load`."""
     check_ending(source, FORMATS)
     with reading(source, "trajectory"):
         table = source.suffix == ".csv"
         if table:
             state = StateMap(robot)
-            entries, verified = _columns(source, {*state.names, *Actuation(state).names})
+            entries, verified = _columns(
+                source, {*state.names, *Actuation(state).names}
+            )
         else:
             entries, verified = read_record(source)
-        if len(entries) == 1 and isinstance(struct := next(iter(entries.values())), dict):
+        if len(entries) == 1 and isinstance(
+            struct := next(iter(entries.values())), dict
+        ):
             entries = struct  # a MATLAB struct
     with located(str(source)):
         if table:
@@ -244,7 +281,9 @@ def arguments(
         )
     t = as_double("t", entries["t"]).ravel()
     pose = as_double("placement", entries.get("placement", [0, 0, 0, 0, 0, 0, 1.0]))
-    pose = vector("placement", pose.ravel(), 7, "a position and a quaternion x, y, z, w")
+    pose = vector(
+        "placement", pose.ravel(), 7, "a position and a quaternion x, y, z, w"
+    )
     quaternion = normalised("the quaternion placement[3:7]", pose[3:])
     reference = pin.XYZQUATToSE3(np.concatenate((pose[:3], quaternion)))
     state = StateMap(robot, reference=reference, frame=frame_of(robot, frame))
@@ -252,12 +291,15 @@ def arguments(
     if u.ndim == 1:
         u = u[:, None]
     if u.ndim != 2:
-        raise InputError(f"u has shape {u.shape}, expected one row of inputs for each knot")
+        raise InputError(
+            f"u has shape {u.shape}, expected one row of inputs for each knot"
+        )
     names = actuation.names
     file_names = texts(entries.get("input_names", actuation.names))
     if names != file_names or u.shape[-1] != len(names):
         lacking, other = (
-            [n for n in a if n not in b] for a, b in ((names, file_names), (file_names, names))
+            [n for n in a if n not in b]
+            for a, b in ((names, file_names), (file_names, names))
         )
         details = ""
         if lacking:
@@ -290,7 +332,9 @@ def _columns(path: Path, known: set[str]) -> tuple[Record, bool]:
 
     Spaces around a cell are removed, except in the names `known`.
     """
-    lines = csv.reader(io.StringIO(read_file(path, ".csv").decode("utf-8-sig"), newline=""))
+    lines = csv.reader(
+        io.StringIO(read_file(path, ".csv").decode("utf-8-sig"), newline="")
+    )
     names, *rows = [line for line in lines if any(line)]
     header = [name if name in known else name.strip() for name in names]
     rows = [[cell.strip() for cell in row] for row in rows]
@@ -298,7 +342,9 @@ def _columns(path: Path, known: set[str]) -> tuple[Record, bool]:
         raise ValueError("two of its columns have the same name")
     for number, row in enumerate(rows, 2):
         if len(row) != len(header):
-            raise ValueError(f"row {number} has {len(row)} cells, the header has {len(header)}")
+            raise ValueError(
+                f"row {number} has {len(row)} cells, the header has {len(header)}"
+            )
     checksummed = header[-1] == record.CHECKSUM
     if checksummed:
         _, *digests = [line.pop() for line in (header, *rows)]
@@ -318,20 +364,26 @@ def _entries(columns: Record, robot: Robot) -> Record:
         )
     state = StateMap(robot)
     inputs = Actuation(state).names
-    rows = {key: [name for name in columns if name.startswith(f"{key}[")] for key in "qv"}
+    rows = {
+        key: [name for name in columns if name.startswith(f"{key}[")] for key in "qv"
+    }
     if not any(rows.values()):
         rows = {"x": list(state.names)}
     rows["t"] = ["t"]
     known = [name for names in rows.values() for name in names]
     require_known("column", known, columns)
     require_known("state or input", columns, (*known, *inputs, "hold", "frame"))
-    entries: Record = {key: columns[key][0] for key in ("hold", "frame") if key in columns}
+    entries: Record = {
+        key: columns[key][0] for key in ("hold", "frame") if key in columns
+    }
     acting = [name for name in inputs if name in columns]
     # If inputs are constant between knots, the last row may lack inputs, because no input acts
     # after the last knot.
     short = bool(acting) and not any(columns[name][-1] for name in acting)
     for key, names in rows.items():
-        entries[key] = np.column_stack([_numbers(name, columns[name]) for name in names])
+        entries[key] = np.column_stack(
+            [_numbers(name, columns[name]) for name in names]
+        )
     u = np.zeros((len(columns["t"]) - short, len(inputs)))
     for name in acting:
         u[:, inputs.index(name)] = _numbers(name, columns[name][: len(u)])

@@ -36,7 +36,12 @@ def about_point(lin: object) -> LinearModel:
 
 
 def require_fit(
-    lin: LinearModel, robot: Robot, state: StateMap, *, whole: bool = False, sensed: bool = False
+    lin: LinearModel,
+    robot: Robot,
+    state: StateMap,
+    *,
+    whole: bool = False,
+    sensed: bool = False,
 ) -> None:
     """Raise `InputError` if a model does not have the states and inputs of the robot.
 
@@ -62,7 +67,13 @@ def signals_of(state: StateMap, kind: str) -> Signals:
 
 
 def require_same(
-    made: str, state: StateMap, kind: str, names: Names, units: Names | None, *, part: bool = False
+    made: str,
+    state: StateMap,
+    kind: str,
+    names: Names,
+    units: Names | None,
+    *,
+    part: bool = False,
 ) -> None:
     """Raise `InputError` if the robot's signals do not have the given names and units.
 
@@ -77,7 +88,9 @@ def require_same(
     if names == tuple(others) and units in (None, tuple(others.values())):
         return
     mine = dict(zip(names, units or map(others.get, names), strict=True))
-    lacking = [n for n in mine if n not in others] or [n for n in others if n not in mine]
+    lacking = [n for n in mine if n not in others] or [
+        n for n in others if n not in mine
+    ]
     changed = [name for name in mine if mine[name] != others.get(name)]
     if lacking:
         verb = "lacks" if lacking[0] in mine else "also has"
@@ -109,7 +122,11 @@ def require_turns(made: str, size: int, robot: Robot) -> None:
 
 
 def outputs(
-    robot: Robot, lin: LinearModel, q: Array, v: Array | None = None, u: Array | None = None
+    robot: Robot,
+    lin: LinearModel,
+    q: Array,
+    v: Array | None = None,
+    u: Array | None = None,
 ) -> Array:
     """Return the outputs y of a robot in the coordinates of a linear model.
 
@@ -200,7 +217,9 @@ def line_up(gain: Gain | GainBatch, lin: LinearModel) -> Array:
     (8, 16)
     """
     if not hasattr(gain, "K") or not hasattr(gain, "state_names"):
-        raise InputError(f"gain has type {type(gain).__name__}, expected a Gain or GainBatch")
+        raise InputError(
+            f"gain has type {type(gain).__name__}, expected a Gain or GainBatch"
+        )
     instance("lin", lin, LinearModel, "a fflin.LinearModel")
     for key in ("frame", "dt"):
         gain_value, model_value = getattr(gain, key, lin.dt), getattr(lin, key)
@@ -211,7 +230,10 @@ def line_up(gain: Gain | GainBatch, lin: LinearModel) -> Array:
             )
     selections = []
     for kind in ("input", "state"):
-        gain_names, model_names = getattr(gain, f"{kind}_names"), getattr(lin, f"{kind}_names")
+        gain_names, model_names = (
+            getattr(gain, f"{kind}_names"),
+            getattr(lin, f"{kind}_names"),
+        )
         lacking, beside = (
             [n for n in gain_names if n not in model_names],
             [n for n in model_names if n not in gain_names],
@@ -222,6 +244,8 @@ def line_up(gain: Gain | GainBatch, lin: LinearModel) -> Array:
                 f"'{gain.robot}', and the gain lacks the {kind} {beside[0]} of the model; either "
                 f"the model or the gain must have all {kind}s of the other"
             )
-        selections.append(np.array([[float(a == b) for b in gain_names] for a in model_names]))
+        selections.append(
+            np.array([[float(a == b) for b in gain_names] for a in model_names])
+        )
     of_inputs, of_states = selections
     return np.asarray(of_inputs @ gain.K @ of_states.T)

@@ -54,8 +54,12 @@ def held(lin: LinearModel) -> LinearModel:
     reference = None
     if robot.orbit or source.x0[:6].any():
         reference = source.reference
-    balanced = equilibrium(robot, source.q, v=source.v, frame=frame, reference=reference)
-    model = linearize(robot, balanced.q, source.v, balanced.u, frame=frame, reference=reference)
+    balanced = equilibrium(
+        robot, source.q, v=source.v, frame=frame, reference=reference
+    )
+    model = linearize(
+        robot, balanced.q, source.v, balanced.u, frame=frame, reference=reference
+    )
     if lin.dt:
         return model.discretize(lin.dt)
     return model
@@ -83,7 +87,8 @@ def momentum_rate(lin: LinearModel) -> Vector:
     massless = [
         i
         for i, key in enumerate(keys)
-        if group_of(key) == "wheel" and f"qdot_m.{lin.input_names[i]}" not in lin.state_names
+        if group_of(key) == "wheel"
+        and f"qdot_m.{lin.input_names[i]}" not in lin.state_names
     ]
     forces = lin.M @ lin.B[nv:, massless] @ lin.u0[massless]
     return rate - forces[:3]
@@ -107,7 +112,9 @@ def wheel_notes(lin: LinearModel) -> tuple[str, ...]:
     if not n:
         return (f"{head}, and gain as much momentum [N m s] in each second",)
     vector = lin.x0[:3]  # of the quaternion of the base relative to the reference
-    turn = pin.Quaternion(np.sqrt(1.0 - float(vector @ vector)), *vector.tolist()).matrix()
+    turn = pin.Quaternion(
+        np.sqrt(1.0 - float(vector @ vector)), *vector.tolist()
+    ).matrix()
     normal = (lin.reference.rotation @ turn).T @ np.array(_NORMAL[lin.frame])
     parts = float(rate @ normal) * normal, rate - float(rate @ normal) * normal
     along, across = (float(np.linalg.norm(part)) for part in parts)

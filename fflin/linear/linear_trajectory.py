@@ -130,7 +130,9 @@ class LinearTrajectory(Trajectory):
         (k,), (fraction,) = intervals_of(self.t, np.array([self._within(t)]))
         if self.dt or not fraction:
             return tuple(array[k] for array in arrays)
-        return tuple(array[k] + fraction * (array[k + 1] - array[k]) for array in arrays)
+        return tuple(
+            array[k] + fraction * (array[k + 1] - array[k]) for array in arrays
+        )
 
     def check(self, *, tolerance: float | None = None) -> Check:
         """Check the linear model at every knot by `fflin.check`, and return the largest errors.
@@ -291,7 +293,8 @@ class Steps(NamedTuple):
     F: Array  # (m, nx + nu, nx + nu)
     h: Array  # (m,) [s] lengths of the steps
     maps: Array  # (m, nx, nx + nu) transition matrices of the steps
-    nodes: Array  # (m, 2) [s] the two Gauss points; the first has the larger weight in F
+    # (m, 2) [s] the two Gauss points; the first has the larger weight in F
+    nodes: Array
 
 
 def transitions(traj: LinearTrajectory, dt: float) -> Iterator[tuple[Steps, Array]]:
@@ -320,7 +323,9 @@ def knot_transitions(traj: LinearTrajectory) -> Iterator[tuple[Steps, Array]]:
     yield from _accurate(traj, [np.array(ends) for ends in pairwise(traj.t.tolist())])
 
 
-def _accurate(traj: LinearTrajectory, cuts: list[Array]) -> Iterator[tuple[Steps, Array]]:
+def _accurate(
+    traj: LinearTrajectory, cuts: list[Array]
+) -> Iterator[tuple[Steps, Array]]:
     """Yield the steps and the transition matrix of each sample, for the samples of `_through`."""
     for first in range(0, len(cuts), _BATCH):
         batch = cuts[first : first + _BATCH]
@@ -342,7 +347,9 @@ def _accurate(traj: LinearTrajectory, cuts: list[Array]) -> Iterator[tuple[Steps
         yield from samples
 
 
-def _through(traj: LinearTrajectory, cuts: list[Array], parts: int) -> list[tuple[Steps, Array]]:
+def _through(
+    traj: LinearTrajectory, cuts: list[Array], parts: int
+) -> list[tuple[Steps, Array]]:
     """Return the steps and the transition matrix of each sample; see `transitions`.
 
     Each array in `cuts` contains the times of one sample: the start, the knots within the sample,
@@ -356,11 +363,15 @@ def _through(traj: LinearTrajectory, cuts: list[Array], parts: int) -> list[tupl
     A, B = traj.matrices_at(nodes.ravel())
     nx, nu = B.shape[1:]
     F = np.zeros((len(h), 2, nx + nu, nx + nu))
-    F[..., :nx, :nx], F[..., :nx, nx:] = (x.reshape(len(h), 2, *x.shape[1:]) for x in (A, B))
+    F[..., :nx, :nx], F[..., :nx, nx:] = (
+        x.reshape(len(h), 2, *x.shape[1:]) for x in (A, B)
+    )
     mixed = (HEAVY * F + LIGHT * F[:, ::-1]).reshape(-1, nx + nu, nx + nu)
     h = np.repeat(0.5 * h, 2)
     heavy_light = np.stack((nodes, nodes[:, ::-1]), axis=2).reshape(-1, 2)
-    maps = np.concatenate(held_exponential(mixed[:, :nx, :nx], mixed[:, :nx, nx:], h), axis=-1)
+    maps = np.concatenate(
+        held_exponential(mixed[:, :nx, :nx], mixed[:, :nx, nx:], h), axis=-1
+    )
     ends = np.cumsum([2 * len(times) for times in start])[:-1]
     columns = [np.split(array, ends) for array in (mixed, h, maps, heavy_light)]
     samples = list[tuple[Steps, Array]]()

@@ -58,7 +58,12 @@ class Prepared:
     """
 
     def __init__(
-        self, robot: Robot, *, frame: Frame | None, reference: pin.SE3 | None, moving: bool
+        self,
+        robot: Robot,
+        *,
+        frame: Frame | None,
+        reference: pin.SE3 | None,
+        moving: bool,
     ) -> None:
         self.robot = robot
         self.moving = truth("moving", moving)
@@ -78,8 +83,15 @@ class Prepared:
         self.actuation = Actuation(state)
         self.sensing: Sensing | None = None
         if robot.outputs != (FullState(),):
-            self.sensing = Sensing(state, robot.outputs, own_reference=self.own_reference)
-        acts = robot.orbit or any(robot.gravity) or robot.stored_momentum or np.any(robot.springs)
+            self.sensing = Sensing(
+                state, robot.outputs, own_reference=self.own_reference
+            )
+        acts = (
+            robot.orbit
+            or any(robot.gravity)
+            or robot.stored_momentum
+            or np.any(robot.springs)
+        )
         self.free = self.sensing is None and not moving and not acts
         nx = state.nx
         nv = state.nx // 2
@@ -106,7 +118,11 @@ class Prepared:
         }
         if not self.own_reference:
             self.common["placement"] = frozen(pin.SE3ToXYZQUAT(state.reference))
-        signals = ("state", state), ("input", self.actuation), ("output", self.sensing or state)
+        signals = (
+            ("state", state),
+            ("input", self.actuation),
+            ("output", self.sensing or state),
+        )
         for signal, source in signals:
             self.common[f"{signal}_names"], self.common[f"{signal}_units"] = (
                 source.names,
@@ -129,7 +145,9 @@ class Prepared:
         if not self.own_reference:
             chart = state.chart(q)
             r_b = state.positions(q)
-        return frozen(state.compose(chart, r_b, state.joint_positions(q), state.velocities(lin.v)))
+        return frozen(
+            state.compose(chart, r_b, state.joint_positions(q), state.velocities(lin.v))
+        )
 
 
 def own_reference(robot: Robot, lin: LinearModel) -> Array:
@@ -245,7 +263,9 @@ class Linearizer:
         reference: pin.SE3 | None = None,
         moving: bool = False,
     ) -> None:
-        self.prepared = ready = Prepared(robot, frame=frame, reference=reference, moving=moving)
+        self.prepared = ready = Prepared(
+            robot, frame=frame, reference=reference, moving=moving
+        )
         self.robot = robot
         self._data = robot.create_data()
         self._lock = Lock()  # protects the work space
@@ -277,7 +297,11 @@ class Linearizer:
         known = v is None and u is None and self._known
         still_v, still_u = self._still
         v = still_v if v is None else robot.checked_velocity(v).copy()
-        u = still_u if u is None else vector("u", u, len(still_u), "the robot's inputs").copy()
+        u = (
+            still_u
+            if u is None
+            else vector("u", u, len(still_u), "the robot's inputs").copy()
+        )
         with self._lock:
             if known:
                 B = np.zeros(self._shape_B)
@@ -300,13 +324,17 @@ class Linearizer:
             if not actuation.default:
                 # Place the base in its neutral pose at the origin to avoid rounding errors. The
                 # result is the same, because B_u in base axes does not depend on the base pose.
-                np.matmul(inverse, actuation.columns(self._data, inertia.centred(q)), out=out)
+                np.matmul(
+                    inverse, actuation.columns(self._data, inertia.centred(q)), out=out
+                )
 
     def __reduce__(self) -> tuple[partial[Linearizer], tuple[Robot]]:
         # The work space cannot be shared, so copies and pickles are built by the constructor.
         state, moving = self.prepared.map, self.prepared.moving
         reference = None if self.prepared.own_reference else state.reference
-        make = partial(type(self), frame=state.frame, reference=reference, moving=moving)
+        make = partial(
+            type(self), frame=state.frame, reference=reference, moving=moving
+        )
         return make, (self.robot,)
 
     def _anywhere(self, q: Array, v: Array, u: Array) -> LinearModel:
@@ -324,7 +352,9 @@ class Linearizer:
                 r_b = state.positions(q)
             x0 = state.compose(chart, r_b, state.joint_positions(q), nu)
             point = q, v, nu, u_base
-            seen = output_equations(ready.sensing, actuation, self._data, chart, rates, x0, point)
+            seen = output_equations(
+                ready.sensing, actuation, self._data, chart, rates, x0, point
+            )
             _require_finite(*seen.values())
         rate = assemble(actuation, chart, nu, u_base, rates, A, moving=ready.moving)
         _require_finite(A, B, rate)
@@ -346,7 +376,10 @@ class Linearizer:
         state, actuation, sensing = ready.map, ready.actuation, ready.sensing
         chart, nu = Standing(count), state.velocities(v)
         x0 = state.compose(chart, chart.q_b, state.joint_positions(q), nu)
-        A, B = np.tile(ready.rest["A"], (count, 1, 1)), np.zeros((count, *self._shape_B))
+        A, B = (
+            np.tile(ready.rest["A"], (count, 1, 1)),
+            np.zeros((count, *self._shape_B)),
+        )
         c = np.empty_like(nu)
         gravity = np.empty((count, 3))
         seen = []
@@ -356,14 +389,21 @@ class Linearizer:
                 c[k], gravity[k] = rates.c, rates.gravity
                 if sensing is not None:
                     measured_point = _STANDING, rates, x0[k], point
-                    seen.append(output_equations(sensing, actuation, self._data, *measured_point))
+                    seen.append(
+                        output_equations(
+                            sensing, actuation, self._data, *measured_point
+                        )
+                    )
         all_rates = AccelerationDerivatives(c, A[:, lower], B[:, lower], gravity)
         f0 = assemble(actuation, chart, nu, u, all_rates, A, moving=ready.moving)
         if sensing is None:
             C, D = (np.tile(ready.common[key], (count, 1, 1)) for key in "CD")
             y = x0
         else:
-            C, D, y = (np.array([equations[key] for equations in seen]) for key in ("C", "D", "y0"))
+            C, D, y = (
+                np.array([equations[key] for equations in seen])
+                for key in ("C", "D", "y0")
+            )
         for arrays in zip(A, B, C, D, f0, y, strict=True):
             _require_finite(*arrays)
         return {"A": A, "B": B, "C": C, "D": D, "y": y}

@@ -14,7 +14,15 @@ import pinocchio as pin
 
 from fflin.base.errors import InputError, optional_package
 from fflin.base.names import input_keys, undotted
-from fflin.base.validation import Array, ArrayLike, Result, Vector, frozen, number, positive
+from fflin.base.validation import (
+    Array,
+    ArrayLike,
+    Result,
+    Vector,
+    frozen,
+    number,
+    positive,
+)
 from fflin.base.writing import as_path
 from fflin.dynamics.integrators import held_exponential
 
@@ -203,7 +211,9 @@ class LinearModel(ModelHeader, StateSpace):
     _robot: Robot | None = None  # robot of the model; None for a model from a file
     mean_motion: float = 0.0
 
-    def __init__(self, shared: Mapping[str, object] | None = None, /, **fields: object) -> None:
+    def __init__(
+        self, shared: Mapping[str, object] | None = None, /, **fields: object
+    ) -> None:
         # The generated `__init__` of a frozen dataclass would set three dozen fields one by one,
         # which takes as long as the dynamics of a small robot. So this method sets all fields at
         # once. The arrays in `shared` must be read-only, because they are not copied.
@@ -351,7 +361,9 @@ class LinearModel(ModelHeader, StateSpace):
             small accelerations.
         """
         judged = [name not in self.ignorable for name in self.state_names]
-        return bool(np.abs(self.rate[judged]).max(initial=0.0) <= self.bound(number("tol", tol)))
+        return bool(
+            np.abs(self.rate[judged]).max(initial=0.0) <= self.bound(number("tol", tol))
+        )
 
     def bound(self, tol: float) -> float:
         """Return the largest rate at an equilibrium: `tol`, or `tol` times mean motion in orbit."""
@@ -443,7 +455,9 @@ class LinearModel(ModelHeader, StateSpace):
         """
         self.require_unchanged()
         matrices = (self.A, self.B, self.C, self.D)
-        return state_space(matrices, self.dt, self.state_names, self.input_names, self.output_names)
+        return state_space(
+            matrices, self.dt, self.state_names, self.input_names, self.output_names
+        )
 
     def save(self, path: str | Path) -> None:
         """Write the model and its certificate to a file, atomically.
@@ -482,11 +496,15 @@ class LinearModel(ModelHeader, StateSpace):
         return replace(lin, _source=(lin.fingerprint, lin))
 
 
-def state_space(matrices: Sequence[ArrayLike], dt: float, *signals: Sequence[str]) -> ControlSystem:
+def state_space(
+    matrices: Sequence[ArrayLike], dt: float, *signals: Sequence[str]
+) -> ControlSystem:
     """Return a `control.StateSpace` with the matrices A, B, C, D and the names of all signals."""
     control = optional_package("control", "to_control needs python-control", "control")
     kinds = ("states", "inputs", "outputs")
-    states, inputs, outputs = (_labels(*group) for group in zip(kinds, signals, strict=True))
+    states, inputs, outputs = (
+        _labels(*group) for group in zip(kinds, signals, strict=True)
+    )
     return control.ss(*matrices, dt, states=states, inputs=inputs, outputs=outputs)
 
 

@@ -29,7 +29,9 @@ class Nonlinear:
     case, f is 0 at the operating point.
     """
 
-    def __init__(self, aba: Aba, lin: LinearModel, state: StateMap | None = None) -> None:
+    def __init__(
+        self, aba: Aba, lin: LinearModel, state: StateMap | None = None
+    ) -> None:
         self._aba, self._lin = aba, lin
         self.state = state or aba.state
         # Without an orbit, ABA receives velocities relative to an observer. The observer moves with
@@ -42,7 +44,9 @@ class Nonlinear:
         self._v: Array = np.zeros((1, aba.state.robot.nv))
         self._a: Array = np.zeros_like(self._v)
         if lin.moving:
-            _, _, self._v, self._a = self.accelerations(np.concatenate((lin.x0, lin.u0))[None])
+            _, _, self._v, self._a = self.accelerations(
+                np.concatenate((lin.x0, lin.u0))[None]
+            )
 
     def accelerations(self, point: Array) -> tuple[Chart, Array, Array, Array]:
         """Return the charts, q, v and dv/dt for rows (N, nx + nu) of states and inputs.
@@ -54,7 +58,9 @@ class Nonlinear:
         observer = self._observer @ rotation_matrices(q[:, 3:7])
         relative = v.copy()
         relative[:, PIN_LINEAR] -= observer
-        a = self._aba.accelerations(q, relative, self._aba.actuation.in_base_axes(chart, u))
+        a = self._aba.accelerations(
+            q, relative, self._aba.actuation.in_base_axes(chart, u)
+        )
         a[:, PIN_LINEAR] -= np.cross(v[:, PIN_ANGULAR], observer)
         return chart, q, v, a
 
@@ -75,7 +81,9 @@ class Nonlinear:
             # `rate` contains the time derivative of the components of v in base axes, which rotate.
             # Add w x v to obtain the time derivative of v relative to the reference axes.
             rate[:, LINEAR] += np.cross(angular, linear)
-        rate = state.to_frame(chart, rate[..., None])[..., 0] - state.velocities(self._a)
+        rate = state.to_frame(chart, rate[..., None])[..., 0] - state.velocities(
+            self._a
+        )
         joint_rates = state.velocities(v - self._v)[:, 6:]
         return np.concatenate((0.5 * turning, position_rate, joint_rates, rate), axis=1)
 
@@ -97,11 +105,15 @@ class Nonlinear:
         t = h * np.repeat((1.0, 2.0, 3.0, -1.0, -2.0, -3.0), 7)[:, None]
         speeds = np.tile(v, (6, 1))
         moved = integrate_rows(robot.model, np.tile(q, (6, 1)), t * speeds)
-        after = coordinates.state_history(state, moved, speeds + t * np.tile(a, (6, 1)), x[0])
+        after = coordinates.state_history(
+            state, moved, speeds + t * np.tile(a, (6, 1)), x[0]
+        )
         # The rates of a moving reference cancel in the errors, but not their rounding errors.
         rounding = ULPS * EPS * np.abs(after).reshape(6, *x.shape).max(axis=0) / h
         if lin.moving:  # the first row is also the motion of the reference
-            after = coordinates.moving_errors("local", after, np.repeat(after[::7], 7, axis=0))
+            after = coordinates.moving_errors(
+                "local", after, np.repeat(after[::7], 7, axis=0)
+            )
         ahead, behind = after.reshape(2, 3, *x.shape)
         rates = np.tensordot(_WEIGHTS, ahead - behind, axes=1) / h
         size = np.maximum(1.0 + np.abs(v).max(axis=1), np.abs(expected).max(axis=1))
@@ -134,7 +146,9 @@ def jacobians(
     return jacobian(f, point, steps, is_curved), again
 
 
-def jacobian(f: Callable[[Array], Array], point: Array, steps: Array, is_curved: Mask) -> Array:
+def jacobian(
+    f: Callable[[Array], Array], point: Array, steps: Array, is_curved: Mask
+) -> Array:
     """Return the Jacobian of f at a point, computed by central differences with the given steps.
 
     f maps rows of points to rows of values. The mask `is_curved` selects the variables for which

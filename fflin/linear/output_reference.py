@@ -45,7 +45,9 @@ class OutputReference:
     `steps` (nx,) are the steps of the finite differences.
     """
 
-    def __init__(self, model: Nonlinear, route: Route, lin: LinearModel, steps: Array) -> None:
+    def __init__(
+        self, model: Nonlinear, route: Route, lin: LinearModel, steps: Array
+    ) -> None:
         self._route, self._lin = route, lin
         self._measuring = Measuring(route.state, lin.q)
         self._bodies = _Bodies(route.state, lin.q[:3])
@@ -64,13 +66,19 @@ class OutputReference:
             return sampled(self._vectors, x, others, ones)
 
         halves = {"positions": slice(nv), "velocities": slice(nv, 2 * nv)}
-        scale = self._scale(C, np.abs(by_x) + size @ np.abs(at.by_x), halves, route.units)
-        rounding += sampled_errors(C, [by_x + by_a @ other.by_x for other in route.samples])
+        scale = self._scale(
+            C, np.abs(by_x) + size @ np.abs(at.by_x), halves, route.units
+        )
+        rounding += sampled_errors(
+            C, [by_x + by_a @ other.by_x for other in route.samples]
+        )
         self.C = Reference(C, scale, rounding)
         inputs = route.aba.actuation.groups
         units = 1.0 / route.input_mobility
         scale = self._scale(D, size @ np.abs(at.by_u), inputs, units)
-        self.D = Reference(D, scale, sampled_errors(D, [by_a @ x.by_u for x in route.samples]))
+        self.D = Reference(
+            D, scale, sampled_errors(D, [by_a @ x.by_u for x in route.samples])
+        )
         rates = np.abs(route.state.velocities(self._a))
         terms = (sizes + size @ rates)[:, None]
         scale = self._scale(y0, terms, {"y0": slice(1)}, np.ones(1))
@@ -92,7 +100,9 @@ class OutputReference:
         ):
             errors = reference.errors(given, ROUTE_TOLERANCE)
             for word, rows in self._kinds.items():
-                yield worst("outputs", f"{name} ({word})", errors[rows], ROUTE_TOLERANCE)
+                yield worst(
+                    "outputs", f"{name} ({word})", errors[rows], ROUTE_TOLERANCE
+                )
 
     def _kinematics(self, steps: Array) -> tuple[Array, Array, Array]:
         """Return dh/dx, its rounding errors, and the magnitudes (ny,) of the terms of h."""
@@ -130,11 +140,17 @@ class OutputReference:
         least = {"rad": 1.0, "1": 1.0, "m": reach}
         moved = np.abs(by_x) * np.abs(x)
         whole = np.abs(h) + moved.sum(axis=1)
-        sizes = np.column_stack((whole, np.abs(unaccelerated) + moved[:, nv:].sum(axis=1)))
-        sizes[:ny] += np.array([least.get(unit, 0.0) for unit in lin.output_units])[:, None]
+        sizes = np.column_stack(
+            (whole, np.abs(unaccelerated) + moved[:, nv:].sum(axis=1))
+        )
+        sizes[:ny] += np.array([least.get(unit, 0.0) for unit in lin.output_units])[
+            :, None
+        ]
         sizes = spread_over(vectors, sizes, ones)
         # The differences of a vector that does not depend on a variable are exactly zero.
-        depends = spread_over(vectors, np.abs(by_x) + np.abs(again).max(axis=0), ones) > 0.0
+        depends = (
+            spread_over(vectors, np.abs(by_x) + np.abs(again).max(axis=0), ones) > 0.0
+        )
         # But the model itself may have rounding errors of the size of h per radian, unless nothing
         # that the joint moves is measured.
         per_unit = np.zeros(by_x.shape)
@@ -167,7 +183,9 @@ class OutputReference:
         state, lin, v = self._route.state, self._lin, self._route.v
         # The steps are as large as the accelerations, so that rounding errors of h are small.
         units = self._route.base_mobility
-        units = units * max(1.0, float((np.abs(self._route.accelerations.rates) / units).max()))
+        units = units * max(
+            1.0, float((np.abs(self._route.accelerations.rates) / units).max())
+        )
         by_a: Array = np.zeros((len(lin.y0), len(units)))
         if not any(output.FEELS_ACCELERATION for output in state.robot.outputs):
             return by_a
@@ -214,7 +232,9 @@ class _Bodies:
             np.array([body.inertia for body in bodies]),
             stored,
         )
-        self._summed = any(output.WORD in ("com", "momentum") for output in robot.outputs)
+        self._summed = any(
+            output.WORD in ("com", "momentum") for output in robot.outputs
+        )
 
     def __call__(self, measuring: Measuring) -> Array:
         """Return the contributions at the point that `measuring` evaluated last."""
@@ -232,7 +252,9 @@ class _Bodies:
         angular = (R @ spin[..., None])[..., 0] + np.cross(center, momentum)
         return np.hstack((body.mass / self._total * center, momentum, angular)).ravel()
 
-    def sums(self, h: Array, ny: int, kinds: dict[str, list[int]], reference: Array) -> Array:
+    def sums(
+        self, h: Array, ny: int, kinds: dict[str, list[int]], reference: Array
+    ) -> Array:
         """Return the matrix (ny, ..) that sums the contributions of the bodies.
 
         `h` contains the outputs (ny,) and the contributions at the operating point. The matrix maps
@@ -267,7 +289,9 @@ def _moved_by(state: StateMap, count: int) -> Mask:
     robot = state.robot
     model = robot.model
     names = model.names.tolist()
-    leaders = {follower.joint.name: follower.leader.name for follower in robot.followers}
+    leaders = {
+        follower.joint.name: follower.leader.name for follower in robot.followers
+    }
 
     def movers(carrier: int) -> list[bool]:
         support = [names[joint] for joint in model.supports[carrier].tolist()]

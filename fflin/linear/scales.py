@@ -113,7 +113,9 @@ def scales(
     return np.where(sizes > least, sizes, np.where(largest > least, largest, unit))
 
 
-def sampled(rows: Blocks, value: Array, others: Sequence[Array], row_units: Array) -> Array:
+def sampled(
+    rows: Blocks, value: Array, others: Sequence[Array], row_units: Array
+) -> Array:
     """Bound the rounding errors of a matrix that was computed several times.
 
     The bound of an entry is a multiple of the largest difference between the computations in the

@@ -41,7 +41,8 @@ def assemble(
     w, v = nu[..., ANGULAR], nu[..., LINEAR]
     W = skew(w)
     position_rate = chart.turned(v[..., None])[..., 0]
-    f0 = np.concatenate((chart.rate(w), position_rate, nu[..., 6:], rates.c), -1)  # (4.8)
+    # (4.8)
+    f0 = np.concatenate((chart.rate(w), position_rate, nu[..., 6:], rates.c), -1)
 
     theta = _over_rotations(actuation, chart, u, rates, W)
     lower[..., g.q_b] = chart.over_q_b(theta)
@@ -59,7 +60,8 @@ def assemble(
         A[..., g.q_b, g.q_b] = by_q_b  # (4.2)
     if not chart.standing:
         # Q R^T = Q^T.
-        A[..., g.q_b, g.omega_b] = chart.N.mT if omega_in_reference else chart.N  # (4.1)
+        # (4.1)
+        A[..., g.q_b, g.omega_b] = chart.N.mT if omega_in_reference else chart.N
         if not v_in_reference:
             A[..., g.r_b, g.v_b] = chart.R
 
@@ -94,7 +96,11 @@ def assemble(
 
 
 def _over_rotations(
-    actuation: Actuation, chart: Chart, u: Array, rates: AccelerationDerivatives, W: Array
+    actuation: Actuation,
+    chart: Chart,
+    u: Array,
+    rates: AccelerationDerivatives,
+    W: Array,
 ) -> Array:
     """Return the derivative of the accelerations with respect to base rotations (4.4).
 

@@ -7,9 +7,20 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import ChartError, InputError, unknown
-from fflin.base.rotation import product_matrix, quaternion_product, rotation_matrix, skew
+from fflin.base.rotation import (
+    product_matrix,
+    quaternion_product,
+    rotation_matrix,
+    skew,
+)
 from fflin.base.validation import Array, ArrayLike, normalised, placement, vector
-from fflin.dynamics.coordinates import ANGULAR, IN_REFERENCE_AXES, LINEAR, SMALLEST_Q0, refuse_orbit
+from fflin.dynamics.coordinates import (
+    ANGULAR,
+    IN_REFERENCE_AXES,
+    LINEAR,
+    SMALLEST_Q0,
+    refuse_orbit,
+)
 from fflin.dynamics.state import Actuation, StateMap
 from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
@@ -18,7 +29,10 @@ from fflin.robot.robot import Robot
 # lost by rounding in every sum. So the derivatives are exact to machine precision.
 _STEP = 1e-20j
 
-_NAMES = {"wxyz": ["quat.w", "quat.x", "quat.y", "quat.z"], "euler": ["roll", "pitch", "yaw"]}
+_NAMES = {
+    "wxyz": ["quat.w", "quat.x", "quat.y", "quat.z"],
+    "euler": ["roll", "pitch", "yaw"],
+}
 _UNITS = {"quat": "1", "p": "m", "v": "m/s"}  # all others have rad or rad/s
 
 
@@ -33,8 +47,10 @@ class Convention(NamedTuple):
     # First flag: whether omega and the base torque are in world axes. Second flag: whether v and
     # the base force are in world axes.
     axes: tuple[bool, bool]
-    at_centre: bool = False  # whether the base frame is the root link's inertial frame (`_centre`)
-    rates: bool = False  # whether the twist contains the rates of the Euler angles, not omega
+    # whether the base frame is the root link's inertial frame (`_centre`)
+    at_centre: bool = False
+    # whether the twist contains the rates of the Euler angles, not omega
+    rates: bool = False
 
 
 TOOLS = {
@@ -42,9 +58,13 @@ TOOLS = {
     "mujoco": Convention("tangent", "wxyz", False, IN_REFERENCE_AXES["hybrid"]),
     "pinocchio": Convention("pose", "xyzw", False, IN_REFERENCE_AXES["local"]),
     "crocoddyl": Convention("pose", "xyzw", False, IN_REFERENCE_AXES["local"]),
-    "spart": Convention("tangent", "matrix", True, IN_REFERENCE_AXES["hybrid"], at_centre=True),
+    "spart": Convention(
+        "tangent", "matrix", True, IN_REFERENCE_AXES["hybrid"], at_centre=True
+    ),
     "euler": Convention("euler", "euler", True, IN_REFERENCE_AXES["hybrid"]),
-    "euler_rates": Convention("euler", "euler", True, IN_REFERENCE_AXES["hybrid"], rates=True),
+    "euler_rates": Convention(
+        "euler", "euler", True, IN_REFERENCE_AXES["hybrid"], rates=True
+    ),
 }
 
 
@@ -63,13 +83,16 @@ class Jacobians(NamedTuple):
     left: Array  # left inverse of P
     V: Array  # du/du'
     H: Array  # du/dy for constant u' (15.4)
-    extra: Array  # term dn/dt n^T of (15.5) for the length of a quaternion; zero without quaternion
+    # term dn/dt n^T of (15.5) for the length of a quaternion; zero without quaternion
+    extra: Array
 
 
 class ToolCoordinates:
     """Coordinates of a tool, or of fflin's own models, relative to a `StateMap`'s reference."""
 
-    def __init__(self, state: StateMap, tool: str = "", *, moving: bool = False) -> None:
+    def __init__(
+        self, state: StateMap, tool: str = "", *, moving: bool = False
+    ) -> None:
         robot = state.robot
         is_fflin = not tool
         kind = TOOLS[tool] if tool else Convention("q_b", "xyzw", True, state.axes)
@@ -79,7 +102,8 @@ class ToolCoordinates:
         self._roll = 0 if kind.angular_first else 3
         self._world = np.repeat(kind.axes, 3)[:, None]
         self._base = _centre(robot) if kind.at_centre else pin.SE3.Identity()
-        swap = np.roll(np.arange(6), 3)  # from Pinocchio's (linear, angular) to (angular, linear)
+        # from Pinocchio's (linear, angular) to (angular, linear)
+        swap = np.roll(np.arange(6), 3)
         # X converts from the frame of the root link to the base frame of the tool. A displacement y
         # of the base becomes X y, a twist nu becomes X nu, and a wrench w becomes X^-T w.
         self._X: Array = self._base.toActionMatrixInverse()[np.ix_(swap, swap)]
@@ -96,28 +120,46 @@ class ToolCoordinates:
         self.actuation = acting = Actuation(state)
         # Wrenches (6, nu) of unit inputs. Only the columns of base torques and forces are nonzero.
         self._wrench = wrench = acting.fixed[:6]
-        if wrench[LINEAR].any() and not wrench[ANGULAR].any() and self._X[LINEAR, ANGULAR].any():
+        if (
+            wrench[LINEAR].any()
+            and not wrench[ANGULAR].any()
+            and self._X[LINEAR, ANGULAR].any()
+        ):
             raise InputError(
                 "in spart, a base force acts at the centre of mass of the root link, so a "
                 "BaseForce needs a BaseTorque for its moment about the origin of the link; give "
                 "the robot a BaseTorque too"
             )
         # `inputs` contains, for each input of the tool, the index of the same input of the robot.
-        self.inputs, at = np.arange(len(acting.names)), np.flatnonzero(wrench.any(axis=0))
+        self.inputs, at = (
+            np.arange(len(acting.names)),
+            np.flatnonzero(wrench.any(axis=0)),
+        )
         if not is_fflin:
-            self.inputs[at] = at[np.argsort((wrench[:, at].argmax(axis=0) + self._roll) % 6)]
+            self.inputs[at] = at[
+                np.argsort((wrench[:, at].argmax(axis=0) + self._roll) % 6)
+            ]
             motors = acting.groups.get("tau_m", at[:0])
             names = [f"tau_m.{joint.name}" for joint in self.joints]
-            self.inputs[motors] = sorted(motors, key=lambda i: names.index(acting.names[i]))
+            self.inputs[motors] = sorted(
+                motors, key=lambda i: names.index(acting.names[i])
+            )
 
     def states(self) -> dict[str, str]:
         """Return the names and units of x' as {name: unit}."""
         kind = self.convention
         units = dict[str, str]()
         attitude = _NAMES.get(kind.attitude, ["theta.x", "theta.y", "theta.z"])
-        omega = [f"{x}_rate" for x in attitude] if kind.rates else [f"omega.{x}" for x in "xyz"]
+        omega = (
+            [f"{x}_rate" for x in attitude]
+            if kind.rates
+            else [f"omega.{x}" for x in "xyz"]
+        )
         pose, twist = [*attitude, "p.x", "p.y", "p.z"], [*omega, "v.x", "v.y", "v.z"]
-        for names, joint_name, angle in ((pose, "q_m", "rad"), (twist, "qdot_m", "rad/s")):
+        for names, joint_name, angle in (
+            (pose, "q_m", "rad"),
+            (twist, "qdot_m", "rad/s"),
+        ):
             base = np.roll(names, self._roll).tolist()
             units |= {name: _UNITS.get(name.partition(".")[0], angle) for name in base}
             units |= {f"{joint_name}.{j.name}": j.unit + angle[3:] for j in self.joints}
@@ -140,7 +182,9 @@ class ToolCoordinates:
         twist = turned @ self._X @ self.state.velocities(v)[:6]
         joints = [joint.value(q) for joint in self.joints]
         parts = (pose, joints), (twist, v[self._idx_v] / self._scales)
-        q, v = (np.concatenate((np.roll(base, self._roll), rest)) for base, rest in parts)
+        q, v = (
+            np.concatenate((np.roll(base, self._roll), rest)) for base, rest in parts
+        )
         return q, v
 
     def to_pinocchio(self, q: ArrayLike, v: ArrayLike | None) -> tuple[Array, Array]:
@@ -148,7 +192,11 @@ class ToolCoordinates:
         robot = self.state.robot
         state = self.state
         size = 6 + len(self.joints)
-        v = np.zeros(size) if v is None else vector("v", v, size, "the tool's: base, then joints")
+        v = (
+            np.zeros(size)
+            if v is None
+            else vector("v", v, size, "the tool's: base, then joints")
+        )
         if self.convention.stored == "xyzw":
             return robot.checked_configuration(q), robot.checked_velocity(v)
         k = 3 + {"wxyz": 4, "matrix": 9}.get(self.convention.stored, 3)
@@ -159,7 +207,9 @@ class ToolCoordinates:
         at[:7] = pin.SE3ToXYZQUAT(state.origin.actInv(base))
         for joint, value in zip(self.joints, q[k:].tolist(), strict=True):
             joint.place(at, value)
-        nu = np.linalg.solve(self._rotated(R, rates=self.convention.rates) @ self._X, twist)
+        nu = np.linalg.solve(
+            self._rotated(R, rates=self.convention.rates) @ self._X, twist
+        )
         speed = state.spread(np.concatenate((nu, np.zeros(robot.n))))
         speed[self._idx_v] = v[6:] * self._scales
         return robot.checked_configuration(at), robot.checked_velocity(speed)
@@ -208,7 +258,9 @@ class ToolCoordinates:
         is constant in the world, so its components in base axes depend on the rotation. The
         derivative of a vector that the tool gives in base axes is zero.
         """
-        derivative: Array = self._world * np.vstack((skew(parts[ANGULAR]), skew(parts[LINEAR])))
+        derivative: Array = self._world * np.vstack(
+            (skew(parts[ANGULAR]), skew(parts[LINEAR]))
+        )
         return derivative
 
     def jacobians(self, q: Array, nu: Array, u: Array, rates: Array) -> Jacobians:
@@ -226,9 +278,12 @@ class ToolCoordinates:
         # error and the tangent vector of the pose stay zero, so they take no step.
         twist: Any = X @ nu[:6] + _STEP * (X @ rates[:6])
         moved = (not self._moving) * _STEP * twist.real
-        turns = 0.5 * product_matrix(quaternion_now) @ np.append(twist.real[ANGULAR], 0.0)
+        turns = (
+            0.5 * product_matrix(quaternion_now) @ np.append(twist.real[ANGULAR], 0.0)
+        )
         quaternion = (
-            quaternion_now + (not (self._moving and kind.attitude == "q_b")) * _STEP * turns
+            quaternion_now
+            + (not (self._moving and kind.attitude == "q_b")) * _STEP * turns
         )
         R = rotation_matrix(quaternion)
         w = quaternion[3]
@@ -249,10 +304,16 @@ class ToolCoordinates:
             base[k - 3 : k, :6] = np.hstack((0.5 * skew(moved[LINEAR]), attitude))
         base[k:, :3] = by_turn
         base[k:, 6:] = self._rotated(R, rates=kind.rates)
-        base[:k], base[k:] = np.roll(base[:k], self._roll, 0), np.roll(base[k:], self._roll, 0)
+        base[:k], base[k:] = (
+            np.roll(base[:k], self._roll, 0),
+            np.roll(base[k:], self._roll, 0),
+        )
         first = k + nv - 6
         P = np.zeros((first + nv, 12 + 2 * n), dtype=complex)
-        rows, columns = [*range(k), *range(first, first + 6)], [*range(6), *range(6 + n, 12 + n)]
+        rows, columns = (
+            [*range(k), *range(first, first + 6)],
+            [*range(6), *range(6 + n, 12 + n)],
+        )
         P[np.ix_(rows, columns)] = base @ np.kron(np.eye(2), X)
         of_joints = (self.state.spread(np.eye(6 + n))[6:, self._idx_v] / self._scales).T
         P[k:first, 6 : 6 + n] = P[first + 6 :, 12 + n :] = of_joints
@@ -265,13 +326,18 @@ class ToolCoordinates:
         left = np.block([[poses, np.zeros((6 + n, nv))], [below, twists]])
         wrench = self._wrench
         H = np.zeros((len(u), 12 + 2 * n))
-        V = np.eye(len(u)) + wrench.T @ (X.T @ self._rotated(R_now).T - np.eye(6)) @ wrench
+        V = (
+            np.eye(len(u))
+            + wrench.T @ (X.T @ self._rotated(R_now).T - np.eye(6)) @ wrench
+        )
         held = self._held(np.linalg.solve(X.T, wrench @ u))
         H[:, :3] = wrench.T @ X.T @ held @ X[ANGULAR, ANGULAR]
         return Jacobians(P.real, P.imag / _STEP.imag, left, V[:, self.inputs], H, extra)
 
 
-def tool_coordinates(robot: Robot, tool: str, *, moving: bool = False) -> ToolCoordinates:
+def tool_coordinates(
+    robot: Robot, tool: str, *, moving: bool = False
+) -> ToolCoordinates:
     """Return the coordinates of a tool for a robot.
 
     Raise an error if the tool is unknown or cannot represent the robot.
@@ -336,10 +402,16 @@ def _angles(R: Array) -> Array:
     return angles
 
 
-def _of_angles(angles: Array, omega: ArrayLike = (0.0, 0.0, 0.0)) -> tuple[Array, Array]:
+def _of_angles(
+    angles: Array, omega: ArrayLike = (0.0, 0.0, 0.0)
+) -> tuple[Array, Array]:
     """Return G of de/dt = G omega for the Euler angles e, and the derivative d(G omega) / de."""
     (s, _, _), (c, cp, _), tp = np.sin(angles), np.cos(angles), np.tan(angles[1])
     G = np.array([[1.0, s * tp, c * tp], [0.0, c, -s], [0.0, s / cp, c / cp]])
     _, pitch, yaw = G @ omega
-    bends = [[tp * pitch, yaw / cp, 0.0], [-cp * yaw, 0.0, 0.0], [pitch / cp, tp * yaw, 0.0]]
+    bends = [
+        [tp * pitch, yaw / cp, 0.0],
+        [-cp * yaw, 0.0, 0.0],
+        [pitch / cp, tp * yaw, 0.0],
+    ]
     return G, np.array(bends)

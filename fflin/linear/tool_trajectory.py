@@ -139,16 +139,22 @@ class _Change:
         return {"state_names": tuple(self.kind.states()), "input_names": inputs}
 
 
-def tool_trajectory(traj: LinearTrajectory, tool: str, dt: float | None) -> ToolTrajectory:
+def tool_trajectory(
+    traj: LinearTrajectory, tool: str, dt: float | None
+) -> ToolTrajectory:
     """Convert the linear models along a trajectory; see `LinearTrajectory.to`."""
     change, step = _Change(traj.robot, tool), step_of(tool, dt)
     if step and traj.dt:
-        raise InputError("the trajectory is sampled; leave out dt, or give the continuous one")
+        raise InputError(
+            "the trajectory is sampled; leave out dt, or give the continuous one"
+        )
     A = change.T @ traj.A @ change.T_left
     B = change.T @ traj.B @ np.linalg.inv(change.T_u)
     if step:
         rates = np.hstack((traj.v, traj.accelerations()))
-        stepped = [euler_step(*knot, step, tool)[:2] for knot in zip(A, B, rates, strict=True)]
+        stepped = [
+            euler_step(*knot, step, tool)[:2] for knot in zip(A, B, rates, strict=True)
+        ]
         A, B = (np.array(matrices) for matrices in zip(*stepped, strict=True))
     return ToolTrajectory(
         tool=tool,

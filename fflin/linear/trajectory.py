@@ -123,17 +123,25 @@ class Trajectory(Design):
     u: Array
     hold: str | None = field(default=None, kw_only=True)
     frame: str = field(default="local", kw_only=True)
-    _note: str = field(default="", kw_only=True)  # last lines of the report; not saved in files
-    _optimality: Optimality | None = field(default=None, kw_only=True)  # not saved in files
+    # last lines of the report; not saved in files
+    _note: str = field(default="", kw_only=True)
+    # not saved in files
+    _optimality: Optimality | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
-        robot = instance("robot", self.robot, Robot, "a fflin.Robot; fflin.load makes one")
+        robot = instance(
+            "robot", self.robot, Robot, "a fflin.Robot; fflin.load makes one"
+        )
         refuse_orbit(robot, "trajectories")
         nu = len(self.actuation.names)
-        times = vector("t", as_double("t", self.t), np.size(self.t), "times of the knots")
+        times = vector(
+            "t", as_double("t", self.t), np.size(self.t), "times of the knots"
+        )
         count = len(times)
         if count < 2:
-            raise InputError(f"t has {count} times, expected at least 2, in increasing order")
+            raise InputError(
+                f"t has {count} times, expected at least 2, in increasing order"
+            )
         if (back := np.flatnonzero(np.diff(times) <= 0.0)).size:
             late, early = times[back[0] : back[0] + 2]
             raise InputError(
@@ -149,13 +157,23 @@ class Trajectory(Design):
             u = np.vstack((u, u[-1:]))
         for name, rows, size, more in (("v", v, robot.nv, ""), ("u", u, nu, hint)):
             if rows.shape != (count, size):
-                raise InputError(f"{name} has shape {rows.shape}, expected {(count, size)}{more}")
+                raise InputError(
+                    f"{name} has shape {rows.shape}, expected {(count, size)}{more}"
+                )
         for k, t in enumerate(times):
             with located(f"at t = {t:g} s"):
-                q[k], v[k] = robot.checked_configuration(q[k]), robot.checked_velocity(v[k])
+                q[k], v[k] = (
+                    robot.checked_configuration(q[k]),
+                    robot.checked_velocity(v[k]),
+                )
                 require_slow("v", v[k])
                 vector("u", u[k], nu, "the robot's inputs")
-        values: dict[str, object] = {"t": times, "q": frozen(q), "v": frozen(v), "u": frozen(u)}
+        values: dict[str, object] = {
+            "t": times,
+            "q": frozen(q),
+            "v": frozen(v),
+            "u": frozen(u),
+        }
         default_hold = "previous" if short else "linear"
         values["hold"] = self.hold or default_hold
         for name, value in values.items():
@@ -272,8 +290,12 @@ class Trajectory(Design):
                 f"dt is {dt:g} s, expected at least 1e-7 of the duration of {duration:g} s"
             )
         if not dt <= duration * (1.0 + _SAME_TIME):
-            raise InputError(f"dt is {dt:g} s, expected at most the duration of {duration:g} s")
-        times: Array = self.t[0] + dt * np.arange(int(duration / dt * (1.0 + _SAME_TIME)) + 1)
+            raise InputError(
+                f"dt is {dt:g} s, expected at most the duration of {duration:g} s"
+            )
+        times: Array = self.t[0] + dt * np.arange(
+            int(duration / dt * (1.0 + _SAME_TIME)) + 1
+        )
         if abs(times[-1] - self.t[-1]) <= 1e-6 * dt:
             times[-1] = self.t[-1]
         return times
@@ -348,7 +370,11 @@ class Trajectory(Design):
 
     @staticmethod
     def load(  # type: ignore[override]
-        path: str | Path, robot: Robot, *, hold: str | None = None, frame: str | None = None
+        path: str | Path,
+        robot: Robot,
+        *,
+        hold: str | None = None,
+        frame: str | None = None,
     ) -> Trajectory:
         """Read a trajectory that `save`, `Motion.save` or another program wrote.
 
@@ -410,7 +436,11 @@ class Trajectory(Design):
         # change the accelerations. A fast wheel would hide the errors of slower joints if they had
         # the same divisor. Therefore, each rotor has its own divisor.
         t, u, state = self.t, self.u, self._aba.state
-        rotations, q, v = rotation_matrices(self.q[:, 3:7]), self.q.copy(), self.v.copy()
+        rotations, q, v = (
+            rotation_matrices(self.q[:, 3:7]),
+            self.q.copy(),
+            self.v.copy(),
+        )
         velocities = (rotations @ v[:, :3, None])[..., 0]
         usual = np.median(velocities, axis=0)
         flown = np.outer(t - t[0], usual)
@@ -420,9 +450,13 @@ class Trajectory(Design):
         q[:, :3] -= q[0, :3] + flown
         v[:, :3] -= usual @ rotations
         rates = self._aba.accelerations(q, v, self._in_base_axes(q, u))
-        terms = [state.spread(self._aba.terms(*knot)) for knot in zip(q, v, u, strict=True)]
+        terms = [
+            state.spread(self._aba.terms(*knot)) for knot in zip(q, v, u, strict=True)
+        ]
         # Take the largest magnitudes over all knots. Infinite or NaN entries count as zero.
-        push, sums = (np.nan_to_num(np.abs(x), posinf=0.0).max(axis=0) for x in (rates, terms))
+        push, sums = (
+            np.nan_to_num(np.abs(x), posinf=0.0).max(axis=0) for x in (rates, terms)
+        )
         rotors = state.robot.rotors
         alone = [joint.idx_v for joint in state.robot.joints if joint.name in rotors]
         others = sorted({*range(6, len(digits))} - {*alone})
@@ -433,7 +467,9 @@ class Trajectory(Design):
 
         def size(of_q: Array, of_v: Array, h: float) -> float:
             miss = np.maximum(np.abs(of_q) - digits, 0.0) / (speed * h)
-            jump = np.maximum(np.abs(of_v) - digits - _SUM_ROUNDING * sums * h, 0.0) / (push * h)
+            jump = np.maximum(np.abs(of_v) - digits - _SUM_ROUNDING * sums * h, 0.0) / (
+                push * h
+            )
             return float(np.maximum(miss, jump).max())
 
         errors = []
@@ -453,7 +489,9 @@ class Trajectory(Design):
                     change = size(apart, end[1] - before[1], h)
                     if change <= _ACCURACY or not np.isfinite(change):
                         break
-                errors.append(size(pin.difference(model, end[0], q[k + 1]), v[k + 1] - end[1], h))
+                errors.append(
+                    size(pin.difference(model, end[0], q[k + 1]), v[k + 1] - end[1], h)
+                )
         return np.where(np.isfinite(errors), errors, np.inf)
 
     def end(self, k: int, steps: int, q: Array, v: Array) -> tuple[Array, Array]:
@@ -506,7 +544,9 @@ def _configurations(robot: Robot, q: ArrayLike, count: int) -> Array:
         hint = ""
         if len(cosines):
             hint = f", or {narrow} with one angle for each continuous joint instead of (cos, sin)"
-        raise InputError(f"q has shape {rows.shape}, expected ({count}, {robot.nq}){hint}")
+        raise InputError(
+            f"q has shape {rows.shape}, expected ({count}, {robot.nq}){hint}"
+        )
     wide = np.empty((count, robot.nq))
     wide[:, np.delete(np.arange(robot.nq), cosines + 1)] = rows
     angles = wide[:, cosines]
@@ -533,7 +573,8 @@ def cubic(first: Array, last: Array, rate: Array, end_rate: Array) -> Array:
     """
     apart = last - first
     return np.stack(
-        (first, rate, 3 * apart - 2 * rate - end_rate, rate + end_rate - 2 * apart), axis=1
+        (first, rate, 3 * apart - 2 * rate - end_rate, rate + end_rate - 2 * apart),
+        axis=1,
     )
 
 
@@ -554,7 +595,9 @@ def along(motion: Motion, robot: Robot | None) -> Trajectory:
             "motion.trajectory(robot)"
         )
     instance("robot", robot, Robot, "a fflin.Robot; fflin.load makes one")
-    entries = {name: getattr(motion, name) for name in ("t", "q", "v", "u", "placement")}
+    entries = {
+        name: getattr(motion, name) for name in ("t", "q", "v", "u", "placement")
+    }
     from fflin.linear.files import arguments
 
     values = arguments(entries, robot, "previous", motion.frame, motion.verified)

@@ -50,7 +50,9 @@ def _example_robot_data() -> dict[str, RobotFile]:
             inner = Path(loader.path, loader.urdf_subpath, loader.urdf_filename)
             root = Path(getModelPath(str(inner))).resolve()
             folders = (root.parents[1], root.parent)
-            robot_files[name] = RobotFile(name, root / inner, "example-robot-data", folders)
+            robot_files[name] = RobotFile(
+                name, root / inner, "example-robot-data", folders
+            )
     return robot_files
 
 

@@ -10,7 +10,13 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 
 from fflin.base.errors import InputError, require_known
-from fflin.base.names import by_name, matching, rates_by_name, stands_for_any, state_keys
+from fflin.base.names import (
+    by_name,
+    matching,
+    rates_by_name,
+    stands_for_any,
+    state_keys,
+)
 from fflin.base.validation import Array, dimension, number, numbers
 from fflin.robot.inputs import JointTorque, ReactionWheel, Thruster, three_numbers
 from fflin.robot.joints import Joint, by_joint
@@ -83,10 +89,14 @@ def _outputs(value: object, _: Robot) -> tuple[Output, ...]:
     """Return outputs; `value` contains `Output` objects, or text such as "pose:tool"."""
     given = [value] if isinstance(value, str) else value
     if not isinstance(given, Sequence) or not given:
-        raise InputError(f"outputs is {value!r}, expected a sequence of at least one output")
+        raise InputError(
+            f"outputs is {value!r}, expected a sequence of at least one output"
+        )
     for item in given:
         if not isinstance(item, str | Output):
-            raise InputError(f"{item!r} is not an output; expected one such as FramePose('tool')")
+            raise InputError(
+                f"{item!r} is not an output; expected one such as FramePose('tool')"
+            )
     outputs: list[Output] = []
     for item in given:
         if isinstance(item, str):
@@ -109,14 +119,18 @@ def _of_joints(what: str, value: object, robot: Robot) -> dict[str, float]:
                 f"damping is '{value}', expected 'urdf', a number or {{joint: damping}}"
             )
         return dict(robot.urdf_damping)
-    joints = [name for name in robot._bare.joint_names if name not in robot.wheel_joints]
+    joints = [
+        name for name in robot._bare.joint_names if name not in robot.wheel_joints
+    ]
     if what != "rest" and not isinstance(value, Mapping):
         value = dict.fromkeys(joints, value)
     values = numbers(what, value, "joint", f"{what} of joint")
     value_of_joint = by_joint(values, joints, robot.joint)
     for name, entry in value_of_joint.items():
         if what != "rest" and entry < 0.0:
-            raise InputError(f"{what} of joint '{name}' is {entry:g}, expected 0 or more")
+            raise InputError(
+                f"{what} of joint '{name}' is {entry:g}, expected 0 or more"
+            )
     return value_of_joint
 
 
@@ -167,7 +181,9 @@ def _state(what: str, value: object, robot: Robot) -> dict[str, object]:
         if name in state:
             state[name] = three_numbers(f"{what} {name}", state[name])
     if "velocity" in state:
-        rates = numbers(f"{what} velocity", state["velocity"], "name", f"{what} velocity")
+        rates = numbers(
+            f"{what} velocity", state["velocity"], "name", f"{what} velocity"
+        )
         state["velocity"] = rates_by_name(robot.joint_names, rates)
     return state
 
@@ -179,7 +195,11 @@ def _weights(value: object, robot: Robot) -> dict[str, object]:
     """
     states, inputs = state_keys(robot.joint_names), _input_keys(robot)
     both = (*states, *inputs)
-    kinds = {"q": ("state", states), "r": ("input", inputs), "bryson": ("state or input", both)}
+    kinds = {
+        "q": ("state", states),
+        "r": ("input", inputs),
+        "bryson": ("state or input", both),
+    }
     given = _parts("weights", value, ("rule", *kinds))
     require_known("rule of weights", [str(given.get("rule", RULES[0]))], RULES)
     weights: dict[str, dict[str, float]] = {}
@@ -210,7 +230,9 @@ def checked_names(what: str, value: object, bare: Robot) -> tuple[str, ...]:
 
 def _parts(what: str, value: object, known: Sequence[str]) -> dict[str, object]:
     if not isinstance(value, Mapping):
-        raise InputError(f"{what} is {value!r}, expected a table with the keys {', '.join(known)}")
+        raise InputError(
+            f"{what} is {value!r}, expected a table with the keys {', '.join(known)}"
+        )
     require_known(f"part of {what}", value, known)
     return dict(value)
 
@@ -257,7 +279,9 @@ def limits_of(robot: Robot) -> dict[str, Range]:
         if isinstance(item, ReactionWheel) and item.max_speed is not None:
             limits_by_name[f"qdot_m.{names[0]}"] = _either(item.max_speed)
     known = {*limits_by_name, *state_keys(robot.joint_names)}
-    limits_by_name |= {name: limits for name, limits in robot.limits.items() if name in known}
+    limits_by_name |= {
+        name: limits for name, limits in robot.limits.items() if name in known
+    }
     return {name: limits for name, limits in limits_by_name.items() if limits != _OPEN}
 
 
@@ -326,7 +350,9 @@ def chosen_limits(
     """
     robot_limits, given = dict[str, Range](), dict[str, Range]()
     parts: Sequence[object] = [limits]
-    if isinstance(limits, list | tuple) and any(isinstance(x, str | Mapping) for x in limits):
+    if isinstance(limits, list | tuple) and any(
+        isinstance(x, str | Mapping) for x in limits
+    ):
         parts = limits
     for part in parts:
         if isinstance(part, str):

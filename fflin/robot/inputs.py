@@ -23,7 +23,8 @@ class Input:
     """Base class of inputs, which checks their limits and names."""
 
     KEY: ClassVar[str]  # `type` in a TOML file
-    GROUP: ClassVar[str]  # common name of all inputs of this class in weights and limits
+    # common name of all inputs of this class in weights and limits
+    GROUP: ClassVar[str]
     UNIT: ClassVar[str] = "N m"
     ENTRIES: ClassVar[str] = " "
     PULLS: ClassVar[bool] = True
@@ -202,7 +203,9 @@ class Thruster(Input):
                 "an on_off thruster needs a max, the force of its pulses, and no min"
             )
         if (impulse := self.least_impulse) is not None:
-            self._set("least_impulse", positive("thruster least_impulse", impulse, "N s"))
+            self._set(
+                "least_impulse", positive("thruster least_impulse", impulse, "N s")
+            )
         self._set("position", three_numbers("thruster position", self.position))
         self._set("direction", unit_vector("thruster direction", self.direction))
         self._set("torque", number("thruster torque", self.torque))
@@ -211,7 +214,9 @@ class Thruster(Input):
     def wrench(self) -> Array:
         """Force [N] and torque [N m] (6,) of a unit input, at the frame's origin in frame axes."""
         force = np.array(self.direction)
-        return np.concatenate((force, np.cross(self.position, force) + self.torque * force))
+        return np.concatenate(
+            (force, np.cross(self.position, force) + self.torque * force)
+        )
 
 
 @dataclass(frozen=True)
@@ -288,7 +293,9 @@ class ReactionWheel(Input):
             )
         if self.inertia is not None:
             hint = "; leave it out to model the wheel by its momentum alone"
-            self._set("inertia", positive("wheel inertia", self.inertia, "kg m^2", hint))
+            self._set(
+                "inertia", positive("wheel inertia", self.inertia, "kg m^2", hint)
+            )
 
     @property
     def wrench(self) -> Array:
@@ -296,7 +303,13 @@ class ReactionWheel(Input):
         return np.concatenate((np.zeros(3), -np.array(self.axis)))
 
 
-KINDS: tuple[type[Input], ...] = (BaseTorque, BaseForce, JointTorque, Thruster, ReactionWheel)
+KINDS: tuple[type[Input], ...] = (
+    BaseTorque,
+    BaseForce,
+    JointTorque,
+    Thruster,
+    ReactionWheel,
+)
 
 
 def three_numbers(what: str, value: object) -> tuple[float, float, float]:
@@ -304,7 +317,9 @@ def three_numbers(what: str, value: object) -> tuple[float, float, float]:
     try:
         x, y, z = (number(what, entry) for entry in cast("Iterable[object]", value))
     except (TypeError, ValueError):
-        raise InputError(f"{what} is {value!r}, expected three finite numbers") from None
+        raise InputError(
+            f"{what} is {value!r}, expected three finite numbers"
+        ) from None
     return x, y, z
 
 
@@ -317,7 +332,9 @@ def unit_vector(what: str, value: object) -> tuple[float, float, float]:
     return x / length, y / length, z / length
 
 
-def checked_inputs(value: object, bare: "Robot", passive: Sequence[str]) -> tuple[Input, ...]:
+def checked_inputs(
+    value: object, bare: "Robot", passive: Sequence[str]
+) -> tuple[Input, ...]:
     """Return checked inputs.
 
     A `JointTorque` whose joint is a pattern is replaced by one torque for each matching joint that
@@ -373,4 +390,6 @@ def named_inputs(inputs: Sequence[Input]) -> list[tuple[Input, tuple[str, ...]]]
 def named_wheels(inputs: Sequence[Input]) -> list[tuple[str, ReactionWheel]]:
     """Return (name, wheel) for each wheel among the inputs, with names as in `named_inputs`."""
     named = named_inputs(inputs)
-    return [(names[0], item) for item, names in named if isinstance(item, ReactionWheel)]
+    return [
+        (names[0], item) for item, names in named if isinstance(item, ReactionWheel)
+    ]

@@ -14,7 +14,14 @@ import pinocchio as pin
 
 from fflin.base.errors import InputError, ModelError, unknown
 from fflin.base.names import joints_by_name
-from fflin.base.validation import NORM_TOLERANCE, ROUND_OFF, Array, ArrayLike, normalised, vector
+from fflin.base.validation import (
+    NORM_TOLERANCE,
+    ROUND_OFF,
+    Array,
+    ArrayLike,
+    normalised,
+    vector,
+)
 
 ROOT = 1  # index of the free-flyer among Pinocchio's joints; 0 is the universe
 
@@ -31,7 +38,8 @@ class Joint(NamedTuple):
     name: str  # name in the model
     idx_q: int = 0  # index of its first entry in Pinocchio's q
     idx_v: int = 0  # index of its entry in Pinocchio's v
-    unbounded: bool = False  # continuous: two entries (cos, sin) of q, but one angle in the state
+    # continuous: two entries (cos, sin) of q, but one angle in the state
+    unbounded: bool = False
     prismatic: bool = False  # its entry of q is a length [m] instead of an angle [rad]
     # "joint", "slosh" for a coordinate of a sloshing mass, or "modal" for a modal amplitude.
     kind: str = "joint"
@@ -101,14 +109,18 @@ class Follower(NamedTuple):
 
     def within(self, model: pin.Model) -> Follower:
         """Return this mimic joint with its own indices and its leader's indices in `model`."""
-        return self._replace(joint=self.joint.within(model), leader=self.leader.within(model))
+        return self._replace(
+            joint=self.joint.within(model), leader=self.leader.within(model)
+        )
 
 
 # Function that returns the joint with a given name, or raises an error that explains the problem.
 Find: TypeAlias = Callable[[str], Joint]
 
 
-def by_joint(values: Mapping[str, T], joints: Sequence[str], find: Find) -> dict[str, T]:
+def by_joint(
+    values: Mapping[str, T], joints: Sequence[str], find: Find
+) -> dict[str, T]:
     """Return {joint: value} from {joint or pattern: value}; the key ``q_m`` means all joints."""
     return joints_by_name("joint", values, joints, find)
 
@@ -124,12 +136,16 @@ def frame_index(model: pin.Model, name: str) -> int:
     """Return the index of a frame; if a link and a joint share a name, return the link's frame."""
     # Do not use Pinocchio's `getFrameId`: it refuses a name that a link and a joint share, and
     # mistakes a link named "universe" for the world.
-    frames = {i: f for i, f in enumerate(model.frames.tolist()) if f.parentJoint >= ROOT}
+    frames = {
+        i: f for i, f in enumerate(model.frames.tolist()) if f.parentJoint >= ROOT
+    }
     # Check the type of `name` first. If `name` were an array, the comparison would give an array.
     indices = [i for i, f in frames.items() if isinstance(name, str) and f.name == name]
     if not indices:
         raise unknown("frame", str(name), [frame.name for frame in frames.values()])
-    return next((i for i in indices if frames[i].type == pin.FrameType.BODY), indices[0])
+    return next(
+        (i for i in indices if frames[i].type == pin.FrameType.BODY), indices[0]
+    )
 
 
 def find_frame(model: pin.Model, name: str | None) -> Carried:
@@ -210,7 +226,9 @@ class Coordinates:
         if not pin.isNormalized(self.model, near, ROUND_OFF):
             parts = {(3, 7): "the base quaternion (x, y, z, w) q[3:7]"}
             for at, name in self.unbounded.items():
-                parts[at, at + 2] = f"(cos, sin) of continuous joint '{name}', q[{at}:{at + 2}],"
+                parts[at, at + 2] = (
+                    f"(cos, sin) of continuous joint '{name}', q[{at}:{at + 2}],"
+                )
             for (first, last), label in parts.items():
                 normalised(label, near[first:last])
             near = pin.normalize(self.model, near)
@@ -223,7 +241,9 @@ class Coordinates:
         v = self._sized("v", v, self.nv, "a velocity in Pinocchio's order")
         for joint, leader, multiplier, _ in self.followers:
             expected = multiplier * v[leader.idx_v]
-            if abs(v[joint.idx_v] - expected) > NORM_TOLERANCE * max(1.0, abs(expected)):
+            if abs(v[joint.idx_v] - expected) > NORM_TOLERANCE * max(
+                1.0, abs(expected)
+            ):
                 raise InputError(
                     f"v[{joint.idx_v}] of joint '{joint.name}' is {v[joint.idx_v]:.9g}, but it "
                     f"mimics '{leader.name}', which requires {expected:.9g}"
@@ -235,7 +255,8 @@ class Coordinates:
         if self._removed and np.size(value) > size:
             gone = ", ".join(self._removed)
             of_what += (
-                f"; the coordinates {gone} were removed with the replaced inputs or appendages"
+                f"; the coordinates {gone} were removed with the replaced inputs "
+                "or appendages"
             )
         return vector(name, value, size, of_what)
 
@@ -289,7 +310,11 @@ def change_in(model: pin.Model, made: pin.Model) -> str:
 
     Only properties that affect A, B or C are compared. Changed limits and new frames are ignored.
     """
-    of_joints = {"joints": "axis", "jointPlacements": "placement", "inertias": "inertia"}
+    of_joints = {
+        "joints": "axis",
+        "jointPlacements": "placement",
+        "inertias": "inertia",
+    }
     for name in ("names", "parents", *of_joints, "armature", "frames"):
         now, before = list(getattr(model, name)), list(getattr(made, name))
         if name == "frames":
@@ -320,4 +345,6 @@ def joint_of(model: pin.Model, index: int) -> Joint:
             f"joint '{name}' is a {kind.removeprefix('JointModel')} of {joint.nv} "
             f"degrees of freedom, expected 1; lock it with lock=['{name}']"
         )
-    return Joint(name, joint.idx_q, joint.idx_v, joint.nq == 2, kind.startswith("JointModelP"))
+    return Joint(
+        name, joint.idx_q, joint.idx_v, joint.nq == 2, kind.startswith("JointModelP")
+    )

@@ -126,14 +126,18 @@ def load(
             arguments = _xacro_arguments(file_fields.pop("xacro", None)) | arguments
         later = locks
         locks = {name: locks.pop(name, value) for name, value in file_locks.items()}
-    urdf = describe(read_file(robot_file.path, "URDF", SIZE_LIMIT), robot_file.path, arguments)
+    urdf = describe(
+        read_file(robot_file.path, "URDF", SIZE_LIMIT), robot_file.path, arguments
+    )
     location = document.located("lock") if document else nullcontext()
     with location:
         loaded = _robot(urdf.model, robot_file.name, locks, urdf.mimics)
     dirs = (*dirs, *robot_file.package_dirs)
     # Register the mesh files now, so that no output file can overwrite them. The meshes are read
     # only later, when the robot is drawn.
-    remember(*filter(None, (find_mesh(uri, robot_file.path, dirs) for uri in urdf.meshes)))
+    remember(
+        *filter(None, (find_mesh(uri, robot_file.path, dirs) for uri in urdf.meshes))
+    )
     loaded = replace(
         loaded,
         urdf=robot_file.path,
@@ -162,7 +166,9 @@ def load(
     notes = [*loaded.notes]
     for field, names, text in ignored(urdf.joints, robot_file.path.stem):
         named_joints = {*getattr(loaded, field, ()), *gone}
-        named_joints |= {x.joint.name for x in loaded.followers if x.leader.name in named_joints}
+        named_joints |= {
+            x.joint.name for x in loaded.followers if x.leader.name in named_joints
+        }
         if not {*names} <= named_joints:
             notes.append(text)
     for note in notes:
@@ -175,7 +181,11 @@ def load(
 
 
 def from_model(
-    model: pin.Model, *, name: str | None = None, lock: Lock | None = None, **fields: object
+    model: pin.Model,
+    *,
+    name: str | None = None,
+    lock: Lock | None = None,
+    **fields: object,
 ) -> Robot:
     """Make a robot from a Pinocchio model that was built from MJCF, SDF or code.
 
@@ -215,7 +225,9 @@ def from_model(
     26
     """
     if not isinstance(model, pin.Model):
-        raise ModelError(f"the model has type {type(model).__name__}, expected a pin.Model")
+        raise ModelError(
+            f"the model has type {type(model).__name__}, expected a pin.Model"
+        )
     if instance("name", name, (str, type(None)), "a string"):
         printable("name", name)
     copy = model.copy()
@@ -229,7 +241,9 @@ def from_model(
     return robot
 
 
-def _robot(model: pin.Model, name: str, lock: Lock, mimics: Mapping[str, Mimic]) -> Robot:
+def _robot(
+    model: pin.Model, name: str, lock: Lock, mimics: Mapping[str, Mimic]
+) -> Robot:
     """Make a robot from a model of one tree on a free-flyer, with joints in depth-first order.
 
     Raise `ModelError` for any other model.
@@ -240,7 +254,9 @@ def _robot(model: pin.Model, name: str, lock: Lock, mimics: Mapping[str, Mimic])
             f"'{name}': the root joint is {root}, expected JointModelFreeFlyer; build the model "
             "with pin.JointModelFreeFlyer() as its root joint"
         )
-    fixed = [model.names[i] for i in range(ROOT + 1, model.njoints) if model.parents[i] == 0]
+    fixed = [
+        model.names[i] for i in range(ROOT + 1, model.njoints) if model.parents[i] == 0
+    ]
     if fixed:
         raise ModelError(
             f"'{name}': joint '{fixed[0]}' is attached to the world, not to the free-flyer; "
@@ -250,11 +266,18 @@ def _robot(model: pin.Model, name: str, lock: Lock, mimics: Mapping[str, Mimic])
     locked: tuple[str, ...] = ()
     if lock:
         model, mimics, locked = locked_model(model, lock, mimics)
-    by_name = {model.names[i]: joint_of(model, i) for i in range(ROOT + 1, model.njoints)}
+    by_name = {
+        model.names[i]: joint_of(model, i) for i in range(ROOT + 1, model.njoints)
+    }
     joints = tuple(joint for name, joint in by_name.items() if name not in mimics)
-    followers = tuple(Follower(by_name[x], by_name[m.leader], *m[1:]) for x, m in mimics.items())
+    followers = tuple(
+        Follower(by_name[x], by_name[m.leader], *m[1:]) for x, m in mimics.items()
+    )
     # In depth-first order, the joint indices of each subtree are consecutive.
-    if any(subtree[len(subtree) - 1] - subtree[0] >= len(subtree) for subtree in model.subtrees):
+    if any(
+        subtree[len(subtree) - 1] - subtree[0] >= len(subtree)
+        for subtree in model.subtrees
+    ):
         raise ModelError(
             f"'{name}': the joints are not in depth-first order, for which Pinocchio's CRBA gives "
             "wrong results; add all joints of one branch before the joints of the next branch"
@@ -270,11 +293,17 @@ def _robot(model: pin.Model, name: str, lock: Lock, mimics: Mapping[str, Mimic])
 def _check_model(model: pin.Model, name: str) -> None:
     """Raise `ModelError` if a value of a joint or body is infinite, NaN or unphysical."""
     for index in range(ROOT, model.njoints):
-        body, joint, parent = model.inertias[index], model.joints[index], model.parents[index]
+        body, joint, parent = (
+            model.inertias[index],
+            model.joints[index],
+            model.parents[index],
+        )
         armature = model.armature[joint.idx_v : joint.idx_v + joint.nv]
         moments = np.linalg.eigvalsh(np.nan_to_num(body.inertia)).tolist()
         shown = ", ".join(f"{moment:.3g}" for moment in moments)
-        finite = np.isfinite([body.mass, *body.lever, *body.inertia.ravel(), *armature]).all()
+        finite = np.isfinite(
+            [body.mass, *body.lever, *body.inertia.ravel(), *armature]
+        ).all()
         faults = {
             f"the parent {parent}, expected a joint before {index}": parent >= index,
             "a placement that is not finite, or whose matrix R is not a rotation": not (
@@ -282,14 +311,19 @@ def _check_model(model: pin.Model, name: str) -> None:
                 and np.isfinite(model.jointPlacements[index].translation).all()
             ),
             "a mass, centre of mass, inertia or armature that is not finite": not finite,
-            f"a link with a mass of {body.mass:g} kg, expected 0 or more": body.mass < 0.0,
+            f"a link with a mass of {body.mass:g} kg, expected 0 or more": body.mass
+            < 0.0,
             f"a link with principal moments of inertia of {shown} kg m^2, expected 0 or more": (
                 is_impossible(body.mass, moments)
             ),
-            f"an armature of {armature.tolist()}, expected 0 or more": (armature < 0.0).any(),
+            f"an armature of {armature.tolist()}, expected 0 or more": (
+                armature < 0.0
+            ).any(),
         }
         for fault in (fault for fault, present in faults.items() if present):
-            raise ModelError(f"'{name}': joint '{model.names[index]}' has {fault}; correct it")
+            raise ModelError(
+                f"'{name}': joint '{model.names[index]}' has {fault}; correct it"
+            )
 
 
 def _normalise_placements(model: pin.Model) -> None:
@@ -411,9 +445,14 @@ def _read_robot_file(file: RobotFile) -> tuple[TomlFile, RobotFile, dict[str, ob
     with document.located("urdf"):
         urdf_file = find_robot(record["urdf"], folder)
         if urdf_file.path.suffix.lower() == ".toml":
-            raise InputError(f"urdf is {urdf_file.path}, expected a URDF or a robot's name")
+            raise InputError(
+                f"urdf is {urdf_file.path}, expected a URDF or a robot's name"
+            )
     with document.located("package_dirs"):
-        dirs = (*folders(record.get("package_dirs", ()), folder), *urdf_file.package_dirs)
+        dirs = (
+            *folders(record.get("package_dirs", ()), folder),
+            *urdf_file.package_dirs,
+        )
     # Nested tables become keys with dots. Only the tables directly below weights, point, target and
     # start, such as point.joints, remain tables.
     values = {key: flat(value) for key, value in record.items()}
@@ -423,8 +462,12 @@ def _read_robot_file(file: RobotFile) -> tuple[TomlFile, RobotFile, dict[str, ob
     if "input" in record:
         values["inputs"] = _read_inputs(document)
     of_nastran, of_tank = FlexibleAppendage.from_nastran, Slosh.cylinder
-    appendages = _built(document, "flexible", partial(_maker, FlexibleAppendage, of_nastran))
-    if appendages := appendages + _built(document, "slosh", partial(_maker, Slosh, of_tank)):
+    appendages = _built(
+        document, "flexible", partial(_maker, FlexibleAppendage, of_nastran)
+    )
+    if appendages := appendages + _built(
+        document, "slosh", partial(_maker, Slosh, of_tank)
+    ):
         values["appendages"] = appendages
     # The robot is named after the TOML file, not after the URDF.
     urdf_file = urdf_file._replace(name=file.name, package_dirs=dirs)
@@ -451,21 +494,27 @@ def _read_inputs(document: TomlFile) -> tuple[Input, ...]:
     """Return the inputs of a file; see `load_inputs`."""
     inputs = tuple(_built(document, "input", _input_type))
     if not inputs:
-        raise document.error("the file contains no inputs; add a table [[input]] with its type")
+        raise document.error(
+            "the file contains no inputs; add a table [[input]] with its type"
+        )
     return inputs
 
 
 def _input_type(values: dict[str, object]) -> type[Input]:
     """Remove the key `type` from the values of an input, and return the class of this type."""
     if "type" not in values:
-        raise InputError(f"the key 'type' is missing; set 'type' to one of {', '.join(_TYPES)}")
+        raise InputError(
+            f"the key 'type' is missing; set 'type' to one of {', '.join(_TYPES)}"
+        )
     kind = str(values.pop("type"))
     require_known("valid 'type'", [kind], _TYPES)
     return _TYPES[kind]
 
 
 def _maker(
-    make: Callable[..., Appendage], special: Callable[..., Appendage], values: Mapping[str, object]
+    make: Callable[..., Appendage],
+    special: Callable[..., Appendage],
+    values: Mapping[str, object],
 ) -> Callable[..., Appendage]:
     """Return `special` if `values` contains a key that only `special` accepts, or else `make`.
 
@@ -478,7 +527,9 @@ def _maker(
 
 
 def _built(
-    document: TomlFile, key: str, choose: Callable[[dict[str, object]], Callable[..., T]]
+    document: TomlFile,
+    key: str,
+    choose: Callable[[dict[str, object]], Callable[..., T]],
 ) -> list[T]:
     """Build an object from each table of the array `key`; messages begin with file and line.
 
@@ -497,12 +548,18 @@ def _built(
         with document.located(key, index, of=f"{label}: "):
             build = choose(values)
             parameters = dict(signature(build).parameters)
-            if build is FlexibleAppendage:  # these parameters come only from Nastran files
+            # these parameters come only from Nastran files
+            if build is FlexibleAppendage:
                 del parameters["inertia"], parameters["rigid"]
             require_known(f"key of {key}", values, parameters)
             for parameter_name, parameter in parameters.items():
-                if parameter.default is parameter.empty and parameter_name not in values:
-                    raise InputError(f"the key '{parameter_name}' is missing; add this key")
+                if (
+                    parameter.default is parameter.empty
+                    and parameter_name not in values
+                ):
+                    raise InputError(
+                        f"the key '{parameter_name}' is missing; add this key"
+                    )
             for file in {"op4", "asm"} & set(values):
                 values[file] = document.path.parent / str(values[file])
             built.append(build(**values))

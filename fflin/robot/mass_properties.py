@@ -21,7 +21,15 @@ import pinocchio as pin
 from fflin.base.errors import InputError, SingularInertiaError, listed, require_known
 from fflin.base.names import by_name, matching
 from fflin.base.rotation import row_products, skew
-from fflin.base.validation import Array, instance, number, positive, shaped, vector, whole
+from fflin.base.validation import (
+    Array,
+    instance,
+    number,
+    positive,
+    shaped,
+    vector,
+    whole,
+)
 from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.urdf.description import TRIANGLE_SLACK, is_impossible
 
@@ -49,7 +57,9 @@ _INVOLVED = 0.1
 
 def dynamic_parameters(model: pin.Model) -> bytes:
     """Return the mass properties of all bodies as bytes, for a hash of the robot."""
-    return np.array([*map(pin.Inertia.toDynamicParameters, model.inertias.tolist())]).tobytes()
+    return np.array(
+        [*map(pin.Inertia.toDynamicParameters, model.inertias.tolist())]
+    ).tobytes()
 
 
 def given_bodies(model: pin.Model, bodies: object) -> dict[int, pin.Inertia]:
@@ -92,7 +102,9 @@ def given_body(name: str, value: object, old: pin.Inertia) -> pin.Inertia:
     mass = old.mass
     if "mass" in value:
         mass = positive(f"mass {of_body}", value["mass"], "kg")
-    com = vector(f"com {of_body}", value.get("com", old.lever), 3, "a point in the body's frame")
+    com = vector(
+        f"com {of_body}", value.get("com", old.lever), 3, "a point in the body's frame"
+    )
     if "inertia" not in value:
         scale = mass / old.mass if old.mass else 1.0
         return pin.Inertia(mass, com, old.inertia * scale)
@@ -111,7 +123,9 @@ def given_body(name: str, value: object, old: pin.Inertia) -> pin.Inertia:
     return pin.Inertia(mass, com, inertia)
 
 
-def random_bodies(model: pin.Model, seed: int, **spreads: float) -> dict[int, pin.Inertia]:
+def random_bodies(
+    model: pin.Model, seed: int, **spreads: float
+) -> dict[int, pin.Inertia]:
     """Return {joint index: inertia} with random changes of all bodies; see `Robot.perturbed`."""
     spreads = {key: number(key, value) for key, value in spreads.items()}
     for key, spread in spreads.items():
@@ -126,14 +140,21 @@ def random_bodies(model: pin.Model, seed: int, **spreads: float) -> dict[int, pi
             # of mass, along each axis.
             second = 0.5 * np.trace(body.inertia) - body.inertia.diagonal()
             radii = np.sqrt(np.abs(second) / (body.mass or np.inf))
-            density, com = spreads["mass"] * drawn[:, 0], spreads["com"] * drawn[:, 1:4] * radii
+            density, com = (
+                spreads["mass"] * drawn[:, 0],
+                spreads["com"] * drawn[:, 1:4] * radii,
+            )
             wider = spreads["inertia"] * drawn[:, 4:]
-            mass, com, about = properties(_stretched(body, np.eye(3), density, com, wider))
+            mass, com, about = properties(
+                _stretched(body, np.eye(3), density, com, wider)
+            )
             new[index] = pin.Inertia(float(mass[0]), com[0], about[0])
     return new
 
 
-def _stretched(body: pin.Inertia, axes: Array, density: Array, com: Array, inertia: Array) -> Array:
+def _stretched(
+    body: pin.Inertia, axes: Array, density: Array, com: Array, inertia: Array
+) -> Array:
     """Return the pseudo-inertias (N, 4, 4) of N variants of a body.
 
     `density` (N,) is the relative change of density. `inertia` (N, 3) is the relative change of the
@@ -143,7 +164,9 @@ def _stretched(body: pin.Inertia, axes: Array, density: Array, com: Array, inert
     """
     # Some files contain physically impossible bodies, which have a negative second moment. Scale
     # such a body equally along all axes, so that the signs of its principal moments do not change.
-    least = np.linalg.eigvalsh(0.5 * np.trace(body.inertia) * np.eye(3) - body.inertia)[0]
+    least = np.linalg.eigvalsh(0.5 * np.trace(body.inertia) * np.eye(3) - body.inertia)[
+        0
+    ]
     if least < -_NO_MOMENT * 0.5 * np.trace(body.inertia):
         inertia = inertia[:, :1] * np.ones(3)
     # If the affine map T is applied to the mass distribution, P becomes T P T^T. This matrix is
@@ -174,7 +197,8 @@ class LinkMass(NamedTuple):
 
     mass: float
     inertia: Array
-    placement: pin.SE3  # placement of the centre of mass and the inertia's axes on the link
+    # placement of the centre of mass and the inertia's axes on the link
+    placement: pin.SE3
 
 
 def link_mass(body: pin.Inertia) -> LinkMass:
@@ -186,10 +210,12 @@ class Piece(NamedTuple):
     """Mass properties of a link, or of a body of links that are fixed to each other."""
 
     joint: int
-    placement: pin.SE3  # placement of the centre of mass and the inertia's axes on the joint
+    # placement of the centre of mass and the inertia's axes on the joint
+    placement: pin.SE3
     mass: float
     inertia: Array
-    frame: pin.SE3  # placement of the link's frame on the joint; identity for a whole body
+    # placement of the link's frame on the joint; identity for a whole body
+    frame: pin.SE3
     body: str  # name of the whole body: its joint, or "base"
     whole: bool = False  # whether the piece is a body of several links
 
@@ -220,7 +246,9 @@ def pieces_of(robot: Robot) -> dict[str, Piece]:
         at = pin.SE3(np.eye(3), inertia.lever)
         axes = pin.SE3.Identity()
         several = len(named) > 1
-        whole = Piece(joint, at, inertia.mass, inertia.inertia, axes, bodies[joint], several)
+        whole = Piece(
+            joint, at, inertia.mass, inertia.inertia, axes, bodies[joint], several
+        )
         total = sum((as_inertia(piece) for piece in named.values()), pin.Inertia.Zero())
         difference = np.abs(total.matrix() - inertia.matrix()).max()
         if difference <= _ROUNDING * np.abs(inertia.matrix()).max():
@@ -233,7 +261,9 @@ def pieces_of(robot: Robot) -> dict[str, Piece]:
     # the robot's model than in the bare model.
     now = [robot.model.getJointId(name) for name in model.names]
     now[ROOT] = ROOT
-    return {name: piece._replace(joint=now[piece.joint]) for name, piece in pieces.items()}
+    return {
+        name: piece._replace(joint=now[piece.joint]) for name, piece in pieces.items()
+    }
 
 
 def bodies_named(robot: Robot, kind: str, key: str) -> list[str]:
@@ -252,7 +282,9 @@ def sums_of(robot: Robot) -> frozenset[str]:
     """Return the names of the pieces that are sums of other pieces: the bodies of several links."""
     linked = {piece.joint for piece in robot.pieces.values() if not piece.whole}
     pieces = robot.pieces.items()
-    return frozenset(name for name, piece in pieces if piece.whole and piece.joint in linked)
+    return frozenset(
+        name for name, piece in pieces if piece.whole and piece.joint in linked
+    )
 
 
 def as_inertia(piece: Piece) -> pin.Inertia:
@@ -263,7 +295,9 @@ def as_inertia(piece: Piece) -> pin.Inertia:
     return piece.placement.act(body)
 
 
-def varied(piece: Piece, mass: Array, density: Array, com: Array, inertia: Array) -> Array:
+def varied(
+    piece: Piece, mass: Array, density: Array, com: Array, inertia: Array
+) -> Array:
     """Return the changes (N, 4, 4) of a body's pseudo-inertia due to changes of one piece.
 
     The changes by `density`, `com` and `inertia` are as in `_stretched`, with components along the
@@ -275,7 +309,9 @@ def varied(piece: Piece, mass: Array, density: Array, com: Array, inertia: Array
     after = _stretched(body, piece.frame.rotation, density, com, inertia)
     moved = body.lever + row_products(com, piece.frame.rotation.T)
     center = np.concatenate((moved, np.ones((len(com), 1))), axis=1)
-    added = (mass * after[:, 3, 3])[:, None, None] * center[:, :, None] * center[:, None]
+    added = (
+        (mass * after[:, 3, 3])[:, None, None] * center[:, :, None] * center[:, None]
+    )
     changes: Array = after + added - body.toPseudoInertia().toMatrix()
     return changes
 
@@ -309,12 +345,18 @@ def _rigid_part(model: pin.Model, index: int) -> _Part:
 def _have_inertia(model: pin.Model, indices: Sequence[int]) -> bool:
     """Return whether all bodies of joints have a mass, and moments of inertia about all axes."""
     bodies = [model.inertias[index] for index in indices]
-    values = np.linalg.eigvalsh(np.reshape([body.inertia for body in bodies], (-1, 3, 3)))
+    values = np.linalg.eigvalsh(
+        np.reshape([body.inertia for body in bodies], (-1, 3, 3))
+    )
     masses = np.array([body.mass for body in bodies])
-    return bool((masses > 0.0).all() and (values[:, 0] > _NO_MOMENT * values[:, 2]).all())
+    return bool(
+        (masses > 0.0).all() and (values[:, 0] > _NO_MOMENT * values[:, 2]).all()
+    )
 
 
-def _flexible_part(model: pin.Model, body: int, mode_joints: Mapping[int, int]) -> _Part:
+def _flexible_part(
+    model: pin.Model, body: int, mode_joints: Mapping[int, int]
+) -> _Part:
     """Return the body of a joint with the balls and liquids of its modes.
 
     `mode_joints` maps the joints of these modes to their indices in v, in ascending order.
@@ -329,8 +371,12 @@ def _flexible_part(model: pin.Model, body: int, mode_joints: Mapping[int, int]) 
         model.joints[index].calc(joint_data, pin.neutral(model))
         placements[index] = placements[parent] * model.jointPlacements[index]
         columns[index] = columns[parent].copy()
-        columns[index][:, at] = placements[index].toActionMatrix() @ np.ravel(joint_data.S)
-    inertias = {index: at.act(model.inertias[index]) for index, at in placements.items()}
+        columns[index][:, at] = placements[index].toActionMatrix() @ np.ravel(
+            joint_data.S
+        )
+    inertias = {
+        index: at.act(model.inertias[index]) for index, at in placements.items()
+    }
     mass = sum(inertia.mass for inertia in inertias.values())
     moment = sum(inertia.mass * inertia.lever for inertia in inertias.values())
     center = np.zeros(3)
@@ -371,7 +417,9 @@ def idle_coordinates(robot: Robot) -> tuple[str, ...]:
         modes_of.setdefault(carrier, {})[index] = model.joints[index].idx_v
     flexible = [_flexible_part(model, *item) for item in modes_of.items()]
     modes = {index for group in modes_of.values() for index in group}
-    rigid = [i for i in range(ROOT, model.njoints) if i not in modes and i not in modes_of]
+    rigid = [
+        i for i in range(ROOT, model.njoints) if i not in modes and i not in modes_of
+    ]
     complete = all(part.rows.shape[0] == part.rows.shape[1] for part in flexible)
     if complete and _have_inertia(model, rigid):
         return ()
@@ -434,7 +482,9 @@ def _virtual_joints(robot: Robot) -> list[str]:
     chain = list[str]()
     body = ROOT
     while model.inertias[body].mass == 0.0:
-        children = [i for i in range(body + 1, model.njoints) if model.parents[i] == body]
+        children = [
+            i for i in range(body + 1, model.njoints) if model.parents[i] == body
+        ]
         if len(children) != 1:
             return []
         body = children[0]

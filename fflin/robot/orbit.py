@@ -98,7 +98,9 @@ class CircularOrbit:
     def __post_init__(self) -> None:
         instance("body", self.body, str, "a name such as 'earth'")
         if (self.mu is None) != (self.body_radius is None):
-            raise InputError("only one of mu and body_radius is given; give both or none")
+            raise InputError(
+                "only one of mu and body_radius is given; give both or none"
+            )
         if (self.altitude is None) == (self.mean_motion is None):
             raise InputError(
                 f"altitude is {self.altitude} [m] and mean_motion is {self.mean_motion} [rad/s]; "
@@ -108,7 +110,10 @@ class CircularOrbit:
             require_known("central body", [self.body], BODIES)
             mu, ground = BODIES[self.body]
         else:
-            mu, ground = positive("mu", self.mu), positive("body_radius", self.body_radius)
+            mu, ground = (
+                positive("mu", self.mu),
+                positive("body_radius", self.body_radius),
+            )
         if self.altitude is None:
             n = positive("mean_motion", self.mean_motion)
             altitude = (mu / n) ** (1.0 / 3.0) / n ** (1.0 / 3.0) - ground
@@ -127,7 +132,12 @@ class CircularOrbit:
                 message = f"an altitude of {altitude:.8g} m over earth is too low for an orbit"
                 message += "; altitudes are in metres, so write 400 km as 400e3"
                 warnings.warn(message, FflinWarning, stacklevel=3)
-        known = {"altitude": altitude, "mean_motion": n, "mu": mu, "body_radius": ground}
+        known = {
+            "altitude": altitude,
+            "mean_motion": n,
+            "mu": mu,
+            "body_radius": ground,
+        }
         for name, value in known.items():
             object.__setattr__(self, name, value)
 

@@ -24,7 +24,9 @@ class Output:
     @property
     def frames(self) -> tuple[str, ...]:
         """Names of the model's frames that the output depends on."""
-        return tuple(getattr(self, name) for name in ("frame", "to") if hasattr(self, name))
+        return tuple(
+            getattr(self, name) for name in ("frame", "to") if hasattr(self, name)
+        )
 
     @property
     def signals(self) -> list[tuple[str, str]]:
@@ -32,7 +34,11 @@ class Output:
         prefix = "/".join(self.frames)
         if self.frames:
             prefix += "."
-        return [(f"{prefix}{name}.{axis}", unit) for name, unit in self.VECTORS for axis in "xyz"]
+        return [
+            (f"{prefix}{name}.{axis}", unit)
+            for name, unit in self.VECTORS
+            for axis in "xyz"
+        ]
 
 
 @dataclass(frozen=True)
@@ -80,7 +86,9 @@ class JointOutput(Output):
         # Refuse a string, because it would be read as a sequence of names with one letter each.
         if isinstance(self.joints, str):
             given = repr(self.joints)
-            raise InputError(f"joints is {given}, expected a tuple of names: write ({given},)")
+            raise InputError(
+                f"joints is {given}, expected a tuple of names: write ({given},)"
+            )
 
 
 class JointPositions(JointOutput):
@@ -285,12 +293,16 @@ def parse_output(text: str) -> tuple[Output, ...]:
     The text frame:NAME stands for the pose and the velocity of a frame.
     """
     word, colon, rest = text.partition(":")
-    kinds = {kind.WORD: (kind,) for kind in KINDS} | {"frame": (FramePose, FrameVelocity)}
+    kinds = {kind.WORD: (kind,) for kind in KINDS} | {
+        "frame": (FramePose, FrameVelocity)
+    }
     require_known("output", [word], kinds)
     kind = kinds[word][0]
     if rest and issubclass(kind, JointOutput):
         return (kind((rest,)),)
-    wanted = [item.name for item in fields(kind)] if issubclass(kind, FrameOutput) else []
+    wanted = (
+        [item.name for item in fields(kind)] if issubclass(kind, FrameOutput) else []
+    )
     names = rest.split(":", len(wanted) - 1) if colon else []
     if len(names) != len(wanted) or not all(names):
         places = ("NAME", *(name.upper() for name in wanted[1:]))

@@ -18,7 +18,14 @@ from fflin.robot import mass_properties
 from fflin.robot.equipment.appendages import Appendage
 from fflin.robot.equipment.assembly import equipped, stored_momentum, with_appendages
 from fflin.robot.fields import FIELDS, Range, checked_names, pulsed_thrusters
-from fflin.robot.inputs import BaseForce, BaseTorque, Input, JointTorque, named_inputs, named_wheels
+from fflin.robot.inputs import (
+    BaseForce,
+    BaseTorque,
+    Input,
+    JointTorque,
+    named_inputs,
+    named_wheels,
+)
 from fflin.robot.joints import ROOT, Coordinates, Joint, find_frame
 from fflin.robot.orbit import CircularOrbit
 from fflin.robot.outputs import FullState, Output
@@ -255,8 +262,12 @@ class Robot(Coordinates):
         require_known("field of a robot", fields, FIELDS)
         robot = self
         if "passive" in fields:
-            robot = replace(self, passive=checked_names("passive", fields["passive"], self._bare))
-            driven = [x for x in self.inputs if getattr(x, "joint", None) not in robot.passive]
+            robot = replace(
+                self, passive=checked_names("passive", fields["passive"], self._bare)
+            )
+            driven = [
+                x for x in self.inputs if getattr(x, "joint", None) not in robot.passive
+            ]
             fields = {"inputs": driven, **fields}
         if "wheel_joints" in fields:
             named = checked_names("wheel_joints", fields["wheel_joints"], self._bare)
@@ -265,7 +276,9 @@ class Robot(Coordinates):
             robot = equipped(robot, inputs=fields["inputs"])
         if "appendages" in fields:
             robot = with_appendages(robot, fields["appendages"])
-        checked = {k: check(x, robot) for k, x in fields.items() if (check := FIELDS[k])}
+        checked = {
+            k: check(x, robot) for k, x in fields.items() if (check := FIELDS[k])
+        }
         # A given table replaces the old table. If `merged` is true, the old entries of all joints
         # that the new table does not name stay. Otherwise, only those of modes stay.
         modes = {joint.name for joint in robot.modes}
@@ -274,7 +287,9 @@ class Robot(Coordinates):
             tables += ["rest", "limits"]
         for key in tables:
             if key in checked:
-                kept = {k: x for k, x in getattr(robot, key).items() if merged or k in modes}
+                kept = {
+                    k: x for k, x in getattr(robot, key).items() if merged or k in modes
+                }
                 checked[key] = kept | checked[key]
         robot = replace(robot, **checked)
         if robot.orbit and any(robot.gravity):
@@ -323,7 +338,12 @@ class Robot(Coordinates):
         return self.with_bodies(mass_properties.given_bodies(self._bare.model, bodies))
 
     def perturbed(
-        self, *, mass: float = 0.1, com: float = 0.1, inertia: float = 0.1, seed: int = 0
+        self,
+        *,
+        mass: float = 0.1,
+        com: float = 0.1,
+        inertia: float = 0.1,
+        seed: int = 0,
     ) -> Robot:
         """Return a copy of the robot with random, physically realisable mass properties.
 
@@ -349,7 +369,9 @@ class Robot(Coordinates):
             Copy of the robot with the changed mass properties.
         """
         spreads = {"mass": mass, "com": com, "inertia": inertia}
-        return self.with_bodies(mass_properties.random_bodies(self._bare.model, seed, **spreads))
+        return self.with_bodies(
+            mass_properties.random_bodies(self._bare.model, seed, **spreads)
+        )
 
     def with_bodies(self, bodies: Mapping[int, pin.Inertia]) -> Robot:
         """Return a copy with other inertias {joint index: inertia}, which include the wheels."""
@@ -380,7 +402,9 @@ class Robot(Coordinates):
             model.inertias[at] = other.model.inertias[joint] - mounted
             if model.inertias[at].mass <= 0.0:
                 return changed
-        return replace(changed, model=model, joints=self.joints, followers=self.followers)
+        return replace(
+            changed, model=model, joints=self.joints, followers=self.followers
+        )
 
     pieces = cached_property(mass_properties.pieces_of)
     _sums = cached_property(mass_properties.sums_of)
@@ -388,7 +412,9 @@ class Robot(Coordinates):
     @cached_property
     def link_of(self) -> dict[str, str]:
         """Link names {body: link} of the bodies with one link, for which both names are valid."""
-        return {x.body: name for name, x in self.pieces.items() if x.body not in self.pieces}
+        return {
+            x.body: name for name, x in self.pieces.items() if x.body not in self.pieces
+        }
 
     @property
     def used_frames(self) -> tuple[str, ...]:
@@ -438,7 +464,9 @@ class Robot(Coordinates):
     def springs(self) -> Springs:
         """Stiffness, damping and rest positions (n,) of all joints in state order."""
         rows = np.zeros((3, self.n))
-        for row, given in zip(rows, (self.stiffness, self.damping, self.rest), strict=True):
+        for row, given in zip(
+            rows, (self.stiffness, self.damping, self.rest), strict=True
+        ):
             row[:] = [given.get(name, 0.0) for name in self.joint_names]
         return Springs(*rows)
 
@@ -462,18 +490,26 @@ class Robot(Coordinates):
         """
         if not isinstance(name, str):
             raise unknown("joint", name, self.joint_names)
-        if independent := next((joint for joint in self.joints if joint.name == name), None):
+        if independent := next(
+            (joint for joint in self.joints if joint.name == name), None
+        ):
             return independent
-        leader = next((x.leader.name for x in self.followers if x.joint.name == name), "")
+        leader = next(
+            (x.leader.name for x in self.followers if x.joint.name == name), ""
+        )
         if leader:
-            raise InputError(f"joint '{name}' mimics '{leader}'; give '{leader}' instead")
+            raise InputError(
+                f"joint '{name}' mimics '{leader}'; give '{leader}' instead"
+            )
         if name in (wheel for wheel, _ in named_wheels(self.inputs)):
             raise InputError(
                 f"wheel '{name}' has no inertia, so it is not a joint and has no speed; give the "
                 "wheel an inertia, or its momentum"
             )
         if any(locked.rpartition("=")[0] == name for locked in self.locked):
-            raise InputError(f"joint '{name}' is locked; unlock it, or leave it out here")
+            raise InputError(
+                f"joint '{name}' is locked; unlock it, or leave it out here"
+            )
         raise unknown("joint", name, self.joint_names)
 
     @cached_property

@@ -67,7 +67,9 @@ class FlownWheels(NamedTuple):
         """Return the names of the wheels at an operating point."""
         states = zip(point.state_names, point.x0.tolist(), strict=True)
         rates = {name: value for name, value in states if name.startswith("qdot_m.")}
-        return self.at({name.removeprefix("qdot_m."): speed for name, speed in rates.items()})
+        return self.at(
+            {name.removeprefix("qdot_m."): speed for name, speed in rates.items()}
+        )
 
 
 def flown_wheels(robot: Robot) -> FlownWheels:

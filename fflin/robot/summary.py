@@ -17,11 +17,20 @@ from fflin.robot.inputs import BaseForce, BaseTorque, Thruster
 from fflin.robot.joints import ROOT, Joint
 from fflin.robot.robot import Robot
 
-_STATE = {"rpy": "[deg]", "position": "[m]", "joints": "[rad | m]", "velocity": "[rad/s | m/s]"}
+_STATE = {
+    "rpy": "[deg]",
+    "position": "[m]",
+    "joints": "[rad | m]",
+    "velocity": "[rad/s | m/s]",
+}
 
 _LOOKS = {
-    "reaction_wheel": re.compile(r"(?<![a-z])(rw|(fly|reaction_?)?wheel)(?![a-z])", re.IGNORECASE),
-    "thruster": re.compile(r"(?<![a-z])(thr|thruster|nozzle|rcs)(?![a-z])", re.IGNORECASE),
+    "reaction_wheel": re.compile(
+        r"(?<![a-z])(rw|(fly|reaction_?)?wheel)(?![a-z])", re.IGNORECASE
+    ),
+    "thruster": re.compile(
+        r"(?<![a-z])(thr|thruster|nozzle|rcs)(?![a-z])", re.IGNORECASE
+    ),
 }
 
 # Frequency [rad/s] and damping ratio of the springs and dampers that a draft suggests for joints
@@ -50,12 +59,16 @@ def robot_info(robot: Robot, at_point: str = "") -> str:
     limits = ""
     if any(cell != "." for row in tree[1:] for cell in row[3:]):
         limits = "limits in rad, N m and rad/s, or in m, N and m/s for prismatic joints"
-    frames = [frame.name for frame in robot.model.frames.tolist() if frame.parentJoint >= ROOT]
+    frames = [
+        frame.name for frame in robot.model.frames.tolist() if frame.parentJoint >= ROOT
+    ]
     names = ", ".join(name for name in dict.fromkeys(frames) if name not in modes)
     parts = [head, at_point, grid(tree, "ll"), limits, folded(_settings(robot))]
     parts.append(f"frames\n{_indented(names, '  ')}")
     if robot.notes:
-        parts.append("\n".join(("warnings", *(_indented(note, "    ") for note in robot.notes))))
+        parts.append(
+            "\n".join(("warnings", *(_indented(note, "    ") for note in robot.notes)))
+        )
     return "\n\n".join(filter(None, parts))
 
 
@@ -67,7 +80,9 @@ def _tree(robot: Robot) -> list[list[str]]:
     """
     model = robot.model
     masses = [body.mass for body in model.inertias.tolist()]
-    for index in sorted((model.getJointId(joint.name) for joint in robot.modes), reverse=True):
+    for index in sorted(
+        (model.getJointId(joint.name) for joint in robot.modes), reverse=True
+    ):
         masses[model.parents[index]] += masses[index]
     kinds = {joint: _kind(joint) for joint in robot.joints if not joint.mode}
     kinds |= {joint: "wheel" for joint in robot.joints if joint.name in robot.wheels}
@@ -108,7 +123,10 @@ def _limit(value: float) -> str:
 
 def _settings(robot: Robot) -> list[str]:
     """Return lines about the fields that a URDF does not contain, except inputs and orbit."""
-    outputs = [":".join((y.WORD, *y.frames, *(vars(y).get("joints") or ()))) for y in robot.outputs]
+    outputs = [
+        ":".join((y.WORD, *y.frames, *(vars(y).get("joints") or ())))
+        for y in robot.outputs
+    ]
     shown: dict[str, object] = {
         "stiffness [N m/rad | N/m | 1/s^2]": robot.stiffness,
         "damping [N m s/rad | N s/m | 1/s]": robot.damping,
@@ -122,7 +140,9 @@ def _settings(robot: Robot) -> list[str]:
         "locked joints": robot.locked,
         "gravity [m/s^2]": robot.gravity if any(robot.gravity) else (),
         "outputs": outputs if outputs != ["state"] else (),
-        "limits": {key: f"{low:g} to {high:g}" for key, (low, high) in robot.limits.items()},
+        "limits": {
+            key: f"{low:g} to {high:g}" for key, (low, high) in robot.limits.items()
+        },
         **{f"weights, {part}": value for part, value in robot.weights.items()},
     }
     for name in ("point", "target", "start"):
@@ -130,7 +150,8 @@ def _settings(robot: Robot) -> list[str]:
             shown[f"{name}, {part} {_STATE[part]}"] = value
     lines = [f"{title}: {_as_text(value)}" for title, value in shown.items() if value]
     return lines + [
-        f"{x.title} on frame {x.frame}: modes {', '.join(x.modes)}" for x in robot.appendages
+        f"{x.title} on frame {x.frame}: modes {', '.join(x.modes)}"
+        for x in robot.appendages
     ]
 
 
@@ -168,7 +189,9 @@ def draft(robot: Robot, urdf: str) -> str:
     inertia = {joint.name: float(M[joint.idx_v, joint.idx_v]) for joint in idle}
     known = {name: value for name, value in robot.urdf_damping.items() if value}
     guessed = {name: 2.0 * _DAMPED * _SWING * size for name, size in inertia.items()}
-    damping = {mark + _text(name): guessed[name] for name in guessed if name not in known}
+    damping = {
+        mark + _text(name): guessed[name] for name in guessed if name not in known
+    }
     damping |= {_text(name): value for name, value in known.items()}
     limits = {}
     for name, (low, high) in limits_of(robot).items():
@@ -186,11 +209,14 @@ def draft(robot: Robot, urdf: str) -> str:
     tables = {
         "damping": {key: f"{value:.6g}" for key, value in damping.items()},
         "stiffness": {
-            mark + _text(name): f"{size * _SWING**2:.6g}" for name, size in inertia.items()
+            mark + _text(name): f"{size * _SWING**2:.6g}"
+            for name, size in inertia.items()
         },
         "limits": limits,
     }
-    template = Template((Path(__file__).parent / "assets" / "robot.toml").read_text("utf-8"))
+    template = Template(
+        (Path(__file__).parent / "assets" / "robot.toml").read_text("utf-8")
+    )
     return template.substitute(
         {
             key: "".join(f"{k} = {x}\n" for k, x in entries.items())
@@ -220,13 +246,16 @@ def _candidates(robot: Robot) -> tuple[str, list[str]]:
     text = ""
     spun = []
 
-    def in_order(index: int) -> list[tuple[float, str]]:  # numbers in names compare by value
+    # numbers in names compare by value
+    def in_order(index: int) -> list[tuple[float, str]]:
         parts = re.split(r"([0-9]+)", model.frames[index].name)
         return [(float(x), "") if x.isdecimal() else (-1.0, x) for x in parts]
 
     for index in sorted(range(model.nframes), key=in_order):
         frame = model.frames[index]
-        kind = next((kind for kind, look in _LOOKS.items() if look.search(frame.name)), "")
+        kind = next(
+            (kind for kind, look in _LOOKS.items() if look.search(frame.name)), ""
+        )
         if not kind or frame.type != pin.FrameType.BODY or frame.parentJoint < ROOT:
             continue
         axis = np.array([0.0, 0.0, 1.0])
@@ -239,12 +268,18 @@ def _candidates(robot: Robot) -> tuple[str, list[str]]:
             name = _text(f"{frame.name}_rotor")
             key = "axis"
             joint = model.joints[frame.parentJoint]
-            if joint.nv == 1 and model.frames[frame.parentFrame].type == pin.FrameType.JOINT:
+            if (
+                joint.nv == 1
+                and model.frames[frame.parentFrame].type == pin.FrameType.JOINT
+            ):
                 axis = np.asarray(data.joints[frame.parentJoint].S).reshape(6)[3:]
                 size = axis @ model.inertias[frame.parentJoint].inertia @ axis
                 spun.append(_text(model.names[frame.parentJoint]))
                 lock = f"# To use this wheel, lock joint {spun[-1]} above.\n"
-                effort, speed = model.effortLimit[joint.idx_v], model.velocityLimit[joint.idx_v]
+                effort, speed = (
+                    model.effortLimit[joint.idx_v],
+                    model.velocityLimit[joint.idx_v],
+                )
             else:
                 size = axis @ frame.inertia.inertia @ axis
                 effort = speed = 0.0
@@ -279,7 +314,9 @@ def ideal_inputs(robot: Robot) -> str:
     ideal = [x for x in robot.inputs if isinstance(x, BaseTorque | BaseForce)]
     if not ideal:
         return ""
-    kinds = " and ".join("torque" if isinstance(x, BaseTorque) else "force" for x in ideal)
+    kinds = " and ".join(
+        "torque" if isinstance(x, BaseTorque) else "force" for x in ideal
+    )
     limits = "" if all(x.max is not None for x in ideal) else " without limits"
     return (
         f"an ideal {kinds}{limits} on the base stands for its actuators; for thrusters or wheels, "

@@ -10,7 +10,12 @@ import pinocchio as pin
 from fflin.base.errors import InputError, require_known
 from fflin.base.names import joints_by_name
 from fflin.base.validation import Array, number, printable
-from fflin.robot.equipment.assembly import carry_over, equipped, restore_names, with_marked_frames
+from fflin.robot.equipment.assembly import (
+    carry_over,
+    equipped,
+    restore_names,
+    with_marked_frames,
+)
 from fflin.robot.inputs import Input, ReactionWheel
 from fflin.robot.joints import ROOT, Follower, Joint, find_frame, frame_index, joint_of
 from fflin.robot.mass_properties import dynamic_parameters, link_mass
@@ -54,10 +59,14 @@ def welded(robot: Robot, lock: Lock) -> Robot:
     passive = tuple(name for name in robot.passive if name not in gone)
     spun = tuple(name for name in robot.wheel_joints if name not in gone)
     kept = tuple(x for x in outputs if getattr(x, "joints", None) != ())
-    joints = tuple(joint.within(model) for joint in bare.joints if joint.name not in gone)
+    joints = tuple(
+        joint.within(model) for joint in bare.joints if joint.name not in gone
+    )
     followers = tuple(f.within(model) for f in bare.followers if f.joint.name in left)
     bare = replace(bare, model=model, joints=joints, followers=followers, locked=locked)
-    robot = replace(robot, locked=locked, passive=passive, wheel_joints=spun, outputs=kept)
+    robot = replace(
+        robot, locked=locked, passive=passive, wheel_joints=spun, outputs=kept
+    )
     return equipped(robot, bare, inputs=inputs)
 
 
@@ -79,7 +88,9 @@ def locked_model(
         values[name] = None if position is None else number(f"lock '{name}'", position)
     for name, mimic in mimics.items():
         if values.get(name) is None and (name in values or mimic.leader in values):
-            values[name] = mimic.multiplier * (values.get(mimic.leader) or 0.0) + mimic.offset
+            values[name] = (
+                mimic.multiplier * (values.get(mimic.leader) or 0.0) + mimic.offset
+            )
     q = pin.neutral(model)
     indices = []
     locked = []
@@ -98,11 +109,15 @@ def requested(lock: object) -> dict[str, float | None]:
     """Return locks as {joint or pattern: position}; None stands for the neutral position."""
     lock = () if lock is None else lock
     try:
-        names: list[object] = [lock] if isinstance(lock, str) else [*cast("Iterable[object]", lock)]
+        names: list[object] = (
+            [lock] if isinstance(lock, str) else [*cast("Iterable[object]", lock)]
+        )
     except TypeError:  # not iterable
         names = [None]
     if not all(isinstance(name, str) for name in names):
-        raise InputError(f"lock is {lock!r}, expected {{joint: value}} or names of joints")
+        raise InputError(
+            f"lock is {lock!r}, expected {{joint: value}} or names of joints"
+        )
     if isinstance(lock, Mapping):
         return dict(lock)
     return dict.fromkeys(map(str, names))
@@ -121,7 +136,9 @@ def _reduced(model: pin.Model, indices: Sequence[int], q: Array) -> pin.Model:
     return reduced
 
 
-def joined(robot: Robot, frame: str, other: Robot, placement: pin.SE3, prefix: str) -> Robot:
+def joined(
+    robot: Robot, frame: str, other: Robot, placement: pin.SE3, prefix: str
+) -> Robot:
     """Return `robot` with the base of `other` welded to the frame `frame` of `robot`.
 
     `placement` is the placement of this base in the frame. The joints and frames of `other` get the
@@ -129,17 +146,25 @@ def joined(robot: Robot, frame: str, other: Robot, placement: pin.SE3, prefix: s
     """
     bare = robot._bare
     if "." in printable("prefix", prefix):
-        raise InputError(f"prefix is {prefix!r}, expected a word without dots, such as 'payload'")
+        raise InputError(
+            f"prefix is {prefix!r}, expected a word without dots, such as 'payload'"
+        )
     taken = {*robot.model.names, *(frame.name for frame in robot.model.frames.tolist())}
     if any(name == prefix or name.startswith(f"{prefix}.") for name in taken):
-        raise InputError(f"'{robot.name}' has a joint or frame '{prefix}'; give another prefix")
+        raise InputError(
+            f"'{robot.name}' has a joint or frame '{prefix}'; give another prefix"
+        )
     model = _appended(bare.model, frame, other.model, placement, prefix)
 
     def renamed(joint: Joint) -> Joint:
         return joint._replace(name=f"{prefix}.{joint.name}")
 
-    joints = [joint.within(model) for joint in (*bare.joints, *map(renamed, other.joints))]
-    theirs = (Follower(renamed(f.joint), renamed(f.leader), *f[2:]) for f in other.followers)
+    joints = [
+        joint.within(model) for joint in (*bare.joints, *map(renamed, other.joints))
+    ]
+    theirs = (
+        Follower(renamed(f.joint), renamed(f.leader), *f[2:]) for f in other.followers
+    )
     both: dict[str, Any] = {
         name: getattr(robot, name)
         | {f"{prefix}.{key}": value for key, value in getattr(other, name).items()}

@@ -22,13 +22,27 @@ from fflin.control.policy import Form, OutputForm, PathForm, Policy, StateForm
 from fflin.control.tracking import AT_THE_END, TrajectoryFeedback
 from fflin.dynamics.state import StateMap
 from fflin.kernel import allocation, forward, loop, policies
-from fflin.kernel.compiled import compiles, is_kept, kernel, numba_is_there, without_numba
+from fflin.kernel.compiled import (
+    compiles,
+    is_kept,
+    kernel,
+    numba_is_there,
+    without_numba,
+)
 from fflin.kernel.tree import LANES, batch_tree, empty, laid_out, work_space
 from fflin.robot.fields import input_limits, limits_of
 from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.robot import Robot
 from fflin.simulation.plan import Plan, Times
-from fflin.simulation.run import STOPS, Plant, Recording, ending_of, go, stop_conditions, stop_of
+from fflin.simulation.run import (
+    STOPS,
+    Plant,
+    Recording,
+    ending_of,
+    go,
+    stop_conditions,
+    stop_of,
+)
 
 # By default, a single run of more than LONG steps uses the compiled loop, if the machine code of
 # the loop is already stored.
@@ -68,8 +82,15 @@ def form_of(policy: Policy, robot: Robot) -> Form | None:
     points = math.prod(len(values) for values in form.grid.values())
     nx = 12 + 2 * robot.n
     nu = sum(len(names) for _, names in robot.named_inputs)
-    shaped(f"offsets of {what}", form.offsets, (points, nu), " (points of the grid, nu)")
-    shaped(f"gains of {what}", form.gains, (points, nu, nx), " (points of the grid, nu, nx)")
+    shaped(
+        f"offsets of {what}", form.offsets, (points, nu), " (points of the grid, nu)"
+    )
+    shaped(
+        f"gains of {what}",
+        form.gains,
+        (points, nu, nx),
+        " (points of the grid, nu, nx)",
+    )
     shaped(f"x0 of {what}", form.x0, (nx,), " (nx)")
     return form
 
@@ -129,7 +150,9 @@ def noises(plan: Plan, size: int, step: int, last: int) -> tuple[Indices, Array]
     rows = np.zeros((len(at), size))
     for row, t in zip(rows, (at * times.sample * times.dt).tolist(), strict=True):
         if plan.noise:
-            row[:] = vector("noise(t)", plan.noise(t), size, "one value for each output")
+            row[:] = vector(
+                "noise(t)", plan.noise(t), size, "one value for each output"
+            )
     return at, rows
 
 
@@ -137,7 +160,8 @@ class Statistics:
     """Base class for statistics of eight parallel runs; this class collects none."""
 
     every = 1  # steps from one row to the next
-    span = 4096  # steps between calls of `over`; Ctrl-C takes effect after at most this many
+    # steps between calls of `over`; Ctrl-C takes effect after at most this many
+    span = 4096
 
     def over(self, q: Array, v: Array) -> Mask:
         """Return a mask (LANES,) of the runs that must end early, judged by q and v."""
@@ -171,7 +195,9 @@ class LaneLoop:
     def __init__(self, plan: Plan, runs: Runs | None = None) -> None:
         runs = runs or {}
         if "delay" in runs:  # provide space for the largest delay
-            plan = plan.replace(times=plan.times._replace(delay=int(runs["delay"].max())))
+            plan = plan.replace(
+                times=plan.times._replace(delay=int(runs["delay"].max()))
+            )
         stop = stop_conditions(plan)
         if runs:  # at the start of dispersed runs, q0 of `StopConditions` is positive
             stop = stop._replace(sign=[abs(stop.sign[0])])
@@ -194,7 +220,9 @@ class LaneLoop:
 
     # A diverging motion may overflow before it is stopped, so NumPy's warnings are suppressed.
     @np.errstate(over="ignore", invalid="ignore")
-    def fly(self, statistics: Statistics, out: Runs, runs: Runs | None = None) -> list[str]:
+    def fly(
+        self, statistics: Statistics, out: Runs, runs: Runs | None = None
+    ) -> list[str]:
         """Simulate up to eight runs; return why each run ended early, or an empty text.
 
         `runs` contains the values that differ between the runs. Without `runs`, the plan itself is
@@ -230,7 +258,9 @@ class LaneLoop:
                 bar(done, steps)
                 v = self._state.spread(point.nu.T)
                 for lane in going.nonzero()[0]:
-                    messages[lane] = self._ending(done * times.dt, point.q[:, lane], v[lane])
+                    messages[lane] = self._ending(
+                        done * times.dt, point.q[:, lane], v[lane]
+                    )
                 stop = np.array([float(stop_of(message)) for message in messages])
                 if done % statistics.span == 0:
                     over = statistics.over(point.q.T, v)[:count] & (stop == 0.0)
@@ -271,7 +301,9 @@ class LaneLoop:
         size = len(self.parts.law.y)
         rows = law.added.reshape(len(law.added) // max(size, 1), size, LANES)
         nothing = np.zeros((LANES, size))
-        bias, deviation = (runs.get(key, nothing)[of_lane].T for key in ("sensed", "noise"))
+        bias, deviation = (
+            runs.get(key, nothing)[of_lane].T for key in ("sensed", "noise")
+        )
         rows[:] = bias
         draws = []
         if "seed" in runs:
@@ -292,17 +324,22 @@ class LaneLoop:
 
         return sense
 
-    def _end(self, statistics: Statistics, ending: Mask, stop: Array, out: Runs) -> None:
+    def _end(
+        self, statistics: Statistics, ending: Mask, stop: Array, out: Runs
+    ) -> None:
         """Write the outcomes of the runs that end at the current step into `out`."""
         point = self.parts.point
         kept = self.parts.reference
         count = len(ending)
         conserved = kept.start[:9] + kept.sums[:9]
-        conserved[6:] += self.done * self._plan.times.dt * kept.per_mass * kept.start[:3]
+        conserved[6:] += (
+            self.done * self._plan.times.dt * kept.per_mass * kept.start[:3]
+        )
         last = np.vstack((point.q, point.nu, self.parts.method.u, conserved))
         diverged = (stop == STOPS.index("diverged"))[:count]
         for chosen, finite in ((ending & diverged, False), (ending & ~diverged, True)):
-            if finite:  # the last state of a diverged run may not be finite, so it is not added
+            # the last state of a diverged run may not be finite, so it is not added
+            if finite:
                 statistics.add(self.done, last[None])
             outcome = statistics.outcome(self.done, stop)
             for name, rows in out.items():
@@ -335,16 +372,21 @@ def recorded(plan: Plan, runs: Runs | None = None) -> Recording:
             raise
         stopped = f"interrupted at t = {loop.done * dt:g} s"
     if runs is None and not np.isfinite(loop.parts.method.u).all():
-        return go(plan)  # the Python engine raises an error that names the invalid command
+        # the Python engine raises an error that names the invalid command
+        return go(plan)
     count = -(-loop.done // every)
     t = np.append(every * np.arange(count) * dt, loop.done * dt)
     count += not stopped.startswith(("diverged", "interrupted"))
     q, nu, u, momentum, center, _ = np.split(rows.kept[:count], loop.ends, axis=1)
     v = plan.plant.state.spread(nu)
-    return Recording(t[:count], q, v, u, momentum, center, loop.done, stopped, "compiled")
+    return Recording(
+        t[:count], q, v, u, momentum, center, loop.done, stopped, "compiled"
+    )
 
 
-def packed(plan: Plan, stop: loop.StopConditions, *, noisy: bool = False) -> loop.Arguments:
+def packed(
+    plan: Plan, stop: loop.StopConditions, *, noisy: bool = False
+) -> loop.Arguments:
     """Return the arguments of `kernel.loop.advance` for a plan that the kernel supports.
 
     `stop.squares` (nv,) must contain the squared limits of the entries of v. If `noisy` is true,
@@ -418,7 +460,9 @@ def no_law(state: StateMap, u: Array) -> policies.Law:
         near=np.zeros(state.robot.n),
         x=np.zeros(state.nx),
         u=u,
-        path=law.path._replace(along=np.zeros(len(nu)), e=np.zeros(state.nx), point=point),
+        path=law.path._replace(
+            along=np.zeros(len(nu)), e=np.zeros(state.nx), point=point
+        ),
     )
 
 
@@ -434,7 +478,9 @@ def _law(plan: Plan, mechanics: forward.Mechanics, noisy: bool) -> policies.Law:
     form = None
     if plan.policy:
         if design := plan.policy.commanded_robot:
-            asking = Plant(StateMap(design, reference=state.reference, frame=state.frame))
+            asking = Plant(
+                StateMap(design, reference=state.reference, frame=state.frame)
+            )
         form = form_of(plan.policy.inner, asking.robot)
     law = no_law(state, np.zeros(len(asking.actuation.names)))
     if asking is not plan.plant:
@@ -472,7 +518,9 @@ def _linear(law: policies.Law, form: StateForm, state: StateMap) -> policies.Law
     return law._replace(grid=grid)
 
 
-def _filtered(law: policies.Law, plan: Plan, form: OutputForm, asking: Plant) -> policies.Law:
+def _filtered(
+    law: policies.Law, plan: Plan, form: OutputForm, asking: Plant
+) -> policies.Law:
     """Return the law of a compensator.
 
     The law commands the inputs of the plant `asking`. Along a trajectory, the law contains the
@@ -488,7 +536,10 @@ def _filtered(law: policies.Law, plan: Plan, form: OutputForm, asking: Plant) ->
     _, measures, near = zip(*map(loop.at, starts), strict=True)
     nz = len(loop.estimate)
     stages = 1 if times.sample else 1 + len(plan.method.nodes)
-    terms = [term._replace(jump=np.broadcast_to(term.jump, nz)) for term in map(form.terms, starts)]
+    terms = [
+        term._replace(jump=np.broadcast_to(term.jump, nz))
+        for term in map(form.terms, starts)
+    ]
     compensator = {
         key: np.concatenate([getattr(term, key).ravel() for term in terms])
         for key in Sample._fields
@@ -499,9 +550,13 @@ def _filtered(law: policies.Law, plan: Plan, form: OutputForm, asking: Plant) ->
     turns = [axes[f.joint - ROOT].T @ f.placement.rotation for f in frames]
     return law._replace(
         kind=policies.LINEAR,
-        origin=np.concatenate([pin.SE3ToXYZQUAT(measure.state.origin) for measure in measures]),
+        origin=np.concatenate(
+            [pin.SE3ToXYZQUAT(measure.state.origin) for measure in measures]
+        ),
         near=np.concatenate([x[state.groups.q_m] for x in near]),
-        filter=policies.Filter(**compensator, z=np.zeros(nz), rates=np.zeros(stages * nz)),
+        filter=policies.Filter(
+            **compensator, z=np.zeros(nz), rates=np.zeros(stages * nz)
+        ),
         measured=measured,
         gyros=[frame.joint - ROOT for frame in frames],
         gyro_axes=np.array([turn.ravel("F") for turn in turns]).ravel(),
@@ -509,7 +564,9 @@ def _filtered(law: policies.Law, plan: Plan, form: OutputForm, asking: Plant) ->
     )
 
 
-def _allocation(plant: Plant, asking: Plant, giving: forward.Mechanics) -> allocation.Allocation:
+def _allocation(
+    plant: Plant, asking: Plant, giving: forward.Mechanics
+) -> allocation.Allocation:
     """Return the allocation of commands to the inputs of the simulated robot.
 
     The commands are for the inputs of the plant `asking`. The simulated robot is the robot of
@@ -519,7 +576,9 @@ def _allocation(plant: Plant, asking: Plant, giving: forward.Mechanics) -> alloc
     size = plant.state.nx // 2
     least, most = input_limits(plant.robot, limits_of(plant.robot))
     inputs = max(len(robot.actuation.names) for robot in (asking, plant))
-    point = empty(forward.POINT)._replace(q=np.zeros(plant.robot.nq), pushing=np.zeros(inputs))
+    point = empty(forward.POINT)._replace(
+        q=np.zeros(plant.robot.nq), pushing=np.zeros(inputs)
+    )
     return allocation.Allocation(
         asking=asks,
         giving=giving,

@@ -17,7 +17,12 @@ from fflin.base.record import Design
 from fflin.base.tables import data_frame
 from fflin.base.validation import Array, Open, Vector, instance
 from fflin.base.writing import RECORDS, as_path, check_ending
-from fflin.dynamics.coordinates import attitude_errors, frame_of, moving_errors, state_history
+from fflin.dynamics.coordinates import (
+    attitude_errors,
+    frame_of,
+    moving_errors,
+    state_history,
+)
 from fflin.dynamics.impact import Impact, joint_called
 from fflin.dynamics.state import Actuation, StateMap
 from fflin.linear.files import labels, write_table
@@ -162,8 +167,10 @@ class Motion(StatesAndInputs, Design):
     urdf_sha256: str
     stopped: str
     com_drift: Vector = field(default_factory=lambda: np.zeros(0))
-    _robot: Any = field(default=None, kw_only=True)  # simulated robot; not saved in files
-    _nominal: str = field(default="", kw_only=True)  # checksum of the nominal robot; not saved
+    # simulated robot; not saved in files
+    _robot: Any = field(default=None, kw_only=True)
+    # checksum of the nominal robot; not saved
+    _nominal: str = field(default="", kw_only=True)
     wheels: tuple[str, ...] = field(default_factory=tuple)
     wheel_inertias: Vector = field(default_factory=lambda: np.zeros(0))
     steered: tuple[str, ...] = field(default_factory=tuple)
@@ -174,25 +181,42 @@ class Motion(StatesAndInputs, Design):
     step: float = 0.0
     phases: tuple[str, ...] = field(default_factory=tuple)
     starts: Vector = field(default_factory=lambda: np.zeros(0))
-    _phases: tuple[Any, ...] = field(default=(), kw_only=True)  # motions and impacts; not saved
+    # motions and impacts; not saved
+    _phases: tuple[Any, ...] = field(default=(), kw_only=True)
     circles: str = field(default_factory=str)  # the orbit, as text
     modes: tuple[str, ...] = field(default_factory=tuple)
     mode_rotations: Vector = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
-        rows = (self.q, self.v, self.x, self.u, self.energy, self.momentum, self.momentum_drift)
+        rows = (
+            self.q,
+            self.v,
+            self.x,
+            self.u,
+            self.energy,
+            self.momentum,
+            self.momentum_drift,
+        )
         may_lack = (self.prediction, self.com_drift)
         count = len(self.t)
-        if any(len(x) != count for x in rows) or any(len(x) not in (0, count) for x in may_lack):
-            raise InputError(f"a motion has {count} times; every history needs as many rows")
+        if any(len(x) != count for x in rows) or any(
+            len(x) not in (0, count) for x in may_lack
+        ):
+            raise InputError(
+                f"a motion has {count} times; every history needs as many rows"
+            )
         of_target = self.target.shape[-1] if self.target.ndim else 1
         if self.target.size and of_target != self.x.shape[1] != self.target.size:
-            raise InputError(f"the target has shape {self.target.shape}, expected a state or rows")
+            raise InputError(
+                f"the target has shape {self.target.shape}, expected a state or rows"
+            )
         if self.target.size in (0, self.x.shape[1]):  # .mat files have no vectors
             object.__setattr__(self, "target", self.target.ravel())
         if not len(self.prediction):  # .json files have no empty matrices
             object.__setattr__(self, "prediction", np.zeros((0, self.x.shape[1])))
-        object.__setattr__(self, "limits", self.limits.reshape(len(self.limit_names), 2))
+        object.__setattr__(
+            self, "limits", self.limits.reshape(len(self.limit_names), 2)
+        )
         super().__post_init__()
 
     def __repr__(self) -> str:
@@ -292,7 +316,9 @@ class Motion(StatesAndInputs, Design):
                 "simulate"
             )
         first = parts[0]
-        whole: Motion = replace(first, phases=(first.robot,), starts=first.t[:1], _phases=parts)
+        whole: Motion = replace(
+            first, phases=(first.robot,), starts=first.t[:1], _phases=parts
+        )
         robot = whole._robot
         q = whole.q[-1]
         v = whole.v[-1]
@@ -307,9 +333,15 @@ class Motion(StatesAndInputs, Design):
                 first_row = [part.q[0], part.v[0]]
             first_q, first_v = first_row
             seen, rates = _seen(robot, other, q, first_q[None], first_v[None])
-            apart = np.abs([pin.difference(robot.model, q, seen[0]), rates[0] - v]).max(axis=0)
+            apart = np.abs([pin.difference(robot.model, q, seen[0]), rates[0] - v]).max(
+                axis=0
+            )
             if apart.max() > _MET * max(1.0, np.abs(v).max()):
-                at = max(i for i, start in enumerate(robot.model.idx_vs) if start <= apart.argmax())
+                at = max(
+                    i
+                    for i, start in enumerate(robot.model.idx_vs)
+                    if start <= apart.argmax()
+                )
                 raise InputError(
                     f"'{name}' does not begin where the motion before it ended: "
                     f"'{robot.model.names[at]}' differs by {apart.max():.2g} in position or rate; "
@@ -317,7 +349,9 @@ class Motion(StatesAndInputs, Design):
                 )
             if isinstance(part, Impact):
                 robot, q, v, event = part.robot, part.q, part.v, part.event
-                whole = replace(whole, notes=(*whole.notes, f"{whole.t[-1]:g} s: {part.told}"))
+                whole = replace(
+                    whole, notes=(*whole.notes, f"{whole.t[-1]:g} s: {part.told}")
+                )
             else:
                 robot = other
                 q = part.q[-1]
@@ -385,7 +419,9 @@ class Motion(StatesAndInputs, Design):
         """
         return data_frame(*self._table(), index="t [s]")
 
-    def plot(self, path: str | Path | None = None, *, show: Sequence[str] | None = None) -> Figure:
+    def plot(
+        self, path: str | Path | None = None, *, show: Sequence[str] | None = None
+    ) -> Figure:
         """Draw the motion by `plot_motion`, and save the figure if a path is given."""
         from fflin import plot_motion
 
@@ -397,7 +433,9 @@ def require_motion(motion: object) -> Motion:
     return instance("motion", motion, Motion, "a Motion, as fflin.simulate returns it")
 
 
-def _seen(robot: Robot, other: Robot, last: Array, q: Array, v: Array) -> tuple[Array, Array]:
+def _seen(
+    robot: Robot, other: Robot, last: Array, q: Array, v: Array
+) -> tuple[Array, Array]:
     """Convert rows q (N, nq) and v (N, nv) of the robot `other` to the coordinates of `robot`.
 
     Joints that `other` lacks are at rest, at their positions in `last` (nq,), a configuration of
@@ -407,8 +445,12 @@ def _seen(robot: Robot, other: Robot, last: Array, q: Array, v: Array) -> tuple[
     for name in list(robot.model.names)[ROOT:]:
         if other.model.existJointName(name):
             joint, other_joint = joint_called(robot, name), joint_called(other, name)
-            own_q[:, joint.idx_q :][:, : joint.nq] = q[:, other_joint.idx_q :][:, : joint.nq]
-            own_v[:, joint.idx_v :][:, : joint.nv] = v[:, other_joint.idx_v :][:, : joint.nv]
+            own_q[:, joint.idx_q :][:, : joint.nq] = q[:, other_joint.idx_q :][
+                :, : joint.nq
+            ]
+            own_v[:, joint.idx_v :][:, : joint.nv] = v[:, other_joint.idx_v :][
+                :, : joint.nv
+            ]
     return own_q, own_v
 
 
@@ -446,13 +488,17 @@ def _longer(whole: Motion, motion: Motion, name: str) -> Motion:
     target = np.zeros(0)
     if whole.target.size and motion.target.size:
         points = other_state.points(np.atleast_2d(motion.target))[1:]
-        goals = state_history(state, *_seen(state.robot, other_state.robot, last, *points), near)
+        goals = state_history(
+            state, *_seen(state.robot, other_state.robot, last, *points), near
+        )
         both = (whole.target, len(whole.t)), (goals, len(t))
         target = np.vstack([np.broadcast_to(x, (n, state.nx)) for x, n in both])
     u = np.zeros((len(t), len(whole.input_names)))  # missing inputs are zero
     u[:, [whole.input_names.index(name) for name in motion.input_names]] = motion.u
     for held in Actuation(state).held:  # inputs in reference axes
-        u[:, held] = u[:, held] @ other_state.reference.rotation.T @ state.reference.rotation
+        u[:, held] = (
+            u[:, held] @ other_state.reference.rotation.T @ state.reference.rotation
+        )
     rows = {"t": t, "q": q, "v": v, "x": state_history(state, q, v, near, t), "u": u}
     joined: dict[str, Any] = {}
     for key in (*rows, "energy", "momentum", "momentum_drift", "com_drift"):

@@ -33,7 +33,11 @@ from fflin.simulation.run import ROUNDED_DOWN, ROUNDED_UP, Plant
 
 # Names in messages: the robot with constant inputs, a loop that is constant during the run, and a
 # rotation, which acts like an undamped oscillation.
-ROBOT, CLOSED_LOOP, ROTATION = "robot", "closed loop", "rotation of the base or of a joint"
+ROBOT, CLOSED_LOOP, ROTATION = (
+    "robot",
+    "closed loop",
+    "rotation of the base or of a joint",
+)
 LONGEST_STEP = 0.01  # [s] default time step, if no pole requires a shorter step
 _DAMPING, _AMPLITUDE = 0.05, 0.01  # tolerances in (11.4)
 _SHORTEST_STEP = 1e-12  # [s] at which the search for a step ends
@@ -151,7 +155,9 @@ class Poles:
         poles, right = np.linalg.eig(self.A)
         k = int(np.abs(poles - pole).argmin())
         poles, left = np.linalg.eig(self.A.T)
-        participation = np.abs(left[:, int(np.abs(poles - pole).argmin())] * right[:, k])
+        participation = np.abs(
+            left[:, int(np.abs(poles - pole).argmin())] * right[:, k]
+        )
         index = int(participation[: len(self.state_names)].argmax())
         return self.state_names[index]
 
@@ -190,7 +196,9 @@ class SampledLoop:
             integrated = self.loop(self._integrated(dt / steps, steps))
         if not np.isfinite(integrated).all():
             return Demand(math.inf, lambda: "the sampled loop")
-        exact, simulated = _matched(np.linalg.eigvals(exact_loop), np.linalg.eigvals(integrated))
+        exact, simulated = _matched(
+            np.linalg.eigvals(exact_loop), np.linalg.eigvals(integrated)
+        )
         lasts = np.abs(exact) > _VANISHING
         if not lasts.any():
             return Demand(0.0, str)
@@ -198,7 +206,9 @@ class SampledLoop:
         growth: Array = np.log(np.maximum(np.abs(simulated[lasts]), 1e-300))
         errors = step_error(poles.real * dt, growth, dt, duration)
         worst = int(errors.argmax())
-        return Demand(float(errors[worst]), lambda: Poles("sampled loop", poles).mode(worst))
+        return Demand(
+            float(errors[worst]), lambda: Poles("sampled loop", poles).mode(worst)
+        )
 
     def _integrated(self, h: float, steps: int) -> LinearModel:
         """Return the sampled model of the plant as the integrator computes it."""
@@ -229,7 +239,11 @@ class Signal:
 
     @classmethod
     def of(
-        cls, name: str, signal: Callable[[float], Array], dt: float | None, duration: float
+        cls,
+        name: str,
+        signal: Callable[[float], Array],
+        dt: float | None,
+        duration: float,
     ) -> Signal:
         """Return the limit of a function of time, for a given step dt [s] or the default step."""
         longest = LONGEST_STEP if dt is None else dt
@@ -250,14 +264,18 @@ class Signal:
 class Pace:
     """The limits of the time step for a run of a given duration with a given method."""
 
-    def __init__(self, limits: Sequence[Limit], method: type[Integrator], duration: float) -> None:
+    def __init__(
+        self, limits: Sequence[Limit], method: type[Integrator], duration: float
+    ) -> None:
         self.limits = tuple(limits)
         self._method = method
         self._duration = duration
 
     def demand(self, h: float) -> Demand:
         """Return the largest step error (11.4) of a step of h [s]; it should be at most 1."""
-        demands = [limit.demand(self._method, h, self._duration) for limit in self.limits]
+        demands = [
+            limit.demand(self._method, h, self._duration) for limit in self.limits
+        ]
         return max(demands, key=lambda limit: limit.error, default=Demand(0.0, str))
 
     def step(self, longest: float = LONGEST_STEP) -> tuple[float, str]:
@@ -372,7 +390,9 @@ def _plant_model(
     robot = plant.robot.replace(outputs=[FullState()])
     state = plant.state
     if not robot.orbit:
-        model = Linearizer(robot, frame="local", moving=True)(q, v, _in_base_axes(plant, q, u))
+        model = Linearizer(robot, frame="local", moving=True)(
+            q, v, _in_base_axes(plant, q, u)
+        )
         return model.A, model.B, model.state_names
     try:
         model = Linearizer(robot, frame=state.frame, reference=state.reference)(q, v, u)
@@ -456,7 +476,11 @@ def _is_resolved(signal: Callable[[float], Array], h: float, duration: float) ->
         end = signal((first + 1) * h * ROUNDED_DOWN)
         for s in _BETWEEN:
             exact = signal((first + s) * h)
-            weights = (1.0 - s) * (1.0 - 2.0 * s), 4.0 * s * (1.0 - s), s * (2.0 * s - 1.0)
+            weights = (
+                (1.0 - s) * (1.0 - 2.0 * s),
+                4.0 * s * (1.0 - s),
+                s * (2.0 * s - 1.0),
+            )
             parabola = weights[0] * start + weights[1] * middle + weights[2] * end
             errors = max(errors, float(np.abs(exact - parabola).max(initial=0.0)))
             largest = max(largest, float(np.abs(exact).max(initial=0.0)))

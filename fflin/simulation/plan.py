@@ -27,7 +27,14 @@ from fflin.base.validation import (
     vector,
     whole,
 )
-from fflin.control.channel import Inputs, Law, Saturation, channelled, saturation, warn_beyond
+from fflin.control.channel import (
+    Inputs,
+    Law,
+    Saturation,
+    channelled,
+    saturation,
+    warn_beyond,
+)
 from fflin.control.policies import Feedback
 from fflin.control.policy import Policy, bound
 from fflin.control.tracking import prepared
@@ -97,7 +104,8 @@ class Times(NamedTuple):
     dt: float
     steps: int
     every: int  # steps between recorded rows
-    sample: int  # steps between samples of the law; 0 if the law is evaluated at all stages
+    # steps between samples of the law; 0 if the law is evaluated at all stages
+    sample: int
     delay: int  # steps from a sample to its effect
     notes: tuple[str, ...]  # remarks on the recorded rows, for the report
 
@@ -116,7 +124,9 @@ class Plan:
     """Checked arguments of `simulate`, and data derived from them; constant during the run."""
 
     def __init__(self, options: SimulationOptions) -> None:
-        robot = instance("robot", options.robot, Robot, "a fflin.Robot; fflin.load makes one")
+        robot = instance(
+            "robot", options.robot, Robot, "a fflin.Robot; fflin.load makes one"
+        )
         self.events = _functions(options)
         policy = None if options.policy is None else prepared(options.policy, robot)
         self.options = options
@@ -126,9 +136,15 @@ class Plan:
         self.method = integrator(options.method)
         lin = policy.model if policy else None
         follows = policy.reference_motion if policy else None
-        default = partial(points.start_of, robot) if follows is None else lambda: follows(0.0)[:2]
+        default = (
+            partial(points.start_of, robot)
+            if follows is None
+            else lambda: follows(0.0)[:2]
+        )
         # Initial configuration (nq,) and velocity (nv,).
-        self.q, self.v = points.point_of(state, options.x0, options.q0, options.v0, default)
+        self.q, self.v = points.point_of(
+            state, options.x0, options.q0, options.v0, default
+        )
         points.require_slow("the initial velocity", self.v)
         if plant.field:
             plant.field.require_near(self.q)
@@ -136,7 +152,9 @@ class Plan:
         sample = sample_of(policy, options.sample)
         dt = None if options.dt is None else _positive("the step dt", options.dt)
         u = _inputs_at_start(policy, plant)
-        limits = limits_of_step(plant, policy, commands, self.q, self.v, u, sample or 0.0)
+        limits = limits_of_step(
+            plant, policy, commands, self.q, self.v, u, sample or 0.0
+        )
         if options.disturbance is not None:
             disturbance = partial(plant.disturbing, q=self.q, v=self.v)
             limits.append(Signal.of("the disturbance", disturbance, dt, duration))
@@ -208,7 +226,9 @@ class Plan:
         x = goal
         if isinstance(goal, LinearModel):
             names, x = goal.state_names, goal.x0
-        rates = dict(zip(names, np.ravel(as_double("target", x)).tolist(), strict=False))
+        rates = dict(
+            zip(names, np.ravel(as_double("target", x)).tolist(), strict=False)
+        )
         v = np.zeros(state.robot.nv)
         for joint in state.robot.joints:
             v[joint.idx_v] = rates.get(f"qdot_m.{joint.name}", 0.0)
@@ -229,10 +249,14 @@ class Plan:
         delay and thruster pulses.
         """
         times = self.times
-        return channelled(law, speeds, self.limits, self.initial, times.sample, times.delay)
+        return channelled(
+            law, speeds, self.limits, self.initial, times.sample, times.delay
+        )
 
 
-def law_of(policy: Policy | None, plant: Plant, limits: Saturation, times: Times) -> Law | None:
+def law_of(
+    policy: Policy | None, plant: Plant, limits: Saturation, times: Times
+) -> Law | None:
     """Return the policy, bound to the robot, as a law that checks commands; None if no policy."""
     if policy is None:
         return None
@@ -251,10 +275,16 @@ def target_of(state: StateMap, target: LinearModel | ArrayLike | None) -> Array 
         goal: Array = vector("target", target, state.nx, "a state (12 + 2n)").copy()
         state.to_pinocchio(goal)  # raises an error for an invalid attitude
         return goal
-    theirs = set(target.state_names) <= set(state.names) and len(target.q) == state.robot.nq
+    theirs = (
+        set(target.state_names) <= set(state.names) and len(target.q) == state.robot.nq
+    )
     # In orbit, the model and the simulation must have the same frame, because q is relative to the
     # orbital frame.
-    if target.moving or not theirs or (state.robot.orbit and target.frame != state.frame):
+    if (
+        target.moving
+        or not theirs
+        or (state.robot.orbit and target.frame != state.frame)
+    ):
         wanted = f"a state of '{state.robot.name}' or a model of that robot about a fixed point"
         if state.robot.orbit:
             wanted += f" in frame {state.frame!r}"
@@ -298,14 +328,18 @@ def _functions(options: SimulationOptions) -> tuple[Event, ...]:
     """Return the events; raise `InputError` if an option that must be a function is not one."""
     expected = "a list of functions event(t, q, v)"
     events = tuple(instance("events", options.events, Sequence, expected))
-    functions: list[tuple[str, object, str]] = [("event", event, "(t, q, v)") for event in events]
+    functions: list[tuple[str, object, str]] = [
+        ("event", event, "(t, q, v)") for event in events
+    ]
     functions.append(("callback", options.callback, "(t, q, v, u)"))
     if not isinstance(options.disturbance, Mapping):
         functions.append(("disturbance", options.disturbance, "(t, q, v)"))
     for name, given, arguments in functions:
         if not callable(given) and (given is not None or name == "event"):
             kind = type(given).__name__
-            raise InputError(f"{name} has type {kind}, expected a function of {arguments}")
+            raise InputError(
+                f"{name} has type {kind}, expected a function of {arguments}"
+            )
         if callable(given):
             function(name, given, arguments)
     return events
@@ -320,7 +354,9 @@ def _inputs_at_start(policy: Policy | None, plant: Plant) -> Array:
     return initial
 
 
-def _warn_beyond_limits(policy: Policy | None, plant: Plant, limits: Saturation) -> None:
+def _warn_beyond_limits(
+    policy: Policy | None, plant: Plant, limits: Saturation
+) -> None:
     """Warn if the reference inputs of a policy exceed the limits.
 
     If the policy follows a trajectory, warn if its inputs exceed the limits at any time.
@@ -426,7 +462,9 @@ def times_of(
         message = f"one in {every} steps is recorded; every=1 (--every 1) records all "
         notes.append(f"{message}{steps:,} steps")
     if every % part and part % every:
-        message = f"a row is recorded every {every} steps, but the controller samples every "
+        message = (
+            f"a row is recorded every {every} steps, but the controller samples every "
+        )
         notes.append(f"{message}{part} steps, so the rows are not a valid trajectory")
     times = Times(dt, steps, every, samples, late, tuple(notes))
     _require_possible(options, times, mode, thinned=thinned)
@@ -441,7 +479,9 @@ def _require_possible(
     `mode` names the mode that makes an automatic step short, and is empty for other steps.
     """
     steps, dt = times.steps, times.dt
-    entries = times.rows * (options.robot.nq + options.robot.nv + 24 + 4 * options.robot.n)
+    entries = times.rows * (
+        options.robot.nq + options.robot.nv + 24 + 4 * options.robot.n
+    )
     most_steps = _ENDLESS if thinned else _MOST_STEPS
     if entries > _MOST_ENTRIES or steps > most_steps:
         reason = f"; {mode} requires this step" if mode else ""
@@ -465,7 +505,9 @@ _COUNTABLE = 2**53  # a double represents every whole number up to this one
 def _in_steps(name: str, time: float, dt: float) -> int:
     """Convert a time [s] to a number of steps; raise `InputError` unless it is a multiple of dt."""
     if time / dt > _COUNTABLE:
-        raise InputError(f"{name} is {time:g} s, which is too many steps of dt = {dt:g} s")
+        raise InputError(
+            f"{name} is {time:g} s, which is too many steps of dt = {dt:g} s"
+        )
     if abs(round(time / dt) * dt - time) > 1e-6 * dt:
         raise InputError(
             f"{name} is {time:g} s, expected a multiple of the step dt = {dt:g} s; "
@@ -481,14 +523,20 @@ def _part_of(sample: float, largest: float, *times: float) -> float:
     """
     least = int(np.ceil(sample / largest))
     steps = [sample / parts for parts in range(least, least + 1000)]
-    fit = (dt for dt in steps if all(abs(round(t / dt) * dt - t) <= 1e-6 * dt for t in times))
+    fit = (
+        dt
+        for dt in steps
+        if all(abs(round(t / dt) * dt - t) <= 1e-6 * dt for t in times)
+    )
     return next(fit, steps[0])
 
 
 def _positive(name: str, value: object) -> float:
     time = number(name, value)
     if not 1.0 / _FOREVER < time <= _FOREVER:
-        raise InputError(f"{name} is {time:g} s, expected more than 0 and at most {_FOREVER:g} s")
+        raise InputError(
+            f"{name} is {time:g} s, expected more than 0 and at most {_FOREVER:g} s"
+        )
     return time
 
 

@@ -49,8 +49,12 @@ def resting_from(motion: Motion) -> float | None:
 
     Return None if the target never moves or never comes to rest, or if the motion has phases.
     """
-    places = motion.target[:, : motion.x.shape[1] // 2] if motion.tracked else motion.x[:1]
-    moved = np.flatnonzero(np.abs(np.diff(places, axis=0)).max(axis=1, initial=0.0) > _STILL)
+    places = (
+        motion.target[:, : motion.x.shape[1] // 2] if motion.tracked else motion.x[:1]
+    )
+    moved = np.flatnonzero(
+        np.abs(np.diff(places, axis=0)).max(axis=1, initial=0.0) > _STILL
+    )
     if motion.phases or not len(moved) or moved[-1] + 2 >= len(places):
         return None
     return float(motion.t[moved[-1] + 1])
@@ -119,7 +123,9 @@ def plot_motion(
     legends: dict[str, dict[str, Artist]] = {}
     with drawing(path, 11.0, 0.3 + sum(heights), axes=axes) as figure:
         colors = dict(zip(joints, cycle(len(joints)), strict=True))
-        grid = figure.add_gridspec(len(heights), _ACROSS, height_ratios=heights, hspace=0.06)
+        grid = figure.add_gridspec(
+            len(heights), _ACROSS, height_ratios=heights, hspace=0.06
+        )
         for (row, column), (title, chart) in zip(spots, drawn.items(), strict=False):
             panel = figure.add_subplot(grid[row, column])
             group = chart[0].group
@@ -127,7 +133,9 @@ def plot_motion(
             chart_colors = colors if group in JOINTS else {}
             _draw(panel, motion.t, chart, chart_colors)
             if motion.tracked and [title] == states[:1]:
-                panel.plot([], [], color="#888888", lw=3.6, alpha=0.3, label="reference")
+                panel.plot(
+                    [], [], color="#888888", lw=3.6, alpha=0.3, label="reference"
+                )
             if group in JOINTS or len(chart) > _MOST_IN_A_PANEL:
                 # Long joint names, or many names, do not fit into a chart. Their legends are below
                 # all charts. One legend names the joints of all charts.
@@ -171,12 +179,20 @@ def charts(motion: Motion, show: Sequence[str] | None = None) -> dict[str, list[
     names = (*motion.state_names, *input_keys(motion))
     show = [show] if isinstance(show, str) else show
     if not (show is None or isinstance(show, Sequence)):
-        raise InputError(f"show is {show!r}, expected a list of names, groups or patterns")
-    keys = names if show is None else [names[i] for i in chosen("state or input", show, names)]
+        raise InputError(
+            f"show is {show!r}, expected a list of names, groups or patterns"
+        )
+    keys = (
+        names
+        if show is None
+        else [names[i] for i in chosen("state or input", show, names)]
+    )
     curves_of_title: dict[str, list[Curve]] = {title: [] for title in _TITLES.values()}
     for curve in curves(motion):
         if curve.key in keys:
-            title = _TITLES.get((curve.group, curve.unit), f"{curve.group} in {curve.unit}")
+            title = _TITLES.get(
+                (curve.group, curve.unit), f"{curve.group} in {curve.unit}"
+            )
             curves_of_title.setdefault(title, []).append(curve)
     return {title: chart for title, chart in curves_of_title.items() if chart}
 
@@ -201,7 +217,9 @@ def _errors(motion: Motion) -> tuple[str, dict[str, Curve]]:
     else:
         return label, {}
     columns, none = zip(names, units, e.T, strict=True), np.zeros(0)
-    return label, {name: Curve(name, "", name, unit, x, none) for name, unit, x in columns}
+    return label, {
+        name: Curve(name, "", name, unit, x, none) for name, unit, x in columns
+    }
 
 
 def _draw(
@@ -219,13 +237,17 @@ def _draw(
         if getattr(chart[0], field) is not None:
             rows = np.array([getattr(curve, field) for curve in chart])
             rows[:, 1:][:, (rows[:, 1:] * rows[:, :-1]).sum(axis=0) < -0.5] = np.nan
-            chart = [c._replace(**{field: row}) for c, row in zip(chart, rows, strict=True)]
+            chart = [
+                c._replace(**{field: row}) for c, row in zip(chart, rows, strict=True)
+            ]
     steps = "default" if group in ("", *STATES, "speed", "momentum") else "steps-post"
     for default_color, curve in zip(cycle(len(chart)), chart, strict=True):
         color = colors.get(curve.short, default_color)
         if curve.reference is not None:
             axes.plot(t, curve.reference, color=color, lw=3.6, alpha=0.3)
-        axes.plot(t, curve.values, color=color, label=curve.short, drawstyle=steps, lw=width)
+        axes.plot(
+            t, curve.values, color=color, label=curve.short, drawstyle=steps, lw=width
+        )
         if curve.linear is not None:
             axes.plot(t, curve.linear, color=color, ls="--", lw=1.0)
     levels = sorted({level for curve in chart for level in curve.near})
@@ -257,14 +279,23 @@ def _name_below(figure: Figure, legends: Mapping[str, Mapping[str, Artist]]) -> 
         names = sorted(named, key="limit".__eq__)  # the limit last
         lines = [named[name] for name in names]
         place: Any = f"outside lower {side}"
-        figure.legend(lines, names, loc=place, ncols=columns, handlelength=1.6, title=title)
+        figure.legend(
+            lines, names, loc=place, ncols=columns, handlelength=1.6, title=title
+        )
 
 
 def _draw_drifts(axes: Axes, motion: Motion) -> None:
     # A logarithmic axis cannot show zero, so drifts below a tenth of the machine epsilon are drawn
     # at this value.
-    drifts = {motion.kept: motion.momentum_drift, "centre of mass [m]": motion.com_drift}
-    shown = {k: np.maximum(v, np.finfo(float).eps / 10.0) for k, v in drifts.items() if len(v)}
+    drifts = {
+        motion.kept: motion.momentum_drift,
+        "centre of mass [m]": motion.com_drift,
+    }
+    shown = {
+        k: np.maximum(v, np.finfo(float).eps / 10.0)
+        for k, v in drifts.items()
+        if len(v)
+    }
     for color, (label, drift) in zip(COLORS, shown.items(), strict=False):
         axes.semilogy(motion.t, drift, color=color, label=label)
     axes.set(title=f"relative {next(iter(shown))} drift", xlabel="t [s]")

@@ -44,7 +44,8 @@ _SHARE = 1e-3
 # Standard gravity [m/s^2], which relates the specific impulse of a thruster to its exhaust speed.
 _GRAVITY = 9.80665
 
-_MOST, _NAMED = 8, 4  # largest number of lines of a list, and of saturated inputs in a line
+# largest number of lines of a list, and of saturated inputs in a line
+_MOST, _NAMED = 8, 4
 
 _OF_PHASES = (
     "|p|: linear momentum; |h|: angular momentum about the centre of mass;\n"
@@ -52,7 +53,12 @@ _OF_PHASES = (
 )
 
 STATES = ("q_b", "r_b", "q_m", "omega_b", "v_b", "qdot_m")
-_TITLES = {"q_b": "attitude", "r_b": "position", "q_m": "joints", "qdot_m": "joint rates"}
+_TITLES = {
+    "q_b": "attitude",
+    "r_b": "position",
+    "q_m": "joints",
+    "qdot_m": "joint rates",
+}
 _PLACES = ("attitude", "position", "joints")
 # {group: titles} of the errors of flexible appendages and liquids. These errors do not decide
 # whether a motion has settled.
@@ -96,7 +102,11 @@ class Curve(NamedTuple):
     @property
     def near(self) -> list[float]:
         """Limits that the curve comes near: some value is at least _NEAR times the limit."""
-        return [level for level in self.levels if level and (self.values / level).max() >= _NEAR]
+        return [
+            level
+            for level in self.levels
+            if level and (self.values / level).max() >= _NEAR
+        ]
 
 
 def curves(motion: Motion) -> Iterator[Curve]:
@@ -104,20 +114,32 @@ def curves(motion: Motion) -> Iterator[Curve]:
     limits = dict(zip(motion.limit_names, motion.limits, strict=True))
     inertias = dict(zip(motion.wheels, motion.wheel_inertias.tolist(), strict=False))
     unlimited = np.full(2, np.inf)
-    for i, (name, unit) in enumerate(zip(motion.state_names, motion.state_units, strict=True)):
+    for i, (name, unit) in enumerate(
+        zip(motion.state_names, motion.state_units, strict=True)
+    ):
         group, _, entry = name.partition(".")
         wheel = group in _OF_MODES and entry in motion.wheels
         kinds = [(group, unit, 1.0)]
         if wheel:
-            kinds = [("speed", unit, 1.0), ("momentum", "N m s", inertias.get(entry, 0.0))]
+            kinds = [
+                ("speed", unit, 1.0),
+                ("momentum", "N m s", inertias.get(entry, 0.0)),
+            ]
         for kind, of_kind, size in kinds:
             if size and not (wheel and group == "q_m"):
-                bounds, values = size * limits.get(name, unlimited), size * motion.x[:, i]
+                bounds, values = (
+                    size * limits.get(name, unlimited),
+                    size * motion.x[:, i],
+                )
                 linear = None if motion.linear is None else size * motion.linear[:, i]
                 target = size * motion.target[:, i] if motion.tracked else None
                 yield Curve(name, kind, name, of_kind, values, bounds, linear, target)
     inputs = zip(
-        input_keys(motion), motion.input_names, motion.input_units, motion.u.T, strict=True
+        input_keys(motion),
+        motion.input_names,
+        motion.input_units,
+        motion.u.T,
+        strict=True,
     )
     for key, name, unit, column in inputs:
         bounds = limits.get(name, unlimited)
@@ -177,7 +199,9 @@ def passed(t: Array, signals: Iterable[Curve]) -> tuple[Passed, ...]:
             value = float(curve.values[at])
             first = curve.group == "q_m" and bool(beyond[0])
             limit = high if value > high else low
-            one = Passed(curve.name, value, float(t[at]), float(limit), curve.unit, first)
+            one = Passed(
+                curve.name, value, float(t[at]), float(limit), curve.unit, first
+            )
             worst.append((-excess[at] / (size or 1e-12), one))
     return tuple(one for _, one in sorted(worst))
 
@@ -211,7 +235,8 @@ class Firings(NamedTuple):
 
     pulses: int | None
     impulse: float  # [N s], sum of all thrusters
-    propellant: float | None  # [kg]; None if a thruster that fires has no specific impulse
+    # [kg]; None if a thruster that fires has no specific impulse
+    propellant: float | None
 
     def __str__(self) -> str:
         text = f"thrusters: impulse {_shown(self.impulse)} N s"
@@ -237,7 +262,8 @@ def firings(motion: Motion) -> Firings | None:
     thrusters = thrusters_of(motion)
     names = [motion.input_names[i] for i in at]
     pulsed = [
-        x in thrusters and bool(thrusters[x].on_off or thrusters[x].least_impulse) for x in names
+        x in thrusters and bool(thrusters[x].on_off or thrusters[x].least_impulse)
+        for x in names
     ]
     on = thrusts[:, pulsed] > 0.0
     starts = np.count_nonzero(on[1:] & ~on[:-1]) + np.count_nonzero(on[:1])
@@ -265,7 +291,9 @@ def thrusters_of(motion: Motion) -> dict[str, Thruster]:
 
 def pulse_thrusters(motion: Motion) -> frozenset[str]:
     """Return the names of the thrusters that are off or on; empty if the robot is not known."""
-    return frozenset(name for name, thruster in thrusters_of(motion).items() if thruster.on_off)
+    return frozenset(
+        name for name, thruster in thrusters_of(motion).items() if thruster.on_off
+    )
 
 
 def _name(name: str) -> str:
@@ -310,9 +338,11 @@ class ErrorSize(NamedTuple):
     initial: float
     largest: float
     final: float
-    settled: float | None  # time [s] from which the error is settled; None if too late or never
+    # time [s] from which the error is settled; None if too late or never
+    settled: float | None
     steered: bool  # whether the policy feeds the error back
-    tail: str = ""  # "remains" or "grows" at the end of the run; empty if the error decays
+    # "remains" or "grows" at the end of the run; empty if the error decays
+    tail: str = ""
 
     @property
     def last(self) -> str:
@@ -325,7 +355,12 @@ class ErrorSize(NamedTuple):
         when = "not yet" if self.steered else "not controlled"
         if self.settled is not None:
             when = f"{self.settled:.3g}" if self.largest > THERE else "."
-        return [self.title, self.unit, *_cells(self.initial, self.largest, self.final), when]
+        return [
+            self.title,
+            self.unit,
+            *_cells(self.initial, self.largest, self.final),
+            when,
+        ]
 
 
 def _cells(*values: float) -> list[str]:
@@ -345,7 +380,9 @@ def error_sizes(motion: Motion) -> list[ErrorSize]:
     sizes = np.abs(motion.error)
     errors = []
     kinds: dict[tuple[str, str], list[int]] = {}
-    for i, (name, unit) in enumerate(zip(motion.state_names, motion.state_units, strict=True)):
+    for i, (name, unit) in enumerate(
+        zip(motion.state_names, motion.state_units, strict=True)
+    ):
         group, _, entry = name.partition(".")
         title = _TITLES.get(group, group)
         if group == "q_m" and entry in motion.wheels:
@@ -357,13 +394,19 @@ def error_sizes(motion: Motion) -> list[ErrorSize]:
         shown_unit = "deg" if group == "q_b" else unit
         kinds.setdefault((title, shown_unit), []).append(i)
     for (title, unit), indices in kinds.items():
-        size = motion.attitude_error if title == "attitude" else sizes[:, indices].max(axis=1)
+        size = (
+            motion.attitude_error
+            if title == "attitude"
+            else sizes[:, indices].max(axis=1)
+        )
         fed_back = any(motion.state_names[i] in steered for i in indices)
         fed_back &= title not in ("position", "v_b") or pushed(motion)
         at = int(settled_at(size))
         settled = None if is_late(at, len(size)) else motion.t[at]
         sizes_of_kind = size[0], size.max(), size[-1]
-        errors.append(ErrorSize(title, unit, *sizes_of_kind, settled, fed_back, _tail(size)))
+        errors.append(
+            ErrorSize(title, unit, *sizes_of_kind, settled, fed_back, _tail(size))
+        )
     return errors
 
 
@@ -420,11 +463,15 @@ def motion_report(motion: Motion) -> str:
     if motion.phases:
         parts += [f"\n{grid(_phases(motion), 'll')}", _OF_PHASES, ""]
     first, last = motion.energy[[0, -1]]
-    kept = f"{motion.kept} drift {motion.momentum_drift.max():.1e}".replace(" ", "\u00a0")
+    kept = f"{motion.kept} drift {motion.momentum_drift.max():.1e}".replace(
+        " ", "\u00a0"
+    )
     parts.append(folded([f"energy: initial {first:.6g} J, final {last:.6g} J; {kept}"]))
     if len(motion.com_drift):
         far = f"{motion.com_drift.max():.1e} m"
-        parts.append(f"largest deviation of the centre of mass from its predicted path: {far}")
+        parts.append(
+            f"largest deviation of the centre of mass from its predicted path: {far}"
+        )
     if motion.linear is not None:
         apart = np.abs(motion.x - motion.linear).max(axis=0)
         # Wheel angles are excluded: they grow without bound, and nothing depends on them.
@@ -495,7 +542,11 @@ def _phases(motion: Motion) -> list[list[str]]:
     parts = motion._phases or motion.phases
     pairs = zip((None, *parts), parts, strict=False)
     struck = [before for before, part in pairs if not isinstance(part, Impact)]
-    firsts = [0, *np.searchsorted(motion.t, motion.starts[1:], "right") - 1, len(motion.t)]
+    firsts = [
+        0,
+        *np.searchsorted(motion.t, motion.starts[1:], "right") - 1,
+        len(motion.t),
+    ]
     for k, (name, impact) in enumerate(zip(motion.phases, struck, strict=True)):
         # `lines` are the lines of the table for one phase: (label, index of a row of the motion,
         # energy to be added, momentum to be added). At an impact, the row of the motion contains
@@ -504,11 +555,19 @@ def _phases(motion: Motion) -> list[list[str]]:
         lines = [("start", firsts[k], 0.0, np.zeros(6))]
         if isinstance(impact, Impact):
             gone = np.roll(impact.momentum - impact.momentum_after, 3)
-            lines = [("before", firsts[k], impact.energy_lost, gone), ("after", *lines[0][1:])]
+            lines = [
+                ("before", firsts[k], impact.energy_lost, gone),
+                ("after", *lines[0][1:]),
+            ]
         lines.append(("end", firsts[k + 1] - 1, 0.0, np.zeros(6)))
         for when, at, energy, momentum in lines:
             h, p = (motion.momentum[at] + momentum).reshape(2, 3)
-            sizes = motion.t[at], motion.energy[at] + energy, np.linalg.norm(p), np.linalg.norm(h)
+            sizes = (
+                motion.t[at],
+                motion.energy[at] + energy,
+                np.linalg.norm(p),
+                np.linalg.norm(h),
+            )
             shown = shorten(name, 28) if when == lines[0][0] else ""
             table.append([shown, when, *(f"{x:.4g}" for x in sizes)])
     return table
@@ -533,9 +592,14 @@ def verdict(motion: Motion, kinds: list[ErrorSize]) -> str:
         text = f"not settled: {_and(failed)} off target"
     elif moved:
         when = max(kind.settled or 0.0 for kind in moved)
-        band = [f"{SETTLED * kind.largest:.2g}\u00a0{kind.unit} ({kind.title})" for kind in moved]
+        band = [
+            f"{SETTLED * kind.largest:.2g}\u00a0{kind.unit} ({kind.title})"
+            for kind in moved
+        ]
         text = f"settled after {when:.3g}\u00a0s to within {_and(band)} of the target"
-        if late := [kind.last for kind in kinds if kind.settled is None and kind.steered]:
+        if late := [
+            kind.last for kind in kinds if kind.settled is None and kind.steered
+        ]:
             subject = "positions" if judged[0].title in _PLACES else "rates"
             text = f"{subject} {text}; not yet settled: {_and(late)}"
         for tail, trend in (("remains", "remaining"), ("grows", "drifting")):
@@ -582,12 +646,16 @@ def _largest_modes(motion: Motion) -> str:
     """Return a table with each mode's largest amplitude, and the rotation at this amplitude."""
     rows = [["mode", "unit", "largest", "rotation [deg]", "at [s]"]]
     far = []
-    for name, rotation in zip(motion.modes, motion.mode_rotations.tolist(), strict=True):
+    for name, rotation in zip(
+        motion.modes, motion.mode_rotations.tolist(), strict=True
+    ):
         at = motion.state_names.index(f"q_m.{name}")
         size = np.abs(motion.x[:, at])
         unit = motion.state_units[at]
         degrees = float(np.degrees(rotation * size.max()))
-        rows.append([name, unit, *_cells(size.max(), degrees), f"{motion.t[size.argmax()]:.3g}"])
+        rows.append(
+            [name, unit, *_cells(size.max(), degrees), f"{motion.t[size.argmax()]:.3g}"]
+        )
         if degrees > _LINEAR and unit == _MODAL:
             far.append(f"{name}\u00a0{degrees:.3g}\u00a0deg")
     table = f"{grid(rows, 'll')}\n"
@@ -604,10 +672,14 @@ def _largest_modes(motion: Motion) -> str:
 def _largest_inputs(motion: Motion) -> str:
     largest = np.abs(motion.u).max(axis=0)
     kinds: dict[tuple[str, str], float] = {}
-    for name, unit, value in zip(input_keys(motion), motion.input_units, largest, strict=True):
+    for name, unit, value in zip(
+        input_keys(motion), motion.input_units, largest, strict=True
+    ):
         if value >= _NOTHING:
             key = (group_of_input(motion, name), unit.replace(" ", "\u00a0"))
             kinds[key] = max(kinds.get(key, 0.0), float(value))
-    shown = [f"{name}\u00a0{value:.4g}\u00a0{unit}" for (name, unit), value in kinds.items()]
+    shown = [
+        f"{name}\u00a0{value:.4g}\u00a0{unit}" for (name, unit), value in kinds.items()
+    ]
     # Non-breaking spaces keep a name, its value and the unit on one line.
     return folded([f"largest inputs: {', '.join(shown) or 'none'}"])

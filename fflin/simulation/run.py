@@ -58,7 +58,8 @@ ROUNDED_UP, ROUNDED_DOWN = 1.0 + 1e-15, 1.0 - 1e-15
 
 STOPS = ("", "diverged", "left the chart", "stopped")
 
-LARGEST_TURN = 1.0  # [rad] largest rotation within a step for which integrators are accurate
+# [rad] largest rotation within a step for which integrators are accurate
+LARGEST_TURN = 1.0
 _LOOK = 16  # steps between checks of the clock
 _LARGEST_SHOWN = 1e3  # [rad] largest rotation per step that a message states
 
@@ -81,11 +82,14 @@ class Plant(Aba):
         require_inertia(robot)
         super().__init__(state)
         self.disturbance = disturbance
-        self._warned = False  # whether a warning of the order of a disturbance was given
+        # whether a warning of the order of a disturbance was given
+        self._warned = False
         nu = len(self.actuation.names)
         groups = self.actuation.groups
         # Indices in u at which the base torque and the base force begin, if they are inputs.
-        self.triads = sorted(int(groups[key][0]) for key in ("tau_b", "F_b") if key in groups)
+        self.triads = sorted(
+            int(groups[key][0]) for key in ("tau_b", "F_b") if key in groups
+        )
         self.faults = faults or ActuatorFaults(
             gain=np.ones(nu),
             bias=np.zeros(nu),
@@ -99,12 +103,19 @@ class Plant(Aba):
         # joints that are not prismatic. Rotors are excluded, because nothing depends on the angle
         # of a rotor.
         rotors = robot.rotors
-        joints = [x.idx_v for x in robot.joints if not (x.prismatic or x.name in rotors)]
+        joints = [
+            x.idx_v for x in robot.joints if not (x.prismatic or x.name in rotors)
+        ]
         self.turning = np.array([3, 4, 5, *joints])
         self._columns = state.lift(self.actuation.fixed)
         # True if the generalised force of the inputs is `_columns` @ u, and no other force acts,
         # apart from a disturbance. Mimic joints and modes are excluded.
-        others = robot.stored_momentum, np.any(robot.springs), any(robot.gravity), robot.orbit
+        others = (
+            robot.stored_momentum,
+            np.any(robot.springs),
+            any(robot.gravity),
+            robot.orbit,
+        )
         self._plain = state.S is None and not self.actuation.carried and not any(others)
 
     def stage(self, t: float, q: Array, v: Array, u: Array) -> tuple[Array, Array]:
@@ -199,7 +210,9 @@ class Plant(Aba):
         """
         driven = driven or bool(self.faults.bias.any())
         base = driven and (self._columns[:6].any() or self.actuation.carried)
-        outside = self.disturbance is not None or any(self.robot.gravity) or self.robot.orbit
+        outside = (
+            self.disturbance is not None or any(self.robot.gravity) or self.robot.orbit
+        )
         return not (base or outside)
 
 
@@ -213,7 +226,8 @@ class Conserved:
     """
 
     momentum: Array  # (6,) after the steps so far
-    wrenches: tuple[Array, ...]  # (6,) about the fixed point at each stage; written by the caller
+    # (6,) about the fixed point at each stage; written by the caller
+    wrenches: tuple[Array, ...]
 
     # The fixed point is the initial position of the base. Far away from the world's origin, angular
     # momentum about the origin would have large rounding errors.
@@ -251,8 +265,13 @@ class Conserved:
         self._stack = np.zeros((2 + len(method.weights), 6))
         self._sums = self._stack[:2]
         self.wrenches = tuple(self._stack[2:])
-        weights, moments = h * np.array(method.weights), h * h * np.array(method.moments)
-        self._after = np.array([[1.0, 0.0, *weights], [h * per_mass, 1.0, *(per_mass * moments)]])
+        weights, moments = (
+            h * np.array(method.weights),
+            h * h * np.array(method.moments),
+        )
+        self._after = np.array(
+            [[1.0, 0.0, *weights], [h * per_mass, 1.0, *(per_mass * moments)]]
+        )
 
     def wrench(self, q: Array, push: Array) -> Array:
         """Return the wrench (6,) about the fixed point in world axes, including the weight.
@@ -337,7 +356,9 @@ class Conserved:
         near = q.copy()
         near[:, :7] -= self._start
         energy, momentum, center, polar = integrals(robot, near, v)
-        sizes = np.sqrt(2.0 * energy[:, None] * np.column_stack((np.full(rows, self.mass), polar)))
+        sizes = np.sqrt(
+            2.0 * energy[:, None] * np.column_stack((np.full(rows, self.mass), polar))
+        )
         scale = sizes.max(axis=0)
         for _, stored in self._stored:
             scale[1] += np.linalg.norm(stored)
@@ -394,7 +415,9 @@ def _follower(plan: Plan) -> Callable[[int], None] | None:
     if advance is None:
         return None
     weights = plan.method.step_weights(plan.times.dt)[1]
-    return lambda stages: advance(weights[stages - 1, : stages + 1], stages == len(weights))
+    return lambda stages: advance(
+        weights[stages - 1, : stages + 1], stages == len(weights)
+    )
 
 
 class _Rows:
@@ -464,7 +487,10 @@ def go(plan: Plan, hint: str = "") -> Recording:
             follow(stages)
         return a
 
-    ending, bar = ending_of(plan, stop_conditions(plan)), Progress(plan.options.progress)
+    ending, bar = (
+        ending_of(plan, stop_conditions(plan)),
+        Progress(plan.options.progress),
+    )
     try:
         for step in range(times.steps):
             u = applied(step, t, q, v) if applied else plan.initial

@@ -41,7 +41,8 @@ _PART = 0.1
 # A linear prediction makes blocks of 2**_DOUBLINGS steps; see `_affine_motion`.
 _DOUBLINGS = 8
 
-_SMALL = 1e-6  # deviation from the target at which limits do not act, to find the poles of a loop
+# deviation from the target at which limits do not act, to find the poles of a loop
+_SMALL = 1e-6
 
 # Changes of the energy of a free motion, relative to its largest kinetic energy, above which a note
 # says that the step is too long. With springs, a step may change the amplitudes by 1 %, and so the
@@ -264,7 +265,10 @@ def simulate(
                 once = f", and {_COMPILING:g} s once to compile"
             message = "the simulation took %.0f s in Python; engine='compiled' (--engine compiled)"
             _log.warning(
-                f"fflin: {message} would take about %.0f s%s", spent, _FRACTION * spent, once
+                f"fflin: {message} would take about %.0f s%s",
+                spent,
+                _FRACTION * spent,
+                once,
             )
         return motion_of(plan, run, foresees)
     except MemoryError:
@@ -350,14 +354,20 @@ def motion_of(plan: Plan, run: Recording, foresees: Predictor | None = None) -> 
     )
 
 
-def _energy_note(plan: Plan, run: Recording, energy: Array, scale: float) -> Iterator[str]:
+def _energy_note(
+    plan: Plan, run: Recording, energy: Array, scale: float
+) -> Iterator[str]:
     """Yield a note if the energy of a free motion changes, which is an error of the integration.
 
     The projection conserves the momentum whatever the step is, so only the energy shows the error.
     `scale` is the largest linear momentum that the kinetic energy permits (11.6).
     """
     robot = plan.plant.robot
-    driven = run.u.any() or plan.options.disturbance is not None or robot.springs.damping.any()
+    driven = (
+        run.u.any()
+        or plan.options.disturbance is not None
+        or robot.springs.damping.any()
+    )
     if driven or robot.orbit or not scale:
         return
     kinetic = scale**2 / (2.0 * robot.mass)
@@ -405,7 +415,9 @@ def half_turn_notes(plan: Plan, beyond: float | None, *, predicted: bool) -> lis
     if steered:
         clauses.append("the law continued with the shorter rotation")
     if predicted:
-        clauses.append("the linear prediction is omitted, because it does not hold there")
+        clauses.append(
+            "the linear prediction is omitted, because it does not hold there"
+        )
     if not clauses:
         return []
     origin = "reference" if plan.follows is None else "trajectory"
@@ -421,7 +433,9 @@ def predictor(plan: Plan) -> Predictor | None:
     linear, policy, state = plan.options.linear, plan.policy, plan.plant.state
     lin = policy.model if policy else None
     if not (linear is None or isinstance(linear, bool | np.bool_)):
-        lin = instance("linear", linear, LinearModel, "a fflin.LinearModel, True or False")
+        lin = instance(
+            "linear", linear, LinearModel, "a fflin.LinearModel, True or False"
+        )
         names = (state.names, plan.plant.actuation.names, state.frame)
         same = (lin.state_names, lin.input_names, lin.frame) == names and not lin.moving
         if policy and policy.senses_outputs:
@@ -483,9 +497,13 @@ def predict(plan: Plan, foresees: Predictor, x: Array, steps: int) -> Array:
     if not sample:
         f0 = rate(np.zeros(len(e)))[:, None]
         size = _SMALL if cuts else 1.0
-        A = np.column_stack([(rate(size * unit) - f0[:, 0]) / size for unit in np.eye(len(e))])
+        A = np.column_stack(
+            [(rate(size * unit) - f0[:, 0]) / size for unit in np.eye(len(e))]
+        )
     if cuts:
-        fastest = max(np.abs(np.linalg.eigvals(matrix)).max(initial=0.0) for matrix in (A, lin.A))
+        fastest = max(
+            np.abs(np.linalg.eigvals(matrix)).max(initial=0.0) for matrix in (A, lin.A)
+        )
         parts = math.ceil(max(1.0, fastest * dt / _PART))
     A, forced = held_exponential(A, np.hstack((B, f0)), dt)
     B, f0 = forced[:, :-1], forced[:, -1]

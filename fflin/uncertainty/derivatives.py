@@ -49,7 +49,9 @@ _BODIES = (
     pin.Inertia(1.0, np.zeros(3), np.zeros((3, 3))),
     *(pin.Inertia(1.0, axis, np.zeros((3, 3))) for axis in _E),
     *(
-        pin.Inertia(0.0, np.zeros(3), np.maximum(np.outer(_E[i], _E[j]), np.outer(_E[j], _E[i])))
+        pin.Inertia(
+            0.0, np.zeros(3), np.maximum(np.outer(_E[i], _E[j]), np.outer(_E[j], _E[i]))
+        )
         for i, j in ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2))
     ),
 )
@@ -67,13 +69,16 @@ class ModelDerivatives:
     """
 
     def __init__(self, lin: LinearModel, robot: Robot, source: LinearModel) -> None:
-        self.lin, self.robot, self._source = lin, robot, source  # `source` is in continuous time
+        # `source` is in continuous time
+        self.lin, self.robot, self._source = lin, robot, source
         default_reference = lin.moving or bool(
             np.array_equal(lin.placement, own_reference(robot, lin))
         )
         default_reference = default_reference and robot.orbit is None
         reference = None if default_reference else lin.reference
-        self._prepare = partial(Prepared, frame=lin.frame, reference=reference, moving=lin.moving)
+        self._prepare = partial(
+            Prepared, frame=lin.frame, reference=reference, moving=lin.moving
+        )
         self._ready = self._prepare(robot)
         state = self._ready.map
         actuation = self._ready.actuation
@@ -83,9 +88,14 @@ class ModelDerivatives:
         self._chart: Chart = Standing()
         if not default_reference:
             self._chart = state.chart(lin.q)
-        self._u, self._nu = actuation.in_base_axes(self._chart, lin.u0), state.velocities(lin.v)
+        self._u, self._nu = (
+            actuation.in_base_axes(self._chart, lin.u0),
+            state.velocities(lin.v),
+        )
         nv, nu = len(self._nu), len(self._u)
-        self._inverse, slopes, by_u = (np.empty((nv, size)) for size in (nv, state.nx, nu))
+        self._inverse, slopes, by_u = (
+            np.empty((nv, size)) for size in (nv, state.nx, nu)
+        )
         accelerations = Accelerations(state, actuation, data)
         self._rates = accelerations.rates(lin.q, lin.v, self._nu, self._u, slopes, by_u)
         Inertia(state, data).invert(lin.q, self._inverse)
@@ -108,12 +118,17 @@ class ModelDerivatives:
         ready = self._ready
         count = len(parameters) + 1
         nv = len(self._nu)
-        A, B = np.zeros((count, state.nx, state.nx)), np.zeros((count, state.nx, len(self._u)))
+        A, B = (
+            np.zeros((count, state.nx, state.nx)),
+            np.zeros((count, state.nx, len(self._u))),
+        )
         c, gravity = np.zeros((count, nv)), np.zeros((count, 3))
         rates = AccelerationDerivatives(c, A[:, nv:], B[:, nv:], gravity)
         for joint in self._joints:
             rows = [row for row, one in enumerate(parameters) if joint in one.bodies]
-            changes = np.array([parameters[row].bodies[joint] for row in rows]).reshape(-1, 10)
+            changes = np.array([parameters[row].bodies[joint] for row in rows]).reshape(
+                -1, 10
+            )
             for part, of_bodies in zip(rates, self._of_bodies, strict=True):
                 part[rows] += np.tensordot(changes, of_bodies[joint - ROOT], 1)
         for row, one in enumerate(parameters):
@@ -122,7 +137,9 @@ class ModelDerivatives:
                     part[row] = of_force
         seen = self._seen(parameters, rates)
         nu, u = (np.broadcast_to(x, (count, len(x))) for x in (self._nu, self._u))
-        f0 = assemble(ready.actuation, self._chart, nu, u, rates, A, moving=ready.moving)
+        f0 = assemble(
+            ready.actuation, self._chart, nu, u, rates, A, moving=ready.moving
+        )
         A, B, f0 = (array[:-1] - array[-1] for array in (A, B, f0))
         if self.lin.dt:
             driven = np.column_stack((self._source.B, self._source.f0))
@@ -132,7 +149,9 @@ class ModelDerivatives:
         C, D, y0 = np.split(seen, (state.nx, -1), axis=2)
         return A, B, C, D, f0, y0[..., 0]
 
-    def _seen(self, parameters: Sequence[Parameter], rates: AccelerationDerivatives) -> Array:
+    def _seen(
+        self, parameters: Sequence[Parameter], rates: AccelerationDerivatives
+    ) -> Array:
         """Return the matrix [dC, dD, dy0] of each parameter (P, ny, ..).
 
         Only outputs that depend on masses or accelerations have nonzero rows.
@@ -141,8 +160,12 @@ class ModelDerivatives:
         # is a quadratic function of the parameter, because `weighed` changes the accelerations
         # linearly. So three values at any step size give the exact derivative, see (12.2a).
         lin, now = self.lin, self._rates
-        derivatives = np.zeros((len(parameters), len(lin.C), lin.C.shape[1] + lin.D.shape[1] + 1))
-        outputs = (o for o in self.robot.outputs if o.FEELS_ACCELERATION or type(o) in WEIGH)
+        derivatives = np.zeros(
+            (len(parameters), len(lin.C), lin.C.shape[1] + lin.D.shape[1] + 1)
+        )
+        outputs = (
+            o for o in self.robot.outputs if o.FEELS_ACCELERATION or type(o) in WEIGH
+        )
         rows = [lin.output_names.index(name) for o in outputs for name, _ in o.signals]
         if not rows:
             return derivatives
@@ -157,7 +180,9 @@ class ModelDerivatives:
             change_bodies(other.model, self.robot.model, one, size)
             changed = [a + size * b for a, b in zip(now, slopes, strict=True)]
             moved = AccelerationDerivatives(*changed)
-            made = output_equations(sensing, actuation, data, self._chart, moved, lin.x0, point)
+            made = output_equations(
+                sensing, actuation, data, self._chart, moved, lin.x0, point
+            )
             seen: Array = np.column_stack((made["C"], made["D"], made["y0"]))[rows]
             total: float = pin.computeTotalMass(other.model)
             for joint in one.bodies:
@@ -171,7 +196,8 @@ class ModelDerivatives:
                 step = 1.0 / (self.fraction(one.bodies) or 1.0)
             mass = sum(change[0] for change in one.bodies.values())
             values = [
-                weighed(one, [part[row] for part in rates], k * step) for k in (0.0, 1.0, 2.0)
+                weighed(one, [part[row] for part in rates], k * step)
+                for k in (0.0, 1.0, 2.0)
             ]
             derivative = (4.0 * values[1] - values[2] - 3.0 * values[0]) / (2.0 * step)
             derivatives[row, rows] = (derivative - mass * values[0] / total) / total
@@ -216,7 +242,10 @@ class ModelDerivatives:
         by_state, by_u = self._by_inertia(rates.slopes), self._by_inertia(rates.by_u)
         count = by_u.shape[:2]
         derivatives = AccelerationDerivatives(
-            np.zeros((*count, len(self._inverse))), by_state, by_u, np.zeros((*count, 3))
+            np.zeros((*count, len(self._inverse))),
+            by_state,
+            by_u,
+            np.zeros((*count, 3)),
         )
         if self._v.any() or rates.c.any():
             # In the model `lone`, only one body has an inertia. For this model, RNEA returns F_p of
@@ -233,7 +262,9 @@ class ModelDerivatives:
                     lone.inertias[joint] = body
                     of_bodies.append(self._rnea_derivatives(lone))
                 lone.inertias[joint] = pin.Inertia.Zero()
-                for kept, values in zip(forces, zip(*of_bodies, strict=True), strict=True):
+                for kept, values in zip(
+                    forces, zip(*of_bodies, strict=True), strict=True
+                ):
                     kept.append(np.tensordot(_OF_BODIES, values, 1))
             F, F_q, F_nu, F_turn = map(np.array, forces)
             derivatives.c[:] = -F @ self._inverse
@@ -251,14 +282,19 @@ class ModelDerivatives:
         `changes` is {Pinocchio joint: change (10,) of the dynamic parameters of the joint's body}.
         """
         of_bodies = self._by_inertia(np.eye(len(self._inverse)))
-        total = sum(np.tensordot(change, of_bodies[at - ROOT], 1) for at, change in changes.items())
+        total = sum(
+            np.tensordot(change, of_bodies[at - ROOT], 1)
+            for at, change in changes.items()
+        )
         return float(np.abs(np.linalg.eigvals(total)).max())
 
     def _jacobians(self) -> Array:
         """Return the Jacobians (bodies, 6, 6 + n) of the joints, in the axes of the joints."""
         model, data = self.robot.model, self._data
         pin.computeJointJacobians(model, data, self._q)
-        full = (pin.getJointJacobian(model, data, joint, _LOCAL) for joint in self._joints)
+        full = (
+            pin.getJointJacobian(model, data, joint, _LOCAL) for joint in self._joints
+        )
         return np.array([self._state.columns(J) for J in full])
 
     def _by_inertia(self, given: Array) -> Array:
@@ -287,9 +323,16 @@ class ModelDerivatives:
             tau, by_q = tau - pull, by_q - pull_by_q
             by_turn = by_v[:, PIN_ANGULAR] @ skew(gradient.spin) - by_turn
         project = state.project
-        return state.forces(tau), project(by_q)[:, 6:], project(by_v), state.forces(by_turn)
+        return (
+            state.forces(tau),
+            project(by_q)[:, 6:],
+            project(by_v),
+            state.forces(by_turn),
+        )
 
-    def _by_acceleration(self, c: Array, pushed: pin.StdVec_Force | None = None) -> Array:
+    def _by_acceleration(
+        self, c: Array, pushed: pin.StdVec_Force | None = None
+    ) -> Array:
         """Return the derivative of RNEA with respect to q_m at zero velocity.
 
         RNEA is computed for the accelerations `c` and the external wrenches `pushed`.
@@ -316,8 +359,13 @@ class ModelDerivatives:
         F_nu = np.zeros((size, size))
         if (joint := one.joint) >= 0:
             at = 6 + joint
-            moved = state.joint_positions(self._q)[joint] - self.robot.springs.rest[joint]
-            F[at] = one.by_stiffness * moved + one.by_damping * state.velocities(self._v)[at]
+            moved = (
+                state.joint_positions(self._q)[joint] - self.robot.springs.rest[joint]
+            )
+            F[at] = (
+                one.by_stiffness * moved
+                + one.by_damping * state.velocities(self._v)[at]
+            )
             F_q[at, joint], F_nu[at, at] = one.by_stiffness, one.by_damping
         if one.wrench:
             joint, column, wrench = one.wrench
@@ -328,15 +376,23 @@ class ModelDerivatives:
                 pushed[joint] = pin.Force(wrench * u[column])
                 F_q = self._by_acceleration(np.zeros(size), pushed)
         derivatives = AccelerationDerivatives(
-            -self._inverse @ F, np.zeros((size, 2 * size)), self._inverse @ B, np.zeros(3)
+            -self._inverse @ F,
+            np.zeros((size, 2 * size)),
+            self._inverse @ B,
+            np.zeros(3),
         )
         if derivatives.c.any():
             F_q = F_q + self._by_acceleration(derivatives.c)
-        derivatives.by_q_m[:], derivatives.by_nu[:] = -self._inverse @ F_q, -self._inverse @ F_nu
+        derivatives.by_q_m[:], derivatives.by_nu[:] = (
+            -self._inverse @ F_q,
+            -self._inverse @ F_nu,
+        )
         return derivatives
 
 
-def change_bodies(model: pin.Model, before: pin.Model, one: Parameter, size: float) -> None:
+def change_bodies(
+    model: pin.Model, before: pin.Model, one: Parameter, size: float
+) -> None:
     """Set the bodies of `model` that depend on a parameter.
 
     The bodies are taken from the model `before`, with the parameter increased by `size`.
@@ -344,6 +400,7 @@ def change_bodies(model: pin.Model, before: pin.Model, one: Parameter, size: flo
     for joint, change in one.bodies.items():
         changed = before.inertias[joint].toDynamicParameters() + size * change
         model.inertias[joint] = pin.Inertia.FromDynamicParameters(changed)
-        if not changed[0]:  # a wheel without mass, for which Pinocchio would divide 0 by 0
+        # a wheel without mass, for which Pinocchio would divide 0 by 0
+        if not changed[0]:
             about = changed[4:][[[0, 1, 3], [1, 2, 4], [3, 4, 5]]]
             model.inertias[joint] = pin.Inertia(0.0, np.zeros(3), about)

@@ -119,7 +119,9 @@ class LFT(Design):
             rows.append((name, shown_unit, *ends, f"{repeats:g}"))
         many = counted(len(self.repeats), "parameter")
         count = f"{self.repeats.sum():g}"
-        title = f"{self.robot}: {many}, {len(self.A)} states; Delta is {count} x {count}"
+        title = (
+            f"{self.robot}: {many}, {len(self.A)} states; Delta is {count} x {count}"
+        )
         return f"{folded([title])}\n\n{grid(cut(rows), 'll')}"
 
     @property
@@ -127,7 +129,9 @@ class LFT(Design):
         """Sampling time, which is 0 because the model is in continuous time."""
         return 0.0
 
-    def at(self, values: Mapping[str, float] | Array) -> tuple[Array, Array, Array, Array]:
+    def at(
+        self, values: Mapping[str, float] | Array
+    ) -> tuple[Array, Array, Array, Array]:
         r"""Return A, B, C and D at given values of the parameters.
 
         Parameters
@@ -163,7 +167,9 @@ class LFT(Design):
         within = np.eye(len(self.D11)) - self.D11 * delta[..., None, :]
         outer = np.concatenate((self.C1, self.D12), axis=1)
         try:
-            z = np.linalg.solve(within, np.broadcast_to(outer, (*delta.shape, outer.shape[1])))
+            z = np.linalg.solve(
+                within, np.broadcast_to(outer, (*delta.shape, outer.shape[1]))
+            )
         except np.linalg.LinAlgError:
             raise InputError(
                 "the inertia M is singular at these parameters; give narrower ranges"
@@ -233,10 +239,15 @@ _MOST = 6
 
 
 def linear_fractional(
-    lin: LinearModel, ready: Prepared, pieces: Mapping[str, Piece], blocks: Sequence[Block]
+    lin: LinearModel,
+    ready: Prepared,
+    pieces: Mapping[str, Piece],
+    blocks: Sequence[Block],
 ) -> LFT:
     """Return the LFT of a model about an operating point at rest, without steady forces."""
-    form = _Form(ready, lin, [interval for block in blocks for interval in block.ranges])
+    form = _Form(
+        ready, lin, [interval for block in blocks for interval in block.ranges]
+    )
     # M contains products of the parameters of a link, such as mass and centre of mass. The damping
     # force of a mode contains the product of its frequency and damping ratio. Therefore all
     # parameters of a link or mode are added together. `together` is {(link or mode, joint): {part:
@@ -291,7 +302,9 @@ class _Form:
     and terms to the force.
     """
 
-    def __init__(self, ready: Prepared, lin: LinearModel, ranges: Sequence[Range]) -> None:
+    def __init__(
+        self, ready: Prepared, lin: LinearModel, ranges: Sequence[Range]
+    ) -> None:
         state = ready.map
         robot = ready.robot
         data = ready.robot.create_data()
@@ -351,7 +364,8 @@ class _Form:
         D[3:, 3:] = piece.inertia
         now = J @ self.a
         s = now.copy()
-        for at, left, right in shifts:  # a centre of mass shifted by d: v' = v + omega x d
+        # a centre of mass shifted by d: v' = v + omega x d
+        for at, left, right in shifts:
             s[:3] += left @ self.times(at, right @ now[3:])
         f = D @ s
         if "mass" in parts:
@@ -359,7 +373,9 @@ class _Form:
         for entry, (i, j) in ENTRIES.items():
             if f"inertia.{entry}" in parts:
                 rows = [i] if i == j else [i, j]
-                turned = self.times(parts[f"inertia.{entry}"], s[[3 + row for row in rows]])
+                turned = self.times(
+                    parts[f"inertia.{entry}"], s[[3 + row for row in rows]]
+                )
                 for row, signal in zip(reversed(rows), turned, strict=True):
                     f[3 + row] += signal
         if "density" in parts:
@@ -386,7 +402,9 @@ class _Form:
             self.force -= np.outer(given, self.times(at, self.u[[column]])[0])
         else:
             change = sum(
-                self.jacobians[joint].T @ np.tensordot(parameters, UNITS, 1) @ self.jacobians[joint]
+                self.jacobians[joint].T
+                @ np.tensordot(parameters, UNITS, 1)
+                @ self.jacobians[joint]
                 for joint, parameters in one.bodies.items()
             )
             values, vectors = np.linalg.eigh(change)
@@ -406,7 +424,10 @@ class _Form:
         springs = self.state.robot.springs
         K, D = springs.stiffness[index], springs.damping[index]
         omega, ratio = joint.oscillation(K, D)
-        position, rate = self.x[[6 + index]], self.x[[self.state.groups.qdot_m.start + index]]
+        position, rate = (
+            self.x[[6 + index]],
+            self.x[[self.state.groups.qdot_m.start + index]],
+        )
         turns = 2.0 * np.pi
 
         def by_frequency(signal: Array) -> Array:

@@ -20,7 +20,10 @@ from fflin.robot.robot import Robot
 
 AXES = "xyz"
 # (row, column) of the six entries of an inertia.
-ENTRIES = {a + b: (AXES.index(a), AXES.index(b)) for a, b in ("xx", "yy", "zz", "xy", "xz", "yz")}
+ENTRIES = {
+    a + b: (AXES.index(a), AXES.index(b))
+    for a, b in ("xx", "yy", "zz", "xy", "xz", "yz")
+}
 # Parameters of a link or body.
 OF_PIECES = {"mass", "density", *(f"com.{axis}" for axis in AXES)}
 OF_PIECES |= {f"inertia.{entry}" for entry in ENTRIES}
@@ -40,7 +43,8 @@ class Parameter:
     # ten dynamic parameters are the mass m, the first moment m c, and the entries xx, xy, yy, xz,
     # yz, zz of the inertia about the joint.
     bodies: dict[int, Array] = field(default_factory=dict)
-    joint: int = -1  # index (state order) of the joint whose spring or damper changes; or -1
+    # index (state order) of the joint whose spring or damper changes; or -1
+    joint: int = -1
     by_stiffness: float = 0.0  # change of the joint's stiffness per unit
     by_damping: float = 0.0  # change of the joint's damping per unit
     # (Pinocchio joint, index of the input, wrench (6,) in the joint's frame). A unit of the input
@@ -62,7 +66,9 @@ class Parameters(dict[str, Parameter]):
         self.pieces = robot.pieces
         self._link_of = robot.link_of
         self._sums = robot._sums
-        of_pieces = (parameter for item in self.pieces.items() for parameter in _of_piece(*item))
+        of_pieces = (
+            parameter for item in self.pieces.items() for parameter in _of_piece(*item)
+        )
         parameters = (*of_pieces, *_of_joints(robot), *_of_inputs(robot))
         super().__init__((parameter.name, parameter) for parameter in parameters)
 
@@ -76,7 +82,9 @@ class Parameters(dict[str, Parameter]):
         if key not in self and bodies:
             body = max(bodies, key=len)
             key = self._link_of[body] + key[len(body) :]
-        names = [name for name in self if key == name or not self._of_several_links(name)]
+        names = [
+            name for name in self if key == name or not self._of_several_links(name)
+        ]
         if not stands_for_any(key, names):
             names = list(self)
         return [names[i] for i in matching("parameter", key, names)]
@@ -89,7 +97,11 @@ class Parameters(dict[str, Parameter]):
 
         Mass properties of a body of several links are left out if other parameters match.
         """
-        names = [n for n, x in self.items() if only in (None, x.of, x.part, x.part.split(".")[0])]
+        names = [
+            n
+            for n, x in self.items()
+            if only in (None, x.of, x.part, x.part.split(".")[0])
+        ]
         names = names or self.find(str(only))
         return [*filterfalse(self._of_several_links, names)] or names
 
@@ -117,9 +129,14 @@ class Parameters(dict[str, Parameter]):
             robot = nominal.with_bodies(bodies)
         springs = {"stiffness": {**robot.stiffness}, "damping": {**robot.damping}}
         for joint in robot.joints:
-            changes, stiffness = parts.get(joint.name, {}), nominal.stiffness.get(joint.name, 0.0)
+            changes, stiffness = (
+                parts.get(joint.name, {}),
+                nominal.stiffness.get(joint.name, 0.0),
+            )
             if changes and joint.mode and stiffness:
-                omega, ratio = joint.oscillation(stiffness, nominal.damping.get(joint.name, 0.0))
+                omega, ratio = joint.oscillation(
+                    stiffness, nominal.damping.get(joint.name, 0.0)
+                )
                 if "frequency" in changes:
                     omega = _TURN * changes["frequency"]
                 damping = 2.0 * changes.get("damping", ratio) * joint.inertia * omega
@@ -137,7 +154,9 @@ class Parameters(dict[str, Parameter]):
                 torque = changes.get("torque", item.torque)
                 inputs[index] = replace(item, position=position, torque=torque)
         fields = {**springs, "inputs": tuple(inputs)}
-        changed = {key: value for key, value in fields.items() if value != getattr(robot, key)}
+        changed = {
+            key: value for key, value in fields.items() if value != getattr(robot, key)
+        }
         if not changed:
             return robot
         return robot.replace(**changed)
@@ -162,12 +181,23 @@ class Parameters(dict[str, Parameter]):
             piece = self.pieces.get(name)
             if piece is None or not changed_parts:
                 continue
-            com, inertia = piece.frame.actInv(piece.placement.translation), piece.inertia.copy()
-            com = [parts.get(f"com.{axis}", x) for axis, x in zip(AXES, com, strict=True)]
+            com, inertia = (
+                piece.frame.actInv(piece.placement.translation),
+                piece.inertia.copy(),
+            )
+            com = [
+                parts.get(f"com.{axis}", x) for axis, x in zip(AXES, com, strict=True)
+            ]
             for entry, (i, j) in ENTRIES.items():
-                inertia[i, j] = inertia[j, i] = parts.get(f"inertia.{entry}", inertia[i, j])
-            mass = positive(f"the mass of '{name}'", parts.get("mass", piece.mass), "kg")
-            density = positive(f"the density factor of '{name}'", parts.get("density", 1.0))
+                inertia[i, j] = inertia[j, i] = parts.get(
+                    f"inertia.{entry}", inertia[i, j]
+                )
+            mass = positive(
+                f"the mass of '{name}'", parts.get("mass", piece.mass), "kg"
+            )
+            density = positive(
+                f"the density factor of '{name}'", parts.get("density", 1.0)
+            )
             # An unchanged inertia is always accepted, for example zero for a point mass. If the
             # nominal inertia is not physically realisable, the changed one must not be worse.
             was, least = (
@@ -175,10 +205,16 @@ class Parameters(dict[str, Parameter]):
                 / (np.trace(J) or 1.0)
                 for J in (piece.inertia, inertia)
             )
-            sound = np.trace(inertia) > 0.0 and least >= min(-_ROUNDING, was - _ROUNDING)
+            sound = np.trace(inertia) > 0.0 and least >= min(
+                -_ROUNDING, was - _ROUNDING
+            )
             if not sound and (inertia != piece.inertia).any():
-                raise InputError(f"the inertia of '{name}' is not physically realisable")
-            placement = pin.SE3(piece.placement.rotation, piece.frame.act(np.array(com)))
+                raise InputError(
+                    f"the inertia of '{name}' is not physically realisable"
+                )
+            placement = pin.SE3(
+                piece.placement.rotation, piece.frame.act(np.array(com))
+            )
             changed = piece._replace(placement=placement, mass=mass, inertia=inertia)
             at = ROOT
             if piece.joint > ROOT:
@@ -186,7 +222,9 @@ class Parameters(dict[str, Parameter]):
             bodies.setdefault(at, bare.inertias[at].toDynamicParameters())
             bodies[at] += density * as_inertia(changed).toDynamicParameters()
             bodies[at] -= as_inertia(piece).toDynamicParameters()
-        return {at: pin.Inertia.FromDynamicParameters(body) for at, body in bodies.items()}
+        return {
+            at: pin.Inertia.FromDynamicParameters(body) for at, body in bodies.items()
+        }
 
 
 def moments(mass: float, first: Array, inertia: Array) -> Array:
@@ -206,13 +244,17 @@ def _of_piece(name: str, piece: Piece) -> Iterator[Parameter]:
     com = piece.frame.actInv(c).tolist()
     for axis, at, d in zip(AXES, com, piece.frame.rotation.T, strict=True):
         D = skew(d)
-        yield change(f"com.{axis}", "m", at, moments(0.0, m * d, m * (D.T @ C + C.T @ D)))
+        yield change(
+            f"com.{axis}", "m", at, moments(0.0, m * d, m * (D.T @ C + C.T @ D))
+        )
     for entry, (row, column) in ENTRIES.items():
         unit_inertia = np.zeros((3, 3))
         unit_inertia[row, column] = unit_inertia[column, row] = 1.0
         about = turn @ unit_inertia @ turn.T
         value = float(piece.inertia[row, column])
-        yield change(f"inertia.{entry}", "kg m^2", value, moments(0.0, np.zeros(3), about))
+        yield change(
+            f"inertia.{entry}", "kg m^2", value, moments(0.0, np.zeros(3), about)
+        )
     yield change("density", "1", 1.0, as_inertia(piece).toDynamicParameters())
 
 
@@ -229,15 +271,21 @@ def _of_joints(robot: Robot) -> Iterator[Parameter]:
             omega, ratio = joint.oscillation(stiffness, damping)
             by_rate, per_turn = 2.0 * inertia * omega, 2.0 * inertia * _TURN
             frequency = Parameter(name, "frequency", "Hz", omega / _TURN, joint=index)
-            yield replace(frequency, by_stiffness=by_rate * _TURN, by_damping=per_turn * ratio)
-            yield Parameter(name, "damping", "1", ratio, joint=index, by_damping=by_rate)
+            yield replace(
+                frequency, by_stiffness=by_rate * _TURN, by_damping=per_turn * ratio
+            )
+            yield Parameter(
+                name, "damping", "1", ratio, joint=index, by_damping=by_rate
+            )
             continue
         per = f"/({joint.unit})" if " " in joint.unit else f"/{joint.unit}"
         force = joint.force_unit
         yield Parameter(
             name, "stiffness", f"{force}{per}", stiffness, joint=index, by_stiffness=1.0
         )
-        yield Parameter(name, "damping", f"{force} s{per}", damping, joint=index, by_damping=1.0)
+        yield Parameter(
+            name, "damping", f"{force} s{per}", damping, joint=index, by_damping=1.0
+        )
 
 
 def _of_inputs(robot: Robot) -> Iterator[Parameter]:
@@ -253,11 +301,18 @@ def _of_inputs(robot: Robot) -> Iterator[Parameter]:
                 # component of d that is perpendicular to the direction has an effect.
                 turned = d - along * (along @ d)
                 moved = np.concatenate((np.zeros(3), np.cross(d, along)))
-                tilted = np.concatenate((turned, np.cross(where, turned) + item.torque * turned))
-                changes = ("position", "m", where, moved), ("direction", "1", along, tilted)
+                tilted = np.concatenate(
+                    (turned, np.cross(where, turned) + item.torque * turned)
+                )
+                changes = (
+                    ("position", "m", where, moved),
+                    ("direction", "1", along, tilted),
+                )
                 for part, unit, at_joint, wrench in changes:
                     in_joint = np.array(placement.act(pin.Force(wrench)).vector)
-                    made = Parameter(names[0], f"{part}.{letter}", unit, float(at_joint @ d))
+                    made = Parameter(
+                        names[0], f"{part}.{letter}", unit, float(at_joint @ d)
+                    )
                     yield replace(made, wrench=(joint, first, in_joint))
             if item.torque:
                 reaction = np.concatenate((np.zeros(3), along))

@@ -141,7 +141,11 @@ class Sensitivity:
             the change 1.0 of ``panel_*.stiffness`` changes all matching stiffnesses together.
         """
         given = numbers("direction", direction, "parameter", "change")
-        named = {name: value for key, value in given.items() for name in self.parameters.find(key)}
+        named = {
+            name: value
+            for key, value in given.items()
+            for name in self.parameters.find(key)
+        }
         if not named:
             raise InputError("direction is empty, expected {parameter: change}")
         matrices = self._derivatives.over([self.parameters[name] for name in named])
@@ -188,11 +192,15 @@ class Sensitivity:
 
         poles, left, right = eig(lin.A - lin.B @ K, left=True)
         changes = self.dA - self.dB @ K
-        derivatives = np.einsum("ik,pij,jk->pk", left.conj(), changes, right, optimize=True)
+        derivatives = np.einsum(
+            "ik,pij,jk->pk", left.conj(), changes, right, optimize=True
+        )
         derivatives = derivatives / np.einsum("ik,ik->k", left.conj(), right)
         apart = np.abs(poles[:, None] - poles)
         np.fill_diagonal(apart, np.inf)
-        derivatives[:, apart.min(axis=1) <= _EQUAL * max(np.abs(poles).max(), _EQUAL)] = np.nan
+        derivatives[
+            :, apart.min(axis=1) <= _EQUAL * max(np.abs(poles).max(), _EQUAL)
+        ] = np.nan
         return poles, derivatives
 
     def check(self, names: Sequence[str] | None = None) -> dict[str, float]:
@@ -214,8 +222,12 @@ class Sensitivity:
         """
         if names is None:
             names = [name for name, one in self.parameters.items() if one.bodies]
-        if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
-            raise InputError(f"names is {names!r}, expected a list, such as ['base.mass']")
+        if not isinstance(names, list | tuple) or not all(
+            isinstance(name, str) for name in names
+        ):
+            raise InputError(
+                f"names is {names!r}, expected a list, such as ['base.mass']"
+            )
         return {name: self._derivatives.difference(self._one(name)) for name in names}
 
     def __str__(self) -> str:
@@ -237,7 +249,9 @@ class Sensitivity:
             ``link_3``, or a pattern such as ``*.density``. Bodies whose links are listed are
             omitted.
         """
-        instance("only", only, (str, type(None)), "the name of a kind, a link or a pattern")
+        instance(
+            "only", only, (str, type(None)), "the name of a kind, a link or a pattern"
+        )
         shown = self.parameters.ranked(only)
         lin = self.lin
         sizes = [max(np.abs(x).max(), 1e-300) for x in (self.lin.A, self.lin.B)]
@@ -250,11 +264,14 @@ class Sensitivity:
             if small:
                 step = 0.01
             effect = [
-                step * np.abs(d).max() / size for d, size in zip((dA, dB), sizes, strict=True)
+                step * np.abs(d).max() / size
+                for d, size in zip((dA, dB), sizes, strict=True)
             ]
             if one.name in shown and max(effect) > 0.0:
                 unit = "." if one.unit == "1" else one.unit
-                percents = (f"{100.0 * x:.2g}" if x > _ROUNDING else "." for x in effect)
+                percents = (
+                    f"{100.0 * x:.2g}" if x > _ROUNDING else "." for x in effect
+                )
                 cells = one.name, unit, f"{one.value:.5g}", f"{step:.3g}", *percents
                 rows.append((max(effect), *cells))
         rows.sort(key=lambda row: -row[0])
@@ -284,7 +301,9 @@ class Sensitivity:
         FileError
             If the file has another ending or cannot be written.
         """
-        write_record(as_path(path), sensitivity_record(self), checksummed=self.lin.verified)
+        write_record(
+            as_path(path), sensitivity_record(self), checksummed=self.lin.verified
+        )
 
 
 def sensitivity_record(result: Sensitivity) -> Record:

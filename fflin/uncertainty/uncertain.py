@@ -89,13 +89,20 @@ class Uncertain:
         """
         robot = self.robot
         lin = linearize(self.robot, q)
-        if any(output.FEELS_ACCELERATION or type(output) in WEIGH for output in robot.outputs):
+        if any(
+            output.FEELS_ACCELERATION or type(output) in WEIGH
+            for output in robot.outputs
+        ):
             raise InputError(
                 "an output depends on accelerations or masses, which the LFT cannot represent; "
                 "remove it with robot.replace(outputs=)"
             )
         rest = robot.springs.rest - StateMap(robot).joint_positions(lin.q)
-        varied = [interval.parameter for interval in self.ranges if interval.parameter.by_stiffness]
+        varied = [
+            interval.parameter
+            for interval in self.ranges
+            if interval.parameter.by_stiffness
+        ]
         pulled = [rest[one.joint] for one in varied]
         pulled += [lin.f0.any(), *robot.gravity, robot.orbit, robot.stored_momentum]
         if any(pulled):
@@ -282,7 +289,9 @@ def uncertain(robot: Robot, ranges: Mapping[str, object]) -> Uncertain:
         else:
             given[key] = value
     if not given:
-        raise InputError("ranges is empty, expected {parameter: 0.2 or (least, largest)}")
+        raise InputError(
+            "ranges is empty, expected {parameter: 0.2 or (least, largest)}"
+        )
     parameters, alone, together = Parameters(robot), dict[str, Block](), list[Block]()
     for key, value in given.items():
         bounds, tied = untied(key, value)
@@ -322,7 +331,9 @@ def _range(one: Parameter, value: object) -> Range:
             "it; use fflin.sensitivity for this parameter"
         )
     if isinstance(value, tuple | list):
-        least, largest = vector(f"range of '{one.name}'", value, 2, "(least, largest)").tolist()
+        least, largest = vector(
+            f"range of '{one.name}'", value, 2, "(least, largest)"
+        ).tolist()
     else:
         relative = number(f"range of '{one.name}'", value)
         if not one.value:
@@ -330,7 +341,9 @@ def _range(one: Parameter, value: object) -> Range:
                 f"'{one.name}' is 0, so that a relative range is empty; give the bounds (least, "
                 "largest)"
             )
-        least, largest = sorted((one.value * (1.0 - relative), one.value * (1.0 + relative)))
+        least, largest = sorted(
+            (one.value * (1.0 - relative), one.value * (1.0 + relative))
+        )
     expected = "" if least < largest else "least < largest"
     if least < 0.0 and one.part in ("stiffness", "damping"):
         expected = "values of 0 or more"
@@ -359,5 +372,8 @@ def _tied(key: str, ranges: list[Range], value: object) -> Block:
     relative = abs(number(key, value))
     # The half width of a range has the sign of the parameter's nominal value. So a positive delta
     # increases the magnitudes of all tied parameters.
-    scaled = (interval._replace(half=relative * interval.parameter.value) for interval in ranges)
+    scaled = (
+        interval._replace(half=relative * interval.parameter.value)
+        for interval in ranges
+    )
     return Block(key, "1", 1.0, relative, tuple(scaled))

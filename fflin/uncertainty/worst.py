@@ -109,7 +109,9 @@ class Worst:
             ("least disk margin", self.margin),
             ("largest gain from a disturbance at the inputs", self.gain),
         ):
-            at = ", ".join(f"{name} {value:.4g}" for name, value in case.parameters.items())
+            at = ", ".join(
+                f"{name} {value:.4g}" for name, value in case.parameters.items()
+            )
             lines.append(f"{criterion} {case.value:.4g} at {at}")
         where = f"the central {100.0 * self.safe:.3g} % of each range"
         if self.safe >= 1.0:
@@ -118,7 +120,9 @@ class Worst:
 
 
 @in_one_thread
-def searched(model: Uncertain, lft: LFT, gain: object, samples: int, seed: int) -> Worst:
+def searched(
+    model: Uncertain, lft: LFT, gain: object, samples: int, seed: int
+) -> Worst:
     """Search for the worst closed loops; see `Uncertain.worst`."""
     K = shaped("gain", getattr(gain, "K", gain), lft.B2.T.shape, " (nu, nx)")
     kept = judged_states(lft, K, getattr(gain, "regulated", ()))
@@ -145,13 +149,17 @@ def searched(model: Uncertain, lft: LFT, gain: object, samples: int, seed: int) 
     whole = Gain(lft.C2, np.zeros((len(lft.C2), len(K))), np.ones(len(K)))
     cases = []
     bar = Progress()
-    undamped = Figures(loops.undamped, loops.undamped, lambda rows, b: loops.undamped(rows) > b)
+    undamped = Figures(
+        loops.undamped, loops.undamped, lambda rows, b: loops.undamped(rows) > b
+    )
     for figures in (undamped, loops.figures(disk), loops.figures(whole)):
         value, delta = _largest(figures, tried, model.refusal)
         cases.append(Found(value, model.values(delta)))
         bar(len(cases), 4)
     unstable = loops.undamped(tried) >= 0.0
-    safe = min(_safe(loops), float(np.abs(tried[unstable]).max(axis=1).min(initial=np.inf)))
+    safe = min(
+        _safe(loops), float(np.abs(tried[unstable]).max(axis=1).min(initial=np.inf))
+    )
     bar.close()
     damping, margin, gained = cases
     return Worst(
@@ -179,7 +187,9 @@ def judged_states(lft: LFT, K: Array, regulated: Sequence[str]) -> Mask:
     # in these rows of A + B1 Delta (I - D11 Delta)^-1 C1, and the matrix of every loop is block
     # triangular.
     kept: Mask = np.isin(lft.state_names, regulated) | K.any(axis=0)
-    kept |= np.abs(lft.C1).max(axis=0, initial=0.0) > _ROUNDING * np.abs(lft.C1).max(initial=0.0)
+    kept |= np.abs(lft.C1).max(axis=0, initial=0.0) > _ROUNDING * np.abs(lft.C1).max(
+        initial=0.0
+    )
     least = _ROUNDING * np.abs(lft.A).max()
     while (acting := ~kept & (np.abs(lft.A[kept]) > least).any(axis=0)).any():
         kept |= acting
@@ -244,7 +254,9 @@ class Loops:
         """Return the functions for the criterion "largest gain" of a channel."""
         middle = np.zeros((1, len(self.lft.repeats)))
         sizes = np.unique(np.abs(np.linalg.eigvals(self.matrices(middle)[0])))
-        at = np.argsort([-self.gains(channel, middle, np.array((w,)))[0] for w in sizes])
+        at = np.argsort(
+            [-self.gains(channel, middle, np.array((w,)))[0] for w in sizes]
+        )
         peaks = [0.0, *sizes[at[:_FREQUENCIES]]]
 
         def exact(row: Array) -> Array:
@@ -252,14 +264,17 @@ class Loops:
             if np.linalg.eigvals(F).real.max() >= 0.0:
                 return np.array((np.inf,))
             value, w = largest_gain(F, B * channel.scale, channel.C, channel.D)
-            peaks.append(min(w, 1e300))  # similar loops have their peak near this frequency
+            # similar loops have their peak near this frequency
+            peaks.append(min(w, 1e300))
             return np.array((value,))
 
         def above(rows: Array, bound: float) -> Mask:
             F, B = self.matrices(rows)
             unstable: Mask = np.linalg.eigvals(F).real.max(axis=-1) >= 0.0
             limit = bound * (1.0 + ACCURACY)
-            _, crossed = gain_crossings(F, B * channel.scale, channel.C, channel.D, limit)
+            _, crossed = gain_crossings(
+                F, B * channel.scale, channel.C, channel.D, limit
+            )
             return unstable | crossed.any(axis=-1)
 
         def quick(rows: Array) -> Array:
@@ -268,7 +283,9 @@ class Loops:
         return Figures(quick, exact, above)
 
 
-def _largest(figures: Figures, tried: Array, refuse: Callable[[Array], str]) -> tuple[float, Array]:
+def _largest(
+    figures: Figures, tried: Array, refuse: Callable[[Array], str]
+) -> tuple[float, Array]:
     """Return the largest criterion that local searches find, and the deltas where it occurs.
 
     The first search starts at the first row of `tried`. A new search starts at each later row whose
@@ -284,7 +301,9 @@ def _largest(figures: Figures, tried: Array, refuse: Callable[[Array], str]) -> 
     return best, at
 
 
-def _climbed(figures: Figures, start: Array, refuse: Callable[[Array], str]) -> tuple[float, Array]:
+def _climbed(
+    figures: Figures, start: Array, refuse: Callable[[Array], str]
+) -> tuple[float, Array]:
     """Maximise a criterion locally from `start`; return the maximum and its deltas.
 
     A step follows the gradient, or sets one delta to -1 or 1.
@@ -302,7 +321,9 @@ def _climbed(figures: Figures, start: Array, refuse: Callable[[Array], str]) -> 
         alone = [np.where(unit, end, delta) for end in (-1.0, 1.0)]
         trials = np.vstack((np.clip(delta + steps, -1.0, 1.0), *alone))
         before = value
-        for trial in islice(filterfalse(refuse, trials[np.argsort(-quick(trials))]), _HELD):
+        for trial in islice(
+            filterfalse(refuse, trials[np.argsort(-quick(trials))]), _HELD
+        ):
             if (reached := float(exact(trial[None])[0])) > value:
                 value, delta = reached, trial
         if not value > before + 1e-9 * abs(before):
@@ -324,7 +345,9 @@ def _safe(loops: Loops) -> float:
         return (lft.C1 - lft.D12 @ loops.K) @ np.linalg.solve(inner, lft.B1) + lft.D11
 
     rates = np.concatenate((np.abs(poles), np.abs(poles.imag)))
-    largest = largest_bound(response, lft.D11, rates[rates > 0.0], lft.repeats.astype(int))
+    largest = largest_bound(
+        response, lft.D11, rates[rates > 0.0], lft.repeats.astype(int)
+    )
     if not largest:
         return np.inf
     return 1.0 / largest
@@ -345,7 +368,9 @@ def perron(Z: Array) -> Array:
     right, left = np.ones((2, *Z.shape[:-1], 1))
     for _ in range(100):
         right, left = sizes @ right, sizes.mT @ left
-        right, left = (vector / vector.max(axis=-2, keepdims=True) for vector in (right, left))
+        right, left = (
+            vector / vector.max(axis=-2, keepdims=True) for vector in (right, left)
+        )
     d: Array = np.sqrt(left / right)
     return d
 
@@ -375,7 +400,9 @@ def largest_bound(
     at_end = min(bound_of(end[None], scaling) for scaling in _scalings(end, blocks))
     heap: list[tuple[float, float, float, bool, Scaling]] = []
 
-    def best_of(a: float, b: float, asked: bool, *known: Scaling) -> tuple[float, Scaling, float]:
+    def best_of(
+        a: float, b: float, asked: bool, *known: Scaling
+    ) -> tuple[float, Scaling, float]:
         """Return the bound over [a, b], the scaling that gives it, and the bound at (a + b)/2.
 
         Both are the least bounds over the scalings in `known` and from `_scalings`. slycot is used
@@ -401,7 +428,10 @@ def largest_bound(
         if asked:
             half = 0.5 * (a + b)
             for low, high in ((a, half), (half, b)):
-                heappush(heap, (-best_of(low, high, False, scaling)[0], low, high, False, scaling))
+                heappush(
+                    heap,
+                    (-best_of(low, high, False, scaling)[0], low, high, False, scaling),
+                )
         else:
             value, scaling, least = best_of(a, b, True, scaling)
             reached = max(reached, least)

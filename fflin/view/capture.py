@@ -20,7 +20,13 @@ from typing import Any
 from fflin.base.errors import FileError, MissingPackageError
 
 _NAMES = (
-    *("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome"),
+    *(
+        "chromium",
+        "chromium-browser",
+        "google-chrome",
+        "google-chrome-stable",
+        "chrome",
+    ),
     *("microsoft-edge", "msedge"),
 )
 
@@ -28,7 +34,11 @@ _NAMES = (
 # without a graphics card, and disable background network access.
 _ARGUMENTS = (
     *("--headless=new", "--remote-debugging-pipe", "--hide-scrollbars", "--mute-audio"),
-    *("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"),
+    *(
+        "--use-angle=swiftshader",
+        "--enable-unsafe-swiftshader",
+        "--ignore-gpu-blocklist",
+    ),
     *("--disable-background-networking", "--disable-quic", "--no-first-run"),
     *("--no-default-browser-check", "--disable-component-update", "--disable-sync"),
     *("--disable-dev-shm-usage", "--disable-extensions"),
@@ -82,15 +92,24 @@ def take_gif(page: str, start: float, end: float, speed: float) -> bytes:
     frames = _film(page, times, _GIF, count)
     images = [Image.open(io.BytesIO(frame)).convert("RGB") for frame in frames]
     palette = images[0].quantize(160)
-    images = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
+    images = [
+        image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images
+    ]
     content = io.BytesIO()
     images[0].save(
-        content, "GIF", save_all=True, append_images=images[1:], duration=1000 // _GIF_FPS, loop=0
+        content,
+        "GIF",
+        save_all=True,
+        append_images=images[1:],
+        duration=1000 // _GIF_FPS,
+        loop=0,
     )
     return content.getvalue()
 
 
-def _film(page: str, times: Sequence[float], size: tuple[int, int], keys: int) -> list[bytes]:
+def _film(
+    page: str, times: Sequence[float], size: tuple[int, int], keys: int
+) -> list[bytes]:
     """Return a PNG of the page at each time.
 
     If `keys` is negative, every picture shows the whole page. Otherwise, every picture shows only
@@ -98,10 +117,18 @@ def _film(page: str, times: Sequence[float], size: tuple[int, int], keys: int) -
     """
     program = find_chromium()
     try:
-        with _browser(program, _PATIENCE + _PER_PICTURE * len(times)) as (browser, folder):
+        with _browser(program, _PATIENCE + _PER_PICTURE * len(times)) as (
+            browser,
+            folder,
+        ):
             file = Path(folder, "page.html")
             file.write_text(page, encoding="utf-8")
-            metrics = {"width": size[0], "height": size[1], "deviceScaleFactor": 1, "mobile": False}
+            metrics = {
+                "width": size[0],
+                "height": size[1],
+                "deviceScaleFactor": 1,
+                "mobile": False,
+            }
             browser.tell("Emulation.setDeviceMetricsOverride", **metrics)
             browser.tell("Page.navigate", url=file.resolve().as_uri() + "#pause")
             while not browser.evaluate("Boolean(window.fflin && window.fflin.ready)"):
@@ -120,7 +147,9 @@ def _film(page: str, times: Sequence[float], size: tuple[int, int], keys: int) -
                 shots.append(base64.b64decode(shot["data"]))
             return shots
     except (OSError, _BrowserError) as error:
-        raise FileError(f"{program} cannot take a picture of the page: {error}") from None
+        raise FileError(
+            f"{program} cannot take a picture of the page: {error}"
+        ) from None
 
 
 @contextmanager
@@ -129,7 +158,9 @@ def _browser(program: str, patience: float) -> Iterator[tuple[_Browser, str]]:
 
     After `patience` seconds, the browser is killed.
     """
-    with tempfile.TemporaryDirectory(prefix="fflin-", ignore_cleanup_errors=True) as folder:
+    with tempfile.TemporaryDirectory(
+        prefix="fflin-", ignore_cleanup_errors=True
+    ) as folder:
         options = [*_ARGUMENTS]
         if getattr(os, "geteuid", lambda: 1)() == 0:
             options.append("--no-sandbox")
@@ -188,13 +219,20 @@ class _Browser:
         # and commands are sent to the browser itself.
         self._session: dict[str, str] = {}
         target = self.tell("Target.createTarget", url="about:blank")
-        attached = self.tell("Target.attachToTarget", targetId=target["targetId"], flatten=True)
+        attached = self.tell(
+            "Target.attachToTarget", targetId=target["targetId"], flatten=True
+        )
         self._session = {"sessionId": attached["sessionId"]}
 
     def tell(self, method: str, **parameters: object) -> dict[str, Any]:
         """Send a command and return the answer."""
         self._number += 1
-        command = {"id": self._number, "method": method, "params": parameters, **self._session}
+        command = {
+            "id": self._number,
+            "method": method,
+            "params": parameters,
+            **self._session,
+        }
         with suppress(BrokenPipeError):  # reading the answer reports the error
             self.commands.write(json.dumps(command).encode() + b"\0")
         answer: dict[str, Any] = {}
@@ -214,7 +252,10 @@ class _Browser:
     def evaluate(self, expression: str) -> Any:
         """Return the value of a JavaScript expression; for a promise, wait for the result."""
         answer = self.tell(
-            "Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True
+            "Runtime.evaluate",
+            expression=expression,
+            awaitPromise=True,
+            returnByValue=True,
         )
         if "exceptionDetails" in answer:
             raise _BrowserError(answer["exceptionDetails"].get("text"))

@@ -68,9 +68,18 @@ class Live:
         page.window.forward = partial(self._each, _Socket.send)
         self.meshcat = page.meshcat
         self.notes = tuple(page.notes)
-        axes = [f"base {kind} {axis}" for kind in ("rotation", "translation") for axis in "xyz"]
+        axes = [
+            f"base {kind} {axis}"
+            for kind in ("rotation", "translation")
+            for axis in "xyz"
+        ]
         sliders = [
-            {"name": name, "low": low, "high": high, "length": robot.joint(name).prismatic}
+            {
+                "name": name,
+                "low": low,
+                "high": high,
+                "length": robot.joint(name).prismatic,
+            }
             for name, (low, high) in self._ranges.items()
         ]
         self._html = page.html(
@@ -133,7 +142,10 @@ class Live:
                 "time": None if t is None else float(t),
                 "poses": poses.round(7).tolist(),
                 "joints": [self.robot.joint(name).value(q) for name in self._ranges],
-                "coupling": (inertia / np.outer(scale, scale)).round(4).ravel().tolist(),
+                "coupling": (inertia / np.outer(scale, scale))
+                .round(4)
+                .ravel()
+                .tolist(),
             }
             self.q = q
             self._state = json.dumps(state)

@@ -31,10 +31,20 @@ from fflin.robot.equipment.assembly import turned_to
 from fflin.robot.inputs import Thruster, named_wheels
 from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.robot import Robot
-from fflin.view.shapes import PLAIN, Color, Indices, Mesh, Shape, bendings, load_mesh, shapes
+from fflin.view.shapes import (
+    PLAIN,
+    Color,
+    Indices,
+    Mesh,
+    Shape,
+    bendings,
+    load_mesh,
+    shapes,
+)
 
 with warnings.catch_warnings():
-    warnings.simplefilter("ignore", DeprecationWarning)  # from packages that meshcat imports
+    # from packages that meshcat imports
+    warnings.simplefilter("ignore", DeprecationWarning)
     from meshcat import Visualizer
 
 Lowered = dict[str, Any]
@@ -47,10 +57,18 @@ _APART = 0.1
 _Y_TO_Z = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
 
 # {type of an array: (extension type of msgpack-lite, name of the typed array in JavaScript)}.
-_TYPED = {"<u2": (0x14, "Uint16Array"), "<u4": (0x16, "Uint32Array"), "<f4": (0x17, "Float32Array")}
+_TYPED = {
+    "<u2": (0x14, "Uint16Array"),
+    "<u4": (0x16, "Uint32Array"),
+    "<f4": (0x17, "Float32Array"),
+}
 
 # Placeholder for a mesh that has already been sent to the page.
-_ELSEWHERE: dict[str, object] = {"uuid": "elsewhere", "type": "SphereGeometry", "radius": 0.0}
+_ELSEWHERE: dict[str, object] = {
+    "uuid": "elsewhere",
+    "type": "SphereGeometry",
+    "radius": 0.0,
+}
 
 _SCRIPTS = (
     *("sky", "orbit", "look", "camera", "stage", "marks", "equipment", "pick", "keys"),
@@ -101,7 +119,9 @@ def body_poses(robot: Robot, q: Array) -> Array:
         poses = [pin.SE3ToXYZQUAT(placement) for placement in data.oMi.tolist()[ROOT:]]
         if robot.appendages:
             for bending in bendings(robot).values():
-                poses[bending.node - ROOT] = pin.SE3ToXYZQUAT(bending.placement(data, row))
+                poses[bending.node - ROOT] = pin.SE3ToXYZQUAT(
+                    bending.placement(data, row)
+                )
         all_poses.append(poses)
     return np.array(all_poses).reshape(*q.shape[:-1], robot.model.njoints - ROOT, 7)
 
@@ -121,13 +141,18 @@ class Drawing:
         # Name of each body's node, in the order of Pinocchio's joints (without the universe).
         self.paths = [quote(name, safe=" ") for name in list(robot.model.names)[ROOT:]]
         drawn_shapes, notes = shapes(robot)
-        if robot.urdf or not prefix:  # boxes are the normal drawing of a payload without a URDF
+        # boxes are the normal drawing of a payload without a URDF
+        if robot.urdf or not prefix:
             page.notes |= dict.fromkeys(notes)
         corners: dict[int, list[Array]] = {}
         for index, shape in enumerate(drawn_shapes):
             body = self._visualizer[self.paths[shape.joint - ROOT]]
             for part, (geometry, matrix, color, box) in enumerate(_pieces(shape)):
-                about: dict[str, object] = {"finish": shape.finish, "color": color, "look": look}
+                about: dict[str, object] = {
+                    "finish": shape.finish,
+                    "color": color,
+                    "look": look,
+                }
                 if look in ("real", "held"):
                     about["link"] = link = ".".join(filter(None, (prefix, shape.link)))
                     page.links[link] = _link(robot, shape)
@@ -184,8 +209,16 @@ class Drawing:
         clips = []
         for index, path in enumerate(self.paths):
             tracks = [
-                {"name": ".position", "type": "vector3", "values": typed(poses[:, index, :3])},
-                {"name": ".quaternion", "type": "quaternion", "values": typed(poses[:, index, 3:])},
+                {
+                    "name": ".position",
+                    "type": "vector3",
+                    "values": typed(poses[:, index, :3]),
+                },
+                {
+                    "name": ".quaternion",
+                    "type": "quaternion",
+                    "values": typed(poses[:, index, 3:]),
+                },
             ]
             clip = {
                 "fps": 1,
@@ -207,7 +240,9 @@ def _link(robot: Robot, shape: Shape) -> list[float]:
 
 def typed(array: Array | Indices, kind: str = "<f4") -> object:
     """Pack an array so that the page decodes it as a typed array."""
-    return umsgpack.Ext(_TYPED[kind][0], np.ascontiguousarray(array, dtype=kind).tobytes())
+    return umsgpack.Ext(
+        _TYPED[kind][0], np.ascontiguousarray(array, dtype=kind).tobytes()
+    )
 
 
 def _pieces(shape: Shape) -> list[tuple[dict[str, object], Array, Color, Array]]:
@@ -221,7 +256,12 @@ def _pieces(shape: Shape) -> list[tuple[dict[str, object], Array, Color, Array]]
         assert shape.mesh is not None
         scale = np.diag((*shape.size, 1.0))
         return [
-            (_triangles(mesh), scale, shape.color or mesh.color or PLAIN, _bounds(mesh.vertices))
+            (
+                _triangles(mesh),
+                scale,
+                shape.color or mesh.color or PLAIN,
+                _bounds(mesh.vertices),
+            )
             for mesh in load_mesh(shape.mesh)
         ]
     color = shape.color or PLAIN
@@ -241,7 +281,13 @@ def _pieces(shape: Shape) -> list[tuple[dict[str, object], Array, Color, Array]]
     if shape.kind != "sphere":
         length = shape.size[1]
         sizes = {"radiusTop": radius, "radiusBottom": radius, "height": length}
-        add("Cylinder", _Y_TO_Z, (radius, length / 2.0, radius), **sizes, radialSegments=40)
+        add(
+            "Cylinder",
+            _Y_TO_Z,
+            (radius, length / 2.0, radius),
+            **sizes,
+            radialSegments=40,
+        )
         ends = []
         if shape.kind == "capsule":
             ends = [-length / 2.0, length / 2.0]
@@ -355,7 +401,8 @@ class Page:
         self.window, self.sent = Recorder(), set[str]()  # `sent`: uuids of sent meshes
         self.meshcat = Visualizer(window=self.window)
         self.notes = dict[str, None]()  # notes about missing drawings
-        self.links = dict[str, list[float]]()  # {link: mass [kg], pose (7,) on its body}
+        # {link: mass [kg], pose (7,) on its body}
+        self.links = dict[str, list[float]]()
         self.drawing = Drawing(self, robot, "robot")
         # Path of each body's node, in the order of Pinocchio's joints (without the universe).
         self.nodes = [["meshcat", "robot", path] for path in self.drawing.paths]
@@ -365,16 +412,23 @@ class Page:
         for item, (name, *_) in robot.named_inputs:
             if isinstance(item, Thruster):
                 joint, placement = find_frame(robot.model, item.frame)
-                nozzle: dict[str, object] = {"name": name, "path": self.nodes[joint - ROOT]}
+                nozzle: dict[str, object] = {
+                    "name": name,
+                    "path": self.nodes[joint - ROOT],
+                }
                 nozzle["position"] = placement.act(np.array(item.position)).tolist()
-                nozzle["direction"] = (placement.rotation @ np.array(item.direction)).tolist()
+                nozzle["direction"] = (
+                    placement.rotation @ np.array(item.direction)
+                ).tolist()
                 self.nozzles.append(nozzle)
         # In the first frame: corners of the bounding boxes of all bodies, centre and radius of the
         # robot, and the point of the floor below the centre. All are in m.
         self.points = self.drawing.points(body_poses(robot, q))
         low, high = self.points.min(axis=0), self.points.max(axis=0)
         self.centre = (low + high) / 2.0
-        self.size = max(float(np.linalg.norm(self.points - self.centre, axis=1).max()), 1e-3)
+        self.size = max(
+            float(np.linalg.norm(self.points - self.centre, axis=1).max()), 1e-3
+        )
         self.floor = np.array([*self.centre[:2], low[2]])
 
     def html(self, mode: str, points: Array, **entries: object) -> str:
@@ -411,8 +465,14 @@ class Page:
             placement = at * pin.SE3(turned_to(axis), apart * axis)
             # If the speed of a wheel is a state, the drawn wheel rotates with the node of the
             # wheel's joint.
-            spins = nodes[robot.model.getJointId(name) - ROOT] if name in robot.wheels else None
-            wheels.append({"path": nodes[joint - ROOT], "spins": spins, **_placed(placement)})
+            spins = (
+                nodes[robot.model.getJointId(name) - ROOT]
+                if name in robot.wheels
+                else None
+            )
+            wheels.append(
+                {"path": nodes[joint - ROOT], "spins": spins, **_placed(placement)}
+            )
         # A live page receives the meshcat commands from the server. Other pages contain these
         # commands and open no connection.
         connect = "'self' ws:"
@@ -442,7 +502,9 @@ class Page:
         }
         # In a script element, only an end tag or the start of a comment has a special meaning. Both
         # begin with "<", which is therefore escaped.
-        data = json.dumps(info, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
+        data = json.dumps(info, allow_nan=False, separators=(",", ":")).replace(
+            "<", "\\u003c"
+        )
         fields = {
             "title": escape(robot.name),
             "scene": self.scene,

@@ -59,7 +59,12 @@ _NONE = np.zeros(0)
 
 
 def motion_page(
-    page: Page, motion: Motion, fps: float, speed: float, follow: bool | None, target: Array | None
+    page: Page,
+    motion: Motion,
+    fps: float,
+    speed: float,
+    follow: bool | None,
+    target: Array | None,
 ) -> str:
     """Return the page of a motion; see `visualize`."""
     robot = page.robot
@@ -87,11 +92,15 @@ def motion_page(
             moving.append((ghost, goals))
     if motion.linear is not None:
         predicted = state.points(motion.linear[shown])[1]
-        moving.append((Drawing(page, robot, "linear", "linear"), body_poses(robot, predicted)))
+        moving.append(
+            (Drawing(page, robot, "linear", "linear"), body_poses(robot, predicted))
+        )
     held = []
     for caught, poses in payloads(motion, frame, shown):
         name = caught.prefix
-        held.append((Drawing(page, caught.payload, f"held/{name}", "held", name), poses))
+        held.append(
+            (Drawing(page, caught.payload, f"held/{name}", "held", name), poses)
+        )
     moving += held
     clips = []
     for drawing, poses in moving:
@@ -129,7 +138,9 @@ def motion_page(
         follow=follow,
         target=len(goals) > 0,
         linear=motion.linear is not None,
-        phases=[*zip(motion.phases, motion.starts.tolist(), names, about, strict=False)],
+        phases=[
+            *zip(motion.phases, motion.starts.tolist(), names, about, strict=False)
+        ],
         held=[drawing.prefix for drawing, _ in held],
     )
 
@@ -165,7 +176,9 @@ def marks(page: Page, film: Playback, goals: Array) -> dict[str, object]:
         if followed:
             followed["tool"] = moved(goals[:, joint - ROOT], at.translation)
     return {
-        "trails": [{"name": name, "points": packed(points)} for name, points in trails.items()],
+        "trails": [
+            {"name": name, "points": packed(points)} for name, points in trails.items()
+        ],
         "followed": [{"points": packed(points)} for points in followed.values()],
         "arrows": [
             {"kind": kind, "longest": ARROW * page.size, "values": packed(values)}
@@ -189,7 +202,8 @@ def moved(poses: Array, point: Array) -> Array:
 class Playback(NamedTuple):
     """Poses, trails and forces of a motion at N frames."""
 
-    poses: Array  # (N, njoints - 1, 7): x, y, z and quaternion of each joint's frame in the world
+    # (N, njoints - 1, 7): x, y, z and quaternion of each joint's frame in the world
+    poses: Array
     com: Array  # (N, 3) [m] centre of mass in the world
     force: Array  # (N, 3) [N] on the base, in world axes
     torque: Array  # (N, 3) [N m] on the base, in world axes
@@ -224,10 +238,14 @@ def play_back(state: StateMap, q: Array, u: Array) -> Playback:
         return wrench[..., 0]
 
     force, torque = in_world("F_b", state.axes[1]), in_world("tau_b", state.axes[0])
-    return Playback(poses, com, force, torque, u[:, groups.get("thrust", np.zeros(0, dtype=int))])
+    return Playback(
+        poses, com, force, torque, u[:, groups.get("thrust", np.zeros(0, dtype=int))]
+    )
 
 
-def payloads(motion: Motion, frame: Frame, shown: Array) -> Iterator[tuple[Capture, Array]]:
+def payloads(
+    motion: Motion, frame: Frame, shown: Array
+) -> Iterator[tuple[Capture, Array]]:
     """Yield each capture, and the poses (N, njoints - 1, 7) of the captured payload.
 
     The poses are at the samples of the motion whose indices are in `shown` (N,).
@@ -261,7 +279,8 @@ def _flight(caught: Capture, frame: Frame, t: Array) -> list[Array]:
     poses = list[Array]()
     none = np.zeros(len(plant.actuation.names))
     softness = np.linalg.inv(state.project(inertia_at(payload, q))).diagonal()[6:]
-    rate = np.sqrt(softness @ payload.springs.stiffness)  # [rad/s] upper bound of frequencies
+    # [rad/s] upper bound of frequencies
+    rate = np.sqrt(softness @ payload.springs.stiffness)
     for time in t[::-1].tolist():
         steps = math.ceil((now - time) * max(1.0 / _STEP, rate / _SWING))
         for _ in range(steps):
@@ -280,7 +299,9 @@ def _held(caught: Capture, robot: Robot, rows: Array) -> list[Array]:
     poses = []
     for q in rows:
         pin.forwardKinematics(model, data, q)
-        poses.append(np.array([pin.SE3ToXYZQUAT(data.oMi[joint] * at) for joint, at in places]))
+        poses.append(
+            np.array([pin.SE3ToXYZQUAT(data.oMi[joint] * at) for joint, at in places])
+        )
     return poses
 
 
@@ -292,8 +313,12 @@ def errors(
     The joints `wheels` and modes are excluded.
     """
     goals = np.broadcast_to(target, q.shape)
-    apart = np.array([pin.difference(robot.model, *pair) for pair in zip(goals, q, strict=True)])
-    joints = [joint for joint in robot.joints if not (joint.mode or joint.name in wheels)]
+    apart = np.array(
+        [pin.difference(robot.model, *pair) for pair in zip(goals, q, strict=True)]
+    )
+    joints = [
+        joint for joint in robot.joints if not (joint.mode or joint.name in wheels)
+    ]
     turning = [joint.idx_v for joint in joints if not joint.prismatic]
     sliding = [joint.idx_v for joint in joints if joint.prismatic]
     error_of = {
@@ -301,13 +326,23 @@ def errors(
         "position": ("m", np.linalg.norm((q - goals)[:, :3], axis=1)),
     }
     if turning:
-        error_of["largest joint"] = ("°", np.degrees(np.abs(apart[:, turning]).max(axis=1)))
+        error_of["largest joint"] = (
+            "°",
+            np.degrees(np.abs(apart[:, turning]).max(axis=1)),
+        )
     if sliding:
-        error_of["largest prismatic joint"] = ("m", np.abs(apart[:, sliding]).max(axis=1))
-    return {k: (unit, np.where(x < _NOTHING, 0.0, x)) for k, (unit, x) in error_of.items()}
+        error_of["largest prismatic joint"] = (
+            "m",
+            np.abs(apart[:, sliding]).max(axis=1),
+        )
+    return {
+        k: (unit, np.where(x < _NOTHING, 0.0, x)) for k, (unit, x) in error_of.items()
+    }
 
 
-def panel(robot: Robot, motion: Motion, shown: Array, target: Array) -> dict[str, object]:
+def panel(
+    robot: Robot, motion: Motion, shown: Array, target: Array
+) -> dict[str, object]:
     """Return the readouts and plots of a motion at the samples `shown`.
 
     Errors are relative to the configurations `target` (k, nq). If k = 0, the page shows changes
@@ -320,7 +355,8 @@ def panel(robot: Robot, motion: Motion, shown: Array, target: Array) -> dict[str
     plotted = 4 if len(target) > 1 else 2
     rest = resting_from(motion) if len(target) > 1 else None
     readouts = [
-        (label_form.format(quantity), unit, values) for quantity, (unit, values) in error_of.items()
+        (label_form.format(quantity), unit, values)
+        for quantity, (unit, values) in error_of.items()
     ]
     plots = [
         _plot(title, [Curve("", "", "", unit, values, _NONE)])
@@ -336,13 +372,18 @@ def panel(robot: Robot, motion: Motion, shown: Array, target: Array) -> dict[str
             reference = None
             if len(target) > 1 and curve.reference is not None:
                 reference = curve.reference[shown]
-            lines.append(curve._replace(values=curve.values[shown], reference=reference))
+            lines.append(
+                curve._replace(values=curve.values[shown], reference=reference)
+            )
         least = max(_NOTHING, _UNSEEN * max(map(_size, lines)))
         seen = [curve for curve in lines if _size(curve) >= least]
         # States of the base are not plotted here, because the errors of attitude and position are
         # plotted above. Rates are plotted only if one of them comes near a limit.
         of_base = whole[0].group in STATES and whole[0].group not in JOINTS
-        if any(curve.near or not title.endswith("rates") for curve in seen) and not of_base:
+        if (
+            any(curve.near or not title.endswith("rates") for curve in seen)
+            and not of_base
+        ):
             plots.append(_plot(title, seen))
     return {
         "readouts": [
@@ -357,7 +398,9 @@ def panel(robot: Robot, motion: Motion, shown: Array, target: Array) -> dict[str
 
 def _size(curve: Curve) -> float:
     """Return the largest magnitude of a curve and, if it has a reference, of the reference."""
-    rows = curve.values if curve.reference is None else (*curve.values, *curve.reference)
+    rows = (
+        curve.values if curve.reference is None else (*curve.values, *curve.reference)
+    )
     return float(np.abs(rows).max())
 
 
@@ -402,7 +445,9 @@ def mode_page(
     page.drawing.place(at_rest)
     Drawing(page, robot, "rest", "ghost").place(at_rest)
     swings = [_swing(state, page, mode, lin) for mode in model_modes.vibrations]
-    points = [page.drawing.points(at) for swing in swings for at in swing[:: _PHASES // 4]]
+    points = [
+        page.drawing.points(at) for swing in swings for at in swing[:: _PHASES // 4]
+    ]
     shapes = np.array([mode.shape for mode in model_modes.vibrations])
     energies = energies_of(robot, lin, shapes)
     modes = [
@@ -414,7 +459,9 @@ def mode_page(
             "shape": _shape(mode, lin),
             "poses": packed(poses),
         }
-        for mode, (energy, _), poses in zip(model_modes.vibrations, energies, swings, strict=True)
+        for mode, (energy, _), poses in zip(
+            model_modes.vibrations, energies, swings, strict=True
+        )
     ]
     about = f"{subtitle(robot)}, {counted(len(modes), 'vibration')}"
     corners = np.concatenate(points)
@@ -435,7 +482,9 @@ def _swing(state: StateMap, page: Page, mode: Mode, lin: LinearModel) -> Array:
 
     # Largest displacement of a corner per unit amplitude, computed with a small amplitude.
     small = 1e-4
-    moved = np.array([page.drawing.points(pose_rows) - page.points for pose_rows in poses(small)])
+    moved = np.array(
+        [page.drawing.points(pose_rows) - page.points for pose_rows in poses(small)]
+    )
     reach = float(np.linalg.norm(moved, axis=2).max()) / small
     turned = np.abs(mode.shape[:half]) * [
         {"1": 2.0, "rad": 1.0}.get(unit, 0.0) for unit in lin.state_units[:half]

@@ -53,11 +53,13 @@ class Shape:
     kind: str  # "box", "sphere", "cylinder", "capsule" or "mesh"
     size: tuple[float, ...]  # [m] sides, radius, or radius and length; scale of a mesh
     placement: pin.SE3  # in the body's frame; the axis of a cylinder is z
-    color: Color | None = PLAIN  # red, green, blue, opacity; None for the colours of a mesh file
+    # red, green, blue, opacity; None for the colours of a mesh file
+    color: Color | None = PLAIN
     finish: str = ""  # name of the material, which decides how metallic the shape looks
     mesh: Path | None = None
     link: str = ""  # name of the link, or of the body if its inertia is drawn
-    at: pin.SE3 = field(default_factory=pin.SE3.Identity)  # link's pose in the body's frame
+    # link's pose in the body's frame
+    at: pin.SE3 = field(default_factory=pin.SE3.Identity)
 
 
 def shapes(robot: Robot) -> tuple[tuple[Shape, ...], tuple[str, ...]]:
@@ -80,7 +82,9 @@ def shapes(robot: Robot) -> tuple[tuple[Shape, ...], tuple[str, ...]]:
             placement = held * shape.placement
             link = f"{prefix}.{shape.link}"
             at = held * shape.at
-            drawn.append(replace(shape, joint=joint, placement=placement, link=link, at=at))
+            drawn.append(
+                replace(shape, joint=joint, placement=placement, link=link, at=at)
+            )
     return tuple(drawn), tuple(notes)
 
 
@@ -91,7 +95,10 @@ def carriers_of(robot: Robot, prefix: str, payload: Robot) -> list[Carried]:
     that carries this frame of the payload, and the placement of the frame on that joint.
     """
     names = [f"{prefix}.{name}" for name in list(payload.model.names)[ROOT + 1 :]]
-    return [find_frame(robot.model, prefix), *(find_joint(robot.model, name) for name in names)]
+    return [
+        find_frame(robot.model, prefix),
+        *(find_joint(robot.model, name) for name in names),
+    ]
 
 
 def _visuals(robot: Robot, notes: list[str]) -> Iterator[Shape]:
@@ -110,7 +117,9 @@ def _visuals(robot: Robot, notes: list[str]) -> Iterator[Shape]:
     bent = bent_links(robot, root)
     missing, unreadable, odd = list[str](), list[str](), list[str]()
     for link in root.find_all("link"):
-        frame_id = robot.model.getFrameId(link.attributes.get("name", ""), pin.FrameType.BODY)
+        frame_id = robot.model.getFrameId(
+            link.attributes.get("name", ""), pin.FrameType.BODY
+        )
         if frame_id >= robot.model.nframes:
             continue  # the link is not in the model
         frame = robot.model.frames[frame_id]
@@ -139,7 +148,9 @@ def _visuals(robot: Robot, notes: list[str]) -> Iterator[Shape]:
                 except ValueError:
                     unreadable.append(file.name)
                     continue
-            yield Shape(joint, kind, size, placement, color, finish, file, frame.name, at)
+            yield Shape(
+                joint, kind, size, placement, color, finish, file, frame.name, at
+            )
     yield from _balls(robot, bent)
     notes += _not_drawn(robot, path, missing, unreadable, odd)
 
@@ -180,7 +191,9 @@ def _geometry(visual: Element) -> tuple[str, tuple[float, ...], str | None]:
     raise ValueError(shape.tag)
 
 
-def _material(visual: Element, colors: Mapping[str, Color], kind: str) -> tuple[Color | None, str]:
+def _material(
+    visual: Element, colors: Mapping[str, Color], kind: str
+) -> tuple[Color | None, str]:
     none = None if kind == "mesh" else PLAIN
     for material in visual.find_all("material"):
         name = material.attributes.get("name", "")
@@ -210,7 +223,9 @@ def _inertia_boxes(robot: Robot) -> Iterator[Shape]:
         sides = np.maximum(sides, max(0.05 * sides.max(), 1e-3))
         placement = pin.SE3(axes, inertia.lever)
         link = "base" if joint == ROOT else robot.model.names[joint]
-        yield Shape(joint, "box", tuple(sides.tolist()), placement, finish="inertia", link=link)
+        yield Shape(
+            joint, "box", tuple(sides.tolist()), placement, finish="inertia", link=link
+        )
 
 
 class Bending(NamedTuple):
@@ -228,7 +243,8 @@ class Bending(NamedTuple):
     frame: pin.SE3  # placement of the appendage's frame on the carrier
     modes: list[int]  # indices of the modal amplitudes in q
     twist: Array  # (6, k) per unit of q: translation before rotation
-    center: Array  # (3,) centre of the first mode's ball, which represents the links, in `frame`
+    # (3,) centre of the first mode's ball, which represents the links, in `frame`
+    center: Array
 
     def placement(self, data: pin.Data, q: Array) -> pin.SE3:
         """Return the placement, in the world, of the appendage's frame after bending."""
@@ -274,7 +290,8 @@ def bent_links(robot: Robot, root: Element) -> dict[str, Bending]:
     carried = {child for links in children.values() for child in links}
     bending_of_link: dict[str, Bending] = {}
     for item in robot.appendages:
-        if isinstance(item, FlexibleAppendage) and item.frame in carried:  # excludes the root link
+        # excludes the root link
+        if isinstance(item, FlexibleAppendage) and item.frame in carried:
             bending = bendings(robot)[item.title]
             links = [item.frame]
             for link in links:
@@ -292,7 +309,9 @@ def _balls(robot: Robot, bent: dict[str, Bending]) -> Iterator[Shape]:
         if isinstance(item, Slosh):
             joint = robot.model.getJointId(item.modes[1])
             lever = robot.model.inertias[joint].lever
-            yield Shape(joint, "sphere", (_radius(item.mass),), pin.SE3(np.eye(3), lever))
+            yield Shape(
+                joint, "sphere", (_radius(item.mass),), pin.SE3(np.eye(3), lever)
+            )
         elif item.frame not in bent:
             bending = bendings(robot)[item.title]
             t, r = np.split(item.participation[:, 0], 2)
@@ -356,7 +375,9 @@ def _loaded(path: Path, _modified: int, _size: int) -> tuple[Mesh, ...]:
     if path.suffix.lower() == ".dae":
         parts = _colored(path)
     parts = parts or [(*_triangles(path), None)]
-    corners = np.concatenate([vertices[faces].reshape(-1, 3) for vertices, faces, _ in parts])
+    corners = np.concatenate(
+        [vertices[faces].reshape(-1, 3) for vertices, faces, _ in parts]
+    )
     if not corners.size or not np.isfinite(corners).all():
         raise ValueError(f"{path}: has no triangles")
     if np.abs(corners).max() > _FARTHEST:
@@ -408,7 +429,11 @@ def _references(kind: str, content: bytes) -> list[str]:
     """Return the paths to which a mesh file refers, as they are written in the file."""
     if kind == ".obj":
         lines = content.decode("utf-8", "replace").splitlines()
-        named = [line.split(maxsplit=1) for line in lines if line.lstrip().startswith("mtllib")]
+        named = [
+            line.split(maxsplit=1)
+            for line in lines
+            if line.lstrip().startswith("mtllib")
+        ]
         return [words[1].strip() for words in named if len(words) > 1]
     if kind == ".gltf":
         table = json.loads(content)
@@ -432,7 +457,9 @@ def _require_no_cycle(content: bytes) -> None:
             contained.setdefault(node, [])
             around.append(node)
         elif name == "instance_node":
-            contained.setdefault(inside, []).append(attributes.get("url", "").removeprefix("#"))
+            contained.setdefault(inside, []).append(
+                attributes.get("url", "").removeprefix("#")
+            )
 
     def end(tag: str) -> None:
         if tag.rpartition(":")[2] == "node":
@@ -460,10 +487,16 @@ def _colored(path: Path) -> list[tuple[Array, Indices, Color | None]]:
 
     try:
         scene = trimesh.load_scene(path, process=False)
-        meshes = [mesh for mesh in scene.convert_units("meters").dump() if hasattr(mesh, "faces")]
+        meshes = [
+            mesh
+            for mesh in scene.convert_units("meters").dump()
+            if hasattr(mesh, "faces")
+        ]
         parts = list[tuple[Array, Indices, Color | None]]()
         for mesh in meshes:
-            color = getattr(getattr(mesh.visual, "material", None), "baseColorFactor", None)
+            color = getattr(
+                getattr(mesh.visual, "material", None), "baseColorFactor", None
+            )
             if color is not None:  # None if the file gives a texture or no colour
                 r, g, b, a = (float(x) / 255.0 for x in color)
                 color = r, g, b, a or 1.0
@@ -479,17 +512,24 @@ def _triangles(path: Path) -> tuple[Array, Indices]:
     try:
         mesh = coal.MeshLoader().load(str(path), np.ones(3))
     except (RuntimeError, ValueError) as error:
-        raise ValueError(f"{path}: cannot be read: {' '.join(str(error).split())}") from None
+        raise ValueError(
+            f"{path}: cannot be read: {' '.join(str(error).split())}"
+        ) from None
     vertices = np.array(mesh.vertices(), dtype=float).reshape(-1, 3)
     triangles = (mesh.tri_indices(index) for index in range(mesh.num_tris))
-    faces = np.array([(t[0], t[1], t[2]) for t in triangles], dtype=np.intp).reshape(-1, 3)
+    faces = np.array([(t[0], t[1], t[2]) for t in triangles], dtype=np.intp).reshape(
+        -1, 3
+    )
     return vertices, faces
 
 
 def _weld(vertices: Array, faces: Indices, cell: float) -> tuple[Array, Indices]:
     """Merge all vertices in the same cell of a grid; drop triangles that collapse."""
     _, first, inverse = np.unique(
-        np.round(vertices / cell).astype(np.int64), axis=0, return_index=True, return_inverse=True
+        np.round(vertices / cell).astype(np.int64),
+        axis=0,
+        return_index=True,
+        return_inverse=True,
     )
     faces = inverse.reshape(-1)[faces]
     a, b, c = faces.T
@@ -498,4 +538,7 @@ def _weld(vertices: Array, faces: Indices, cell: float) -> tuple[Array, Indices]
     _, kept = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
     faces = faces[np.sort(kept)]
     used, compact = np.unique(faces, return_inverse=True)
-    return (vertices[first[used]].astype(np.float32), compact.reshape(-1, 3).astype(np.uint32))
+    return (
+        vertices[first[used]].astype(np.float32),
+        compact.reshape(-1, 3).astype(np.uint32),
+    )

@@ -14,7 +14,12 @@ import pinocchio as pin
 
 from fflin.base.errors import FflinWarning, FileError, InputError
 from fflin.base.validation import Array, instance, number, positive, truth, whole
-from fflin.base.writing import as_path, check_distinct, check_output_path, write_atomically
+from fflin.base.writing import (
+    as_path,
+    check_distinct,
+    check_output_path,
+    write_atomically,
+)
 from fflin.dynamics.points import start_of
 from fflin.dynamics.state import Actuation, StateMap
 from fflin.robot.joints import ROOT, find_frame
@@ -223,13 +228,17 @@ def _at_rest(robot: Robot, q: Array | None) -> Motion:
 
 def _temporary(name: str) -> Path:
     prefix = f"fflin-{re.sub(r'[^a-zA-Z0-9_]+', '_', name)[:40]}-"
-    with tempfile.NamedTemporaryFile(prefix=prefix, suffix=".html", delete=False) as file:
+    with tempfile.NamedTemporaryFile(
+        prefix=prefix, suffix=".html", delete=False
+    ) as file:
         return Path(file.name)
 
 
 def check_outputs(files: Mapping[str, str | PathLike[str] | None]) -> dict[str, Path]:
     """Return {ending: path} of the requested files; raise an error if one cannot be written."""
-    outputs = {ending: as_path(file) for ending, file in files.items() if file is not None}
+    outputs = {
+        ending: as_path(file) for ending, file in files.items() if file is not None
+    }
     for ending, path in outputs.items():
         if path.suffix.lower() != ending:
             raise FileError(f"'{path}' ends in '{path.suffix}', expected {ending}")
@@ -255,7 +264,9 @@ def tool_frame(robot: Robot, tool: str | None = None) -> str | None:
         return None
     if model.existFrame("tool"):
         return "tool"
-    deepest = max(range(ROOT, model.njoints), key=lambda joint: len(model.supports[joint]))
+    deepest = max(
+        range(ROOT, model.njoints), key=lambda joint: len(model.supports[joint])
+    )
     links = [
         frame.name
         for frame in model.frames.tolist()
@@ -265,7 +276,11 @@ def tool_frame(robot: Robot, tool: str | None = None) -> str | None:
 
 
 def check_playback(
-    fps: float, speed: float | None, times: Sequence[float] | None, start: float, end: float
+    fps: float,
+    speed: float | None,
+    times: Sequence[float] | None,
+    start: float,
+    end: float,
 ) -> tuple[float, float, list[float] | None]:
     """Check the frame rate, speed and picture times [s] of a motion, and return them.
 
@@ -275,13 +290,30 @@ def check_playback(
     fps = number("fps", fps)
     if not 0.0 < fps <= 240.0:
         raise InputError(f"fps is {fps:g}, expected more than 0 and at most 240")
-    nice = [1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1e3, 2e3, 5e3, 1e4, 1e5]
+    nice = [
+        1.0,
+        2.0,
+        5.0,
+        10.0,
+        20.0,
+        50.0,
+        100.0,
+        200.0,
+        500.0,
+        1e3,
+        2e3,
+        5e3,
+        1e4,
+        1e5,
+    ]
     if speed is None:
         speed = next((s for s in nice if end - start <= s * _LONGEST), 1e6)
     if times is not None:
         times = [number("a time", time) for time in times]
         if not times or not all(start <= time <= end for time in times):
-            raise InputError(f"times are {times}, expected times from {start:g} to {end:g} s")
+            raise InputError(
+                f"times are {times}, expected times from {start:g} to {end:g} s"
+            )
     return fps, positive("speed", speed), times
 
 
@@ -314,7 +346,11 @@ def _configuration(robot: Robot, name: str, value: Array) -> Array:
 
 
 def _pictures(
-    page: str, outputs: dict[str, Path], motion: Motion, speed: float, times: Sequence[float] | None
+    page: str,
+    outputs: dict[str, Path],
+    motion: Motion,
+    speed: float,
+    times: Sequence[float] | None,
 ) -> dict[Path, bytes]:
     from fflin.view.capture import take_gif, take_png
 

@@ -110,7 +110,9 @@ def test_three_wheels_put_the_attitude_anywhere(robots):
     model = pin.Model()
     base = model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "free")
     model.appendBodyToJoint(
-        base, pin.Inertia(100.0, np.zeros(3), np.diag([20.0, 30.0, 25.0])), pin.SE3.Identity()
+        base,
+        pin.Inertia(100.0, np.zeros(3), np.diag([20.0, 30.0, 25.0])),
+        pin.SE3.Identity(),
     )
     for axis, kind in zip(
         "xyz", (pin.JointModelRUBX, pin.JointModelRUBY, pin.JointModelRUBZ), strict=True
@@ -145,7 +147,10 @@ def test_thrusters_are_combined(robots):
     lin = fflin.linearize(robot.replace(inputs=inputs[:1]))
     one = fflin.controllability(lin)
     assert one.dimension == 2
-    assert any("angular momentum y" in n and "linear momentum z" in n for n in one.uncontrollable)
+    assert any(
+        "angular momentum y" in n and "linear momentum z" in n
+        for n in one.uncontrollable
+    )
     holds_together(lin, one)
 
 
@@ -167,9 +172,12 @@ def test_springs_and_dampers_against_exact_arithmetic(robots, name):
         }
         driven = [j for j in motors(robot) if rng.random() < 0.4] or motors(robot, 1)
         inputs = [*([BaseTorque()] if case == 2 else []), *driven]
-        lin = fflin.linearize(robot.replace(inputs=inputs, stiffness=values, damping=drag))
+        lin = fflin.linearize(
+            robot.replace(inputs=inputs, stiffness=values, damping=drag)
+        )
         K, D = (
-            np.diag([0.0] * 6 + [d.get(j, 0.0) for j in robot.joint_names]) for d in (values, drag)
+            np.diag([0.0] * 6 + [d.get(j, 0.0) for j in robot.joint_names])
+            for d in (values, drag)
         )
         expected = exact.dimension(lin.M, K, D, selection(lin))
         found = fflin.controllability(lin)
@@ -186,7 +194,9 @@ def test_random_trees_against_exact_arithmetic(n):
         at = {j: rng.uniform(-1, 1) for j in robot.joint_names}
         q = fflin.configuration(robot, at)
         stiffness = {
-            j: float(rng.integers(1, 100)) for j in robot.joint_names if rng.random() < 0.5
+            j: float(rng.integers(1, 100))
+            for j in robot.joint_names
+            if rng.random() < 0.5
         }
         damping = {
             j: float(rng.integers(1, 5))
@@ -195,7 +205,8 @@ def test_random_trees_against_exact_arithmetic(n):
         }
         inputs = motors(robot, 1 + n // 3)
         lin = fflin.linearize(
-            robot.replace(inputs=inputs, stiffness=stiffness, damping=damping, rest=at), q
+            robot.replace(inputs=inputs, stiffness=stiffness, damping=damping, rest=at),
+            q,
         )
         K, D = (
             np.diag([0.0] * 6 + [d.get(j, 0.0) for j in robot.joint_names])
@@ -213,7 +224,9 @@ def repeated(rng, like, squares, drive, spread):
     The coordinates are scaled by powers of two, as units do.
     """
     nv = len(squares)
-    P = np.eye(nv) + np.diag(rng.integers(-1, 2, size=nv - 1), -1) @ np.diag(np.arange(nv) % 2)
+    P = np.eye(nv) + np.diag(rng.integers(-1, 2, size=nv - 1), -1) @ np.diag(
+        np.arange(nv) % 2
+    )
     P = P[:, rng.permutation(nv)]
     P = P * 2.0 ** rng.integers(-spread, spread + 1, size=nv)
     S = P.T @ drive
@@ -227,7 +240,9 @@ def test_repeated_frequencies_against_exact_arithmetic(robots, seed, spread):
     rng = np.random.default_rng(seed)
     like = fflin.linearize(robots["ets_vii"])
     squares = np.array([0.0] * 5 + [4.0] * 3 + [9.0, 100.0, 100.0, 10000.0])
-    drive = rng.integers(-2, 3, size=(12, 1 + seed % 3)) * (rng.random((12, 1 + seed % 3)) < 0.7)
+    drive = rng.integers(-2, 3, size=(12, 1 + seed % 3)) * (
+        rng.random((12, 1 + seed % 3)) < 0.7
+    )
     drive[0, 0] = 1
     lin, M, K, S = repeated(rng, like, squares, drive.astype(float), spread)
     groups = [squares == value for value in np.unique(squares)]
@@ -255,7 +270,10 @@ def test_undriven_vibrations_are_named_with_their_poles(robots):
     assert np.sum(found.fixed_poles.imag) == pytest.approx(0.0)
     assert not found.stabilizable
     for speed in (2, 5, 6):
-        assert sum(f"vibration at {speed} rad/s" in name for name in found.uncontrollable) == 2
+        assert (
+            sum(f"vibration at {speed} rad/s" in name for name in found.uncontrollable)
+            == 2
+        )
     poles = np.linalg.eigvals(found.rows @ lin.A @ np.linalg.pinv(found.rows))
     assert np.sort(abs(poles)) == pytest.approx(speeds, rel=1e-6)
 
@@ -264,7 +282,9 @@ def test_sampling_at_a_period_loses_the_vibration(robots):
     robot = robots["servicer_7dof"]
     panel = {"panel_left": 100.0}
     lin = fflin.linearize(
-        robot.replace(inputs=[BaseTorque(), BaseForce(), *motors(robot, 7)], stiffness=panel)
+        robot.replace(
+            inputs=[BaseTorque(), BaseForce(), *motors(robot, 7)], stiffness=panel
+        )
     )
     # Thirteen inputs and one spring; the other panel keeps its momentum.
     poles = np.linalg.eigvals(lin.A)
@@ -292,7 +312,11 @@ def test_a_damped_undriven_spring_can_be_left_alone(robots):
         assert found.dimension == 22 == exact.dimension(M, K, D, S)
         assert found.stabilizable
         holds_together(model, found)
-    s = found.fixed_poles if not model.dt else np.log(found.fixed_poles.astype(complex)) / 0.05
+    s = (
+        found.fixed_poles
+        if not model.dt
+        else np.log(found.fixed_poles.astype(complex)) / 0.05
+    )
     assert s.real == pytest.approx(-0.2, rel=1e-3)
     growing = mechanical(M, K, -D, S, like)
     assert not fflin.controllability(growing).stabilizable
@@ -324,12 +348,18 @@ def test_a_hundred_joints():
     robot = random_tree(rng, 100)
     at = {j: rng.uniform(-1, 1) for j in robot.joint_names}
     q = fflin.configuration(robot, at)
-    for inputs, rank in ((robot.inputs, 106), (motors(robot), 100), (motors(robot, 7), 7)):
+    for inputs, rank in (
+        (robot.inputs, 106),
+        (motors(robot), 100),
+        (motors(robot, 7), 7),
+    ):
         lin = fflin.linearize(robot.replace(inputs=inputs), q)
         found = fflin.controllability(lin)
         assert found.dimension == 2 * rank
     stiffness = {j: 50.0 for j in robot.joint_names[:10]}
-    lin = fflin.linearize(robot.replace(inputs=motors(robot)[5:8], stiffness=stiffness, rest=at), q)
+    lin = fflin.linearize(
+        robot.replace(inputs=motors(robot)[5:8], stiffness=stiffness, rest=at), q
+    )
     K = np.diag([0.0] * 6 + [50.0] * 10 + [0.0] * 90)
     expected = exact.dimension(lin.M, K, 0.0 * K, selection(lin))
     assert fflin.controllability(lin).dimension == expected
@@ -337,10 +367,16 @@ def test_a_hundred_joints():
 
 def test_a_file_gives_the_same_answer(robots, tmp_path):
     robot = robots["dual_arm"]
-    lin = fflin.linearize(robot.replace(inputs=motors(robot), stiffness={"left_1": 3.0}))
+    lin = fflin.linearize(
+        robot.replace(inputs=motors(robot), stiffness={"left_1": 3.0})
+    )
     lin.save(tmp_path / "m.json")
-    found, again = map(fflin.controllability, (lin, fflin.LinearModel.load(tmp_path / "m.json")))
-    assert (found.rows == again.rows).all() and found.uncontrollable == again.uncontrollable
+    found, again = map(
+        fflin.controllability, (lin, fflin.LinearModel.load(tmp_path / "m.json"))
+    )
+    assert (
+        found.rows == again.rows
+    ).all() and found.uncontrollable == again.uncontrollable
 
 
 def test_what_is_no_model_is_refused():
@@ -363,5 +399,7 @@ def test_states_are_named_whatever_the_basis_of_their_combinations_is():
     names = [f"x{k}" for k in range(8)]
     expected = _dominant(vectors, names)
     for angle in np.linspace(0.1, 3.0, 7):
-        turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+        turn = np.array(
+            [[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]]
+        )
         assert _dominant(turn @ vectors, names) == expected

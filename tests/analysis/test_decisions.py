@@ -79,7 +79,9 @@ def test_equal_ends_leave_a_vibration_that_the_middle_cannot_drive(robots):
     lin = fflin.linearize(robot)
     for model in (lin, lin.discretize(0.1)):
         found = fflin.controllability(model)
-        assert found.dimension == 12 and not any("undecided" in note for note in found.notes)
+        assert found.dimension == 12 and not any(
+            "undecided" in note for note in found.notes
+        )
 
 
 def weakly_driven(robots, weak):
@@ -91,7 +93,9 @@ def weakly_driven(robots, weak):
     return mechanical(np.eye(12), K, 0.0 * K, S, like)
 
 
-def test_a_decision_within_rounding_names_the_state_and_both_answers(robots, monkeypatch):
+def test_a_decision_within_rounding_names_the_state_and_both_answers(
+    robots, monkeypatch
+):
     monkeypatch.setenv("COLUMNS", "80")
     clear = fflin.controllability(weakly_driven(robots, 1e-6))
     assert clear.dimension == 24 and not clear.notes and clear.margin.kept > 1e4
@@ -123,7 +127,9 @@ def test_doubt_is_told_by_the_errors_and_by_what_succeeds(robots):
     lin = weakly_driven(robots, 10.0**-10.5)
     with pytest.warns(fflin.FflinWarning, match="joint_5"):
         fflin.kalman(
-            replace(lin, C=C, D=np.zeros((11, 11)), output_names=lin.input_names), 1.0, 1.0
+            replace(lin, C=C, D=np.zeros((11, 11)), output_names=lin.input_names),
+            1.0,
+            1.0,
         )
     lin = weakly_driven(robots, 10.0**-12.0)
     blind = replace(lin, C=C, D=np.zeros((11, 11)), output_names=lin.input_names)
@@ -160,10 +166,15 @@ def test_what_died_out_between_samples_is_told(robots):
     assert fflin.controllability(sampled).dimension == true["controllable"]
     alone = fflin.controllability(replace(sampled, _source=None))
     assert alone.dimension != true["controllable"]
-    assert any(f"{alone.dimension} or {true['controllable']} of" in note for note in alone.notes)
+    assert any(
+        f"{alone.dimension} or {true['controllable']} of" in note
+        for note in alone.notes
+    )
     assert fflin.controllability(replace(sampled, A=sampled.A.copy())).dimension == 4
     changed = replace(sampled, B=2.0 * sampled.B)
-    assert changed.generator is None and sampled.generator is lin and lin.generator is lin
+    assert (
+        changed.generator is None and sampled.generator is lin and lin.generator is lin
+    )
 
 
 def test_a_spring_at_rest_does_not_push_the_base(robots):
@@ -180,7 +191,9 @@ def test_a_spring_at_rest_does_not_push_the_base(robots):
         assert gain.margin > 0.0 and gain.residual < 1e-8
 
 
-@pytest.mark.parametrize("postures", [8, pytest.param(100, marks=pytest.mark.exhaustive)])
+@pytest.mark.parametrize(
+    "postures", [8, pytest.param(100, marks=pytest.mark.exhaustive)]
+)
 def test_momenta_are_conserved_in_every_posture(robots, postures):
     rng = np.random.default_rng(0)
     trees = (random_tree(rng, int(rng.integers(1, 8))) for _ in range(3 * postures))
@@ -197,5 +210,8 @@ def test_momenta_are_conserved_in_every_posture(robots, postures):
 def test_motions_of_the_base_are_named_in_full(robots):
     lin = fflin.linearize(robots["ets_vii"])
     at = np.eye(12)
-    assert shape(lin, at[1]) == "rotation about y" and shape(lin, at[4]) == "translation along y"
+    assert (
+        shape(lin, at[1]) == "rotation about y"
+        and shape(lin, at[4]) == "translation along y"
+    )
     assert shape(lin, at[11]) == "joint_6"

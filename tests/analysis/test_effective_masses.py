@@ -46,7 +46,9 @@ def test_one_panel_on_a_spring_has_the_closed_form():
     assert found.residual[2, 2] == pytest.approx(HUB + PANEL - pull**2 / J, rel=1e-12)
     assert not found.free.any()
     # A panel up and towards the base's -z turns it about -y: L L^T has the product.
-    assert found.participation[2] * found.participation[4] == pytest.approx(-pull * turn / J)
+    assert found.participation[2] * found.participation[4] == pytest.approx(
+        -pull * turn / J
+    )
 
 
 @pytest.mark.parametrize("shift", [(0.0, 0.0, 0.0), (0.3, -0.2, 1.0)])
@@ -57,9 +59,13 @@ def test_of_a_symmetric_pair_one_mode_alone_has_mass(shift):
     J, pull = PANEL_Y + PANEL * ARM**2, PANEL * ARM
     turn = PANEL_Y + PANEL * ARM * (ARM + HINGE)
     lifting, turning = found.masses
-    np.testing.assert_allclose(lifting, [0.0, 0.0, 2.0 * pull**2 / J], rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(
+        lifting, [0.0, 0.0, 2.0 * pull**2 / J], rtol=1e-12, atol=1e-12
+    )
     np.testing.assert_allclose(turning, np.zeros(3), atol=1e-12)
-    np.testing.assert_allclose(found.inertias[1], [0.0, 2.0 * turn**2 / J, 0.0], atol=1e-9)
+    np.testing.assert_allclose(
+        found.inertias[1], [0.0, 2.0 * turn**2 / J, 0.0], atol=1e-9
+    )
     # In the floating robot too, one mode lifts the base and one turns it.
     slow, fast = fflin.modes(fflin.linearize(panels(base=base))).modes
     sunk = 2.0 * pull / (HUB + 2.0 * PANEL)
@@ -73,12 +79,18 @@ def test_all_modes_and_what_is_left_are_the_mass_and_inertia(name):
     rng = np.random.default_rng(2)
     robot = fflin.load(name)
     q, _, _ = random_point(robot, rng)
-    some = {joint: rng.uniform(1.0, 9.0) for joint in robot.joint_names if rng.random() < 0.6}
+    some = {
+        joint: rng.uniform(1.0, 9.0)
+        for joint in robot.joint_names
+        if rng.random() < 0.6
+    }
     found = masses(robot.replace(stiffness=some), q)
     L = found.participation
     assert L.shape == (6, len(some)) and found.free.any()
     whole = L @ L.T + found.free + found.residual
-    np.testing.assert_allclose(whole, found.total, atol=1e-10 * np.abs(found.total).max())
+    np.testing.assert_allclose(
+        whole, found.total, atol=1e-10 * np.abs(found.total).max()
+    )
     for part in (found.free, found.residual):
         assert np.linalg.eigvalsh(part).min() > -1e-10 * np.abs(found.total).max()
     # The total is the rigid robot's: mass, and inertia about the base frame's origin.
@@ -86,10 +98,14 @@ def test_all_modes_and_what_is_left_are_the_mass_and_inertia(name):
     pin.crba(robot.model, data, q)
     rigid = data.Ycrb[1].matrix()
     np.testing.assert_allclose(found.total, rigid, atol=1e-10 * np.abs(rigid).max())
-    assert found.total[:3, :3] == pytest.approx(robot.mass * np.eye(3), abs=1e-9 * robot.mass)
+    assert found.total[:3, :3] == pytest.approx(
+        robot.mass * np.eye(3), abs=1e-9 * robot.mass
+    )
     # The residual does not depend on which joints have springs.
     sprung = masses(robot.replace(stiffness=3.0), q)
-    np.testing.assert_allclose(sprung.residual, found.residual, atol=1e-9 * np.abs(rigid).max())
+    np.testing.assert_allclose(
+        sprung.residual, found.residual, atol=1e-9 * np.abs(rigid).max()
+    )
     assert not sprung.free.any()
 
 
@@ -128,8 +144,12 @@ def test_masses_turn_with_the_base_frame_and_do_not_change_with_its_origin():
 
 def test_soft_modes_beside_stiff_ones_keep_their_digits():
     soft, stiff = 1e-4, 1e8
-    robot = fflin.load("servicer_7dof", stiffness={"panel_left": soft, "joint_7": stiff})
-    alone = fflin.load("servicer_7dof", lock=["joint_7"], stiffness={"panel_left": soft})
+    robot = fflin.load(
+        "servicer_7dof", stiffness={"panel_left": soft, "joint_7": stiff}
+    )
+    alone = fflin.load(
+        "servicer_7dof", lock=["joint_7"], stiffness={"panel_left": soft}
+    )
     found, expected = masses(robot), masses(alone)
     assert found.frequencies[0] == pytest.approx(expected.frequencies[0], rel=1e-12)
     np.testing.assert_allclose(found.masses[0], expected.masses[0], atol=1e-11)
@@ -139,10 +159,16 @@ def test_reports_and_command_line(capsys):
     springs = ["--stiffness", "panel_left=100", "--stiffness", "panel_right=100"]
     assert cli.main(["modes", "servicer_7dof", *springs]) == 0
     out = capsys.readouterr().out
-    robot = fflin.load("servicer_7dof", stiffness={"panel_left": 100.0, "panel_right": 100.0})
+    robot = fflin.load(
+        "servicer_7dof", stiffness={"panel_left": 100.0, "panel_right": 100.0}
+    )
     found = masses(robot)
     assert str(found) in out and max(map(len, out.splitlines())) <= 80
-    row = next(line for line in str(found).splitlines() if f"{found.frequencies[0]:.6g}" in line)
+    row = next(
+        line
+        for line in str(found).splitlines()
+        if f"{found.frequencies[0]:.6g}" in line
+    )
     heavy = found.masses[0, 2]
     assert row.split()[-2:] == [f"{heavy:.4g}", f"{100.0 * heavy / robot.mass:.1f}"]
     assert cli.main(["modes", "servicer_7dof"]) == 0

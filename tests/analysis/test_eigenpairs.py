@@ -23,10 +23,14 @@ def test_zeros_are_split_off_and_the_others_kept(seed):
     A = hidden(rng, *chains, *others)
     pairs, nullity = nonzero_eigenpairs(A, 1e-13)
     assert nullity == 3
-    values = sorted((value for value, *_ in pairs), key=lambda value: (value.real, value.imag))
+    values = sorted(
+        (value for value, *_ in pairs), key=lambda value: (value.real, value.imag)
+    )
     assert values == pytest.approx([-0.7, -0.5j, 0.5j, 0.3], abs=1e-13)
     for value, x, error in pairs:
-        assert np.abs(A @ x - value * x).max() < 1e-14 and np.linalg.norm(x) == pytest.approx(1.0)
+        assert np.abs(A @ x - value * x).max() < 1e-14 and np.linalg.norm(
+            x
+        ) == pytest.approx(1.0)
         assert error < 1e-11
     assert nonzero_eigenpairs(hidden(rng, *chains), 1e-13) == ([], 3)
 
@@ -39,7 +43,8 @@ def test_rounding_is_not_taken_for_growth(seed):
     pairs, nullity = nonzero_eigenpairs(A, 1e-13)
     assert nullity == 0 and len(pairs) == 5
     on_axis = [(value, error) for value, _, error in pairs if value.imag]
-    assert max(abs(value.real) for value, _ in on_axis) > 1e-12  # far beyond the rounding of A
+    # far beyond the rounding of A
+    assert max(abs(value.real) for value, _ in on_axis) > 1e-12
     assert all(abs(value.real) < error < 1e-3 for value, error in on_axis)
     (growing,) = (value.real - error for value, _, error in pairs if not value.imag)
     assert growing > 0.09

@@ -56,13 +56,17 @@ def test_two_hinged_panels_have_the_frequencies_derived_by_hand(frame):
     k = 1562.0
     robot = two_panels(stiffness=k)
     q = fflin.configuration(robot, None, random_pose(np.random.default_rng(1), 130.0))
-    found = fflin.modes(fflin.linearize(robot, q, frame=frame, reference=pin.SE3.Identity()))
+    found = fflin.modes(
+        fflin.linearize(robot, q, frame=frame, reference=pin.SE3.Identity())
+    )
     expected = np.sqrt(k / np.array(felt_inertias()))
     assert found.frequencies == pytest.approx(expected, rel=1e-13)
     assert found.frequencies == pytest.approx([2.61954, 3.45462], abs=5e-6)
     assert not found.damping_ratios.any() and not found.unstable
     assert found.rigid_body == 6 and found.zero_eigenvalues == 12
-    lifting, turning = (dict(zip(found.state_names, m.shape, strict=True)) for m in found.modes)
+    lifting, turning = (
+        dict(zip(found.state_names, m.shape, strict=True)) for m in found.modes
+    )
     assert lifting["q_m.left"] == pytest.approx(-lifting["q_m.right"], rel=1e-12)
     assert turning["q_m.left"] == pytest.approx(turning["q_m.right"], rel=1e-12)
 
@@ -71,9 +75,9 @@ def test_mode_shapes_conserve_momentum():
     """Of the panels lifting by ARM each, the hub sinks by 2 m ARM / (M + 2 m)."""
     found = fflin.modes(fflin.linearize(two_panels(stiffness=50.0)))
     shape = dict(zip(found.state_names, found.modes[0].shape, strict=True))
-    assert shape["q_m.left"] == pytest.approx(1.0, abs=1e-15) and shape["q_b.y"] == pytest.approx(
-        0.0, abs=1e-14
-    )
+    assert shape["q_m.left"] == pytest.approx(1.0, abs=1e-15) and shape[
+        "q_b.y"
+    ] == pytest.approx(0.0, abs=1e-14)
     sunk = -2.0 * PANEL * ARM / (HUB + 2.0 * PANEL)
     assert shape["r_b.z"] == pytest.approx(sunk, rel=1e-12)
     assert shape["v_b.z"] == pytest.approx(found.modes[0].pole * sunk, rel=1e-12)
@@ -128,9 +132,13 @@ def test_poles_are_the_eigenvalues(name, damped):
         own = dict(zip(bare.joint_names, inertia, strict=True))
         robot = bare.replace(stiffness={j: own[j] * rng.uniform(1, 9) for j in some})
         if damped:
-            robot = robot.replace(damping={j: own[j] * rng.uniform(0.1, 2) for j in some})
+            robot = robot.replace(
+                damping={j: own[j] * rng.uniform(0.1, 2) for j in some}
+            )
         q, _, _ = random_point(bare, rng)
-        robot = robot.replace(rest={joint.name: joint.value(q) for joint in bare.joints})
+        robot = robot.replace(
+            rest={joint.name: joint.value(q) for joint in bare.joints}
+        )
         lin = fflin.linearize(robot, q)
         found = fflin.modes(lin)
         expected = np.linalg.eigvals(lin.A)
@@ -150,9 +158,13 @@ def test_poles_are_the_eigenvalues(name, damped):
             # The joints alone, the base and the free joints floating, have no zeros to disturb.
             on = [6 + bare.joint_names.index(joint) for joint in some]
             inverse = fflin.linearize(bare, q).B[6 + robot.n :][np.ix_(on, on)]
-            K, D = ([values[j] for j in some] for values in (robot.stiffness, robot.damping))
+            K, D = (
+                [values[j] for j in some] for values in (robot.stiffness, robot.damping)
+            )
             size = len(on)
-            alone = np.block([[np.zeros((size, size)), np.eye(size)], [-inverse * K, -inverse * D]])
+            alone = np.block(
+                [[np.zeros((size, size)), np.eye(size)], [-inverse * K, -inverse * D]]
+            )
             expected = np.linalg.eigvals(alone)
             assert matched(np.log(mine), np.log(expected)) < 3e-13
         if not damped and some:
@@ -179,7 +191,8 @@ def test_chains_of_four_zeros_stay_zeros():
     lin = fflin.linearize(robot, u=fflin.equilibrium(robot).u)
     found = fflin.modes(lin)
     assert found.equilibrium and not found.modes
-    assert (found.rigid_body, found.zero_eigenvalues) == (4, 12)  # pitch and roll accelerate
+    # pitch and roll accelerate
+    assert (found.rigid_body, found.zero_eigenvalues) == (4, 12)
 
 
 def test_a_stiff_and_a_soft_spring():
@@ -187,7 +200,9 @@ def test_a_stiff_and_a_soft_spring():
     J, k = 0.2, 1e-2
     model = pin.Model()
     model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "free")
-    model.appendBodyToJoint(1, pin.Inertia(5.0, np.zeros(3), np.eye(3)), pin.SE3.Identity())
+    model.appendBodyToJoint(
+        1, pin.Inertia(5.0, np.zeros(3), np.eye(3)), pin.SE3.Identity()
+    )
     for name, joint in (("soft", pin.JointModelRX()), ("stiff", pin.JointModelRY())):
         index = model.addJoint(1, joint, pin.SE3.Identity(), name)
         rotor = pin.Inertia(1.0, np.zeros(3), J * np.eye(3))
@@ -203,7 +218,9 @@ def test_a_spinning_wheel_nutates():
     """Momentum h on a body of transverse inertia I: frequency h / I, neither damped nor growing."""
     model = pin.Model()
     model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "free")
-    model.appendBodyToJoint(1, pin.Inertia(5.0, np.zeros(3), 2.0 * np.eye(3)), pin.SE3.Identity())
+    model.appendBodyToJoint(
+        1, pin.Inertia(5.0, np.zeros(3), 2.0 * np.eye(3)), pin.SE3.Identity()
+    )
     model.addJoint(1, pin.JointModelRZ(), pin.SE3.Identity(), "wheel")
     wheel = pin.Inertia(1.0, np.zeros(3), np.diag([0.3, 0.3, 0.5]))
     model.appendBodyToJoint(2, wheel, pin.SE3.Identity())
@@ -217,13 +234,17 @@ def test_a_spinning_wheel_nutates():
     assert found.zero_eigenvalues == 12
 
 
-@pytest.mark.parametrize("name, rotor", [("canadarm2", "joint_7"), ("ets_vii", "joint_6")])
+@pytest.mark.parametrize(
+    "name, rotor", [("canadarm2", "joint_7"), ("ets_vii", "joint_6")]
+)
 def test_what_loses_no_energy_neither_decays_nor_grows(name, rotor):
     """Springs and a spinning rotor: gyroscopic, so that every pole is imaginary; exactly so."""
     rng = np.random.default_rng(5)
     bare = fflin.load(name)
     q, _, _ = random_point(bare, rng)
-    own = dict(zip(bare.joint_names, fflin.linearize(bare, q).M.diagonal()[6:], strict=True))
+    own = dict(
+        zip(bare.joint_names, fflin.linearize(bare, q).M.diagonal()[6:], strict=True)
+    )
     springs = {joint: own[joint] * rng.uniform(1, 9) for joint in own if joint != rotor}
     rest = {joint.name: joint.value(q) for joint in bare.joints}
     robot = bare.replace(stiffness=springs, rest=rest)
@@ -292,7 +313,9 @@ def test_a_rod_that_buckles_has_the_rate_derived_by_hand(f):
         assert found.frequencies == pytest.approx([np.sqrt(-square)], rel=1e-9)
         assert not found.damping_ratios.any() and not found.unstable
     else:
-        assert [mode.pole for mode in found.unstable] == pytest.approx([np.sqrt(square)], rel=1e-9)
+        assert [mode.pole for mode in found.unstable] == pytest.approx(
+            [np.sqrt(square)], rel=1e-9
+        )
         assert len(found.modes) == 2 and found.unstable[0].damping_ratio == -1.0
 
 
@@ -323,18 +346,36 @@ def test_command_line(capsys):
     assert cli.main(["modes", "servicer_7dof", *springs]) == 0
     out = capsys.readouterr().out
     assert says(out, "13 rigid-body", "26", "2 vibrations")
-    robot = fflin.load("servicer_7dof", stiffness={"panel_left": 100.0, "panel_right": 100.0})
+    robot = fflin.load(
+        "servicer_7dof", stiffness={"panel_left": 100.0, "panel_right": 100.0}
+    )
     for frequency in fflin.modes(fflin.linearize(robot)).frequencies:
         assert f"{frequency:.6g}" in out
 
 
 def test_command_line_takes_an_equilibrium(capsys):
-    point = ["--joint", "panel_left=0.3", "--rpy", "30", "0", "20", "--gravity", "0", "0", "-1"]
+    point = [
+        "--joint",
+        "panel_left=0.3",
+        "--rpy",
+        "30",
+        "0",
+        "20",
+        "--gravity",
+        "0",
+        "0",
+        "-1",
+    ]
     point += ["--reference", "world", "--stiffness", "panel_left=100"]
     assert cli.main(["linearize", "servicer_7dof", *point, "--equilibrium"]) == 0
     out = capsys.readouterr().out
     assert "a fixed point" in out and "not a fixed point" not in out
-    assert cli.main(["check", "servicer_7dof", *point, "--equilibrium", "--frame", "world"]) == 0
+    assert (
+        cli.main(
+            ["check", "servicer_7dof", *point, "--equilibrium", "--frame", "world"]
+        )
+        == 0
+    )
     assert cli.main(["modes", "servicer_7dof", *point]) == 0
     assert "not an equilibrium" in capsys.readouterr().out
     assert cli.main(["modes", "servicer_7dof", *point, "--equilibrium"]) == 0
@@ -346,7 +387,9 @@ def test_command_line_takes_an_equilibrium(capsys):
         ("--inputs", "servicer_7dof"): "tau_m.panel_right",
         ("--velocity", "joint_1=1"): "rotors",
     }.items():
-        assert cli.main(["modes", "servicer_7dof", *point, "--equilibrium", *options]) == 2
+        assert (
+            cli.main(["modes", "servicer_7dof", *point, "--equilibrium", *options]) == 2
+        )
         err = hear_lines(capsys.readouterr().err).splitlines()
         assert len(err) == 1 and err[0].startswith("fflin: error: ") and words in err[0]
 
@@ -356,20 +399,26 @@ def test_inputs_that_cancel_leave_no_mode():
     pair = [fflin.Thruster("panel_left", (0, 0, 0.3), (x, 0, 0)) for x in (1, -1)]
     robot = robot.replace(inputs=[*pair, *robot.inputs])
     q = fflin.configuration(robot, {"joint_2": 0.4, "panel_left": 0.3})
-    lin = fflin.linearize(robot, q, u=fflin.effort(robot, {"thruster_1": 5, "thruster_2": 5}))
+    lin = fflin.linearize(
+        robot, q, u=fflin.effort(robot, {"thruster_1": 5, "thruster_2": 5})
+    )
     found = fflin.modes(lin)
     assert lin.is_equilibrium() and not found.modes and found.zero_eigenvalues == 30
 
 
 @pytest.mark.parametrize("thrust", [1e-3, 1.0])
 def test_a_weak_asymmetry_is_not_taken_for_a_spring(thrust):
-    robot = fflin.load("servicer_7dof", stiffness={"panel_left": 100.0, "panel_right": 50.0})
+    robot = fflin.load(
+        "servicer_7dof", stiffness={"panel_left": 100.0, "panel_right": 50.0}
+    )
     pair = [
         fflin.Thruster("panel_left", (0, 0.2, 0.3), (1, 0, 0)),
         fflin.Thruster("panel_right", (0, 0.1, 0.3), (-1, 0, 0)),
     ]
     robot = robot.replace(inputs=pair)
-    lin = fflin.linearize(robot, fflin.configuration(robot, {"joint_2": 0.4}), u=[thrust] * 2)
+    lin = fflin.linearize(
+        robot, fflin.configuration(robot, {"joint_2": 0.4}), u=[thrust] * 2
+    )
     found = fflin.modes(lin)
     expected = np.linalg.eigvals(lin.A)
     expected = expected[np.abs(expected) > 1e-4 * thrust**0.5]
@@ -381,14 +430,18 @@ def test_a_weak_asymmetry_is_not_taken_for_a_spring(thrust):
     assert len(found.unstable) == growing.sum() > 0
 
 
-@pytest.mark.parametrize(("growth", "doubtful"), [(1e-9, False), (1.0, True), (1e3, False)])
+@pytest.mark.parametrize(
+    ("growth", "doubtful"), [(1e-9, False), (1.0, True), (1e3, False)]
+)
 def test_growth_within_rounding_is_told(robots, growth, doubtful):
     """A pole that turns and grows by so many times its rounding, beside a damper."""
     lin = fflin.linearize(robots["planar_detumble"].replace(stiffness=9.0, damping=0.1))
     (first, *_) = (mode for mode in fflin.modes(lin).modes if mode.oscillates)
     error = abs(first.pole.real / first.margin)
     changed = replace(first, margin=growth, unstable=growth > 1.0)
-    assert error < 1e-10 * first.frequency and first.margin < -1e3 and not first.unstable
+    assert (
+        error < 1e-10 * first.frequency and first.margin < -1e3 and not first.unstable
+    )
     found = replace(fflin.modes(lin), modes=(changed,))
     assert bool(found.notes) == doubtful
     assert ("undecided" in str(found)) == doubtful
@@ -424,12 +477,16 @@ def test_energies_of_bodies_are_those_of_the_velocities(name, frame):
             of_base += robot.model.inertias[1].vtiv(pin.Motion(v[:6]))
         velocity = mode.shape[half:]
         whole = (velocity.conj() @ lin.M @ velocity).real
-        assert mode.energy["base"] == pytest.approx(of_base / whole, rel=1e-8, abs=1e-12)
+        assert mode.energy["base"] == pytest.approx(
+            of_base / whole, rel=1e-8, abs=1e-12
+        )
 
 
 def test_energy_does_not_depend_on_the_frame_of_the_base_or_the_scale():
     given = fflin.modes(spun(fflin.load("servicer_7dof", stiffness=20.0)))
-    moved = fflin.modes(spun(fflin.load("servicer_7dof", stiffness=20.0), "local", moving=True))
+    moved = fflin.modes(
+        spun(fflin.load("servicer_7dof", stiffness=20.0), "local", moving=True)
+    )
     joints = [fflin.JointTorque(f"joint_{i}") for i in range(1, 8)]
     lin = spun(fflin.load("servicer_7dof", stiffness=20.0, inputs=joints))
     reduced = fflin.modes(fflin.momentum_reduction(lin))
@@ -462,10 +519,16 @@ def test_two_bodies_on_a_spring_share_the_energy_as_derived_by_hand():
     """Of two rotors on one axis through both centres, the energies are as J_b to J_a."""
     model = pin.Model()
     model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "free")
-    model.appendBodyToJoint(1, pin.Inertia(5.0, np.zeros(3), 3.0 * np.eye(3)), pin.SE3.Identity())
+    model.appendBodyToJoint(
+        1, pin.Inertia(5.0, np.zeros(3), 3.0 * np.eye(3)), pin.SE3.Identity()
+    )
     model.addJoint(1, pin.JointModelRZ(), pin.SE3.Identity(), "rotor")
-    model.appendBodyToJoint(2, pin.Inertia(1.0, np.zeros(3), 0.5 * np.eye(3)), pin.SE3.Identity())
-    (mode,) = fflin.modes(fflin.linearize(fflin.from_model(model, stiffness={"rotor": 2.0}))).modes
+    model.appendBodyToJoint(
+        2, pin.Inertia(1.0, np.zeros(3), 0.5 * np.eye(3)), pin.SE3.Identity()
+    )
+    (mode,) = fflin.modes(
+        fflin.linearize(fflin.from_model(model, stiffness={"rotor": 2.0}))
+    ).modes
     assert list(mode.energy) == ["rotor", "base"]
     assert mode.energy["rotor"] == pytest.approx(3.0 / 3.5, rel=1e-12)
 
@@ -486,7 +549,9 @@ def test_energy_does_not_depend_on_which_body_is_the_base():
 
 def test_panels_that_move_most_are_named_first_with_percentages():
     """Not the joints of an arm that swings along with less mass."""
-    robot = fflin.load("servicer_7dof", stiffness={"panel_left": 100.0, "panel_right": 100.0})
+    robot = fflin.load(
+        "servicer_7dof", stiffness={"panel_left": 100.0, "panel_right": 100.0}
+    )
     found = fflin.modes(fflin.linearize(robot))
     rows = str(found).splitlines()[3:]
     assert "panel_left_link 48 %" in rows[0]
@@ -521,11 +586,15 @@ def test_modes_build_as_many_data_for_many_modes_as_for_one(monkeypatch, slosh):
     """A pin.Data of n joints costs n^3, so one for each mode costs n^4."""
     built = []
     create = fflin.Robot.create_data
-    monkeypatch.setattr(fflin.Robot, "create_data", lambda self: built.append(1) or create(self))
+    monkeypatch.setattr(
+        fflin.Robot, "create_data", lambda self: built.append(1) or create(self)
+    )
 
     def count(modes):
         tanks = [
-            fflin.Slosh("base", 1.0, (0.0, 0.0, 0.1), frequency=0.2 + 0.01 * i, name=f"tank_{i}")
+            fflin.Slosh(
+                "base", 1.0, (0.0, 0.0, 0.1), frequency=0.2 + 0.01 * i, name=f"tank_{i}"
+            )
             for i in range(modes if slosh else 0)
         ]
         springs = {f"joint_{i + 1}": 20.0 for i in range(0 if slosh else modes)}

@@ -24,7 +24,9 @@ def transfer(lin, s):
 
 def posed(robot, rng):
     return fflin.configuration(
-        robot, {j: rng.uniform(-1, 1) for j in robot.joint_names}, random_pose(rng, 50.0)
+        robot,
+        {j: rng.uniform(-1, 1) for j in robot.joint_names},
+        random_pose(rng, 50.0),
     )
 
 
@@ -36,9 +38,14 @@ def test_unactuated_base_leaves_the_generalised_inertia(robots, name):
     lin = fflin.linearize(robot.replace(inputs=motors(robot)), q)
     reduced = fflin.momentum_reduction(lin)
     n = robot.n
-    names = [*(f"q_m.{j}" for j in robot.joint_names), *(f"qdot_m.{j}" for j in robot.joint_names)]
+    names = [
+        *(f"q_m.{j}" for j in robot.joint_names),
+        *(f"qdot_m.{j}" for j in robot.joint_names),
+    ]
     assert list(reduced.state_names) == names and reduced.B.shape == (2 * n, n)
-    assert (reduced.A == np.block([[np.zeros((n, n)), np.eye(n)], [np.zeros((n, 2 * n))]])).all()
+    assert (
+        reduced.A == np.block([[np.zeros((n, n)), np.eye(n)], [np.zeros((n, 2 * n))]])
+    ).all()
     M = lin.M
     schur = M[6:, 6:] - M[6:, :6] @ np.linalg.inv(M[:6, :6]) @ M[:6, 6:]
     assert fflin.generalized_inertia(lin) == pytest.approx(schur, rel=1e-9, abs=1e-9)
@@ -57,7 +64,13 @@ def test_transfer_function_is_kept(robots, name, wrench):
     """From every input to every output, with springs and dampers, in other axes too."""
     robot, rng = robots[name], np.random.default_rng(7)
     q = posed(robot, rng)
-    at = dict(zip(robot.joint_names, fflin.linearize(robot, q).x0[6 : 6 + robot.n], strict=True))
+    at = dict(
+        zip(
+            robot.joint_names,
+            fflin.linearize(robot, q).x0[6 : 6 + robot.n],
+            strict=True,
+        )
+    )
     robot = robot.replace(
         inputs=[*wrench, *motors(robot)],
         outputs=[fflin.FullState(), fflin.FrameVelocity(robot.model.frames[-1].name)],
@@ -114,7 +127,11 @@ def test_random_trees_and_an_idle_joint():
 def test_nothing_conserved_keeps_all(robots):
     lin = fflin.linearize(robots["ets_vii"])
     reduced = fflin.momentum_reduction(lin)
-    assert (reduced.A == lin.A).all() and (reduced.B == lin.B).all() and not len(reduced.momenta)
+    assert (
+        (reduced.A == lin.A).all()
+        and (reduced.B == lin.B).all()
+        and not len(reduced.momenta)
+    )
     assert (reduced.T == np.eye(24)).all()
 
 
@@ -160,19 +177,27 @@ def test_what_drifts_is_carried_over(robots):
     assert len(reduced.A) == 12 and np.abs(lin.f0).max() == 0.3
     assert not reduced.f0.any() and reduced.is_equilibrium()
     assert "q_m.joint_1" not in reduced.ignorable
-    assert fflin.momentum_reduction(fflin.linearize(robot, v=v)).ignorable == lin.ignorable
+    assert (
+        fflin.momentum_reduction(fflin.linearize(robot, v=v)).ignorable == lin.ignorable
+    )
     falling = fflin.linearize(robot.replace(gravity=(0.0, 0.0, -9.81)))
-    assert (fflin.momentum_reduction(falling).f0 == falling.f0).all() and falling.f0.any()
+    assert (
+        fflin.momentum_reduction(falling).f0 == falling.f0
+    ).all() and falling.f0.any()
 
 
 def test_drifting_points_are_refused(robots):
-    robot = robots["ets_vii"].replace(gravity=(0.0, 0.0, -9.81), inputs=motors(robots["ets_vii"]))
+    robot = robots["ets_vii"].replace(
+        gravity=(0.0, 0.0, -9.81), inputs=motors(robots["ets_vii"])
+    )
     with pytest.raises(fflin.InputError, match="not an equilibrium"):
         fflin.momentum_reduction(fflin.linearize(robot))
     with pytest.raises(fflin.InputError, match="LinearModel"):
         fflin.momentum_reduction(None)
     with pytest.raises(fflin.InputError, match="reduc"):
-        lin = fflin.linearize(robots["ets_vii"].replace(inputs=motors(robots["ets_vii"])))
+        lin = fflin.linearize(
+            robots["ets_vii"].replace(inputs=motors(robots["ets_vii"]))
+        )
         fflin.generalized_inertia(fflin.momentum_reduction(lin))
 
 
@@ -204,7 +229,9 @@ def test_generalised_jacobian_is_the_reduced_models_output(robots):
     robot = robots["servicer_7dof"]
     robot = robot.replace(inputs=motors(robot), outputs=[fflin.FrameVelocity("tool")])
     q = fflin.configuration(robot, {"joint_2": 0.4, "joint_4": -1.1})
-    reduced = fflin.momentum_reduction(fflin.linearize(robot, q, reference=pin.SE3.Identity()))
+    reduced = fflin.momentum_reduction(
+        fflin.linearize(robot, q, reference=pin.SE3.Identity())
+    )
     J = fflin.generalized_jacobian(robot, q, "tool")
     data = robot.create_data()
     pin.framesForwardKinematics(robot.model, data, q)
@@ -228,7 +255,10 @@ def test_the_report_states_what_is_kept_and_what_is_removed():
                 "ReducedModel('planar_detumble', nx="
             )
             text = " ".join(line.strip() for line in report)
-            assert f"{18 - 2 * momenta} of 18 states are kept: {reduced.state_names[0]}" in text
+            assert (
+                f"{18 - 2 * momenta} of 18 states are kept: {reduced.state_names[0]}"
+                in text
+            )
             assert f"{momenta} conserved momenta and the coordinates" in text
 
 

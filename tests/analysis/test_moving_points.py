@@ -59,18 +59,27 @@ def turned(R):
 def test_rows_of_the_momenta_are_constant_along_the_motion(frame, gravity):
     """L B = 0 and dL/dt + L A = S L, with dL/dt by differences on an integrated motion."""
     robot = random_tree(np.random.default_rng(3), 4)
-    robot = robot.replace(inputs=motors(robot), gravity=gravity, stiffness=3.0, damping=0.2)
+    robot = robot.replace(
+        inputs=motors(robot), gravity=gravity, stiffness=3.0, damping=0.2
+    )
     q0, v0, u0 = random_point(robot, np.random.default_rng(4))
     u = u0[6:]
     h = 1e-3
     _, q, v, *_ = flown(robot, q0, v0, u, knots=5, duration=4.0 * h)
     moving = frame == "moving"
-    axes = {"moving": True} if moving else {"frame": frame, "reference": pin.SE3.Identity()}
-    models = [fflin.linearize(robot, *point, u, **axes) for point in zip(q, v, strict=True)]
+    axes = (
+        {"moving": True}
+        if moving
+        else {"frame": frame, "reference": pin.SE3.Identity()}
+    )
+    models = [
+        fflin.linearize(robot, *point, u, **axes) for point in zip(q, v, strict=True)
+    ]
     L = [moving_points.conserved(lin).rows for lin in models]
     if moving:
         L = [
-            turned(pin.XYZQUATToSE3(at[:7]).rotation) @ rows for at, rows in zip(q, L, strict=True)
+            turned(pin.XYZQUATToSE3(at[:7]).rotation) @ rows
+            for at, rows in zip(q, L, strict=True)
         ]
     rate = (8.0 * (L[3] - L[1]) - (L[4] - L[0])) / (12.0 * h)  # the error is O(h^4)
     lin, rows = models[2], L[2]
@@ -113,15 +122,24 @@ def test_no_more_than_what_the_momenta_leave_is_controllable(robots, name):
                 assert np.abs(rows @ basis).max(initial=0.0) < 1e-8
                 assert len(rows) == nx - found.dimension == np.linalg.matrix_rank(rows)
                 B = lin.B * size[:, None]
-                assert np.abs(rows[:conserved] @ B).max(initial=0.0) < 0.05 * np.abs(B).max()
+                assert (
+                    np.abs(rows[:conserved] @ B).max(initial=0.0)
+                    < 0.05 * np.abs(B).max()
+                )
 
 
 @pytest.mark.parametrize("name", ARMS)
 def test_inputs_on_all_coordinates_control_all_states_in_motion(robots, name):
     robot, q, v = random_moving(np.random.default_rng(1), name, robots)
-    lin = fflin.linearize(robot.replace(inputs=[BaseTorque(), BaseForce(), *motors(robot)]), q, v)
+    lin = fflin.linearize(
+        robot.replace(inputs=[BaseTorque(), BaseForce(), *motors(robot)]), q, v
+    )
     found = fflin.controllability(lin)
-    assert found.dimension == len(lin.A) and found.method == "closed form" and found.stabilizable
+    assert (
+        found.dimension == len(lin.A)
+        and found.method == "closed form"
+        and found.stabilizable
+    )
     assert says(str(found), "not an equilibrium")
     # Sampling may lose states, which the frozen matrices cannot exclude.
     assert fflin.controllability(lin.discretize(0.1)).stabilizable is None
@@ -139,7 +157,9 @@ def test_the_motion_of_one_joint_leaves_seventeen_of_twenty_six(robots):
             *(f"linear momentum {axis}" for axis in "xyz"),
             *(f"centre of mass {axis}" for axis in "xyz"),
         )
-        assert says(str(found), "at most 17 of 26", "linear momentum x/y/z", "robot leaves")
+        assert says(
+            str(found), "at most 17 of 26", "linear momentum x/y/z", "robot leaves"
+        )
 
 
 def gap(F, size):
@@ -154,22 +174,37 @@ def gap(F, size):
 
 SWINGS = [
     ("astrobee_arm", {"omega_b.z": 0.7, "v_b.x": 0.2}, "motors"),
-    pytest.param("planar_detumble", {"omega_b.z": 0.5, "joint_1": 1.0}, "motors", marks=EXHAUSTIVE),
+    pytest.param(
+        "planar_detumble",
+        {"omega_b.z": 0.5, "joint_1": 1.0},
+        "motors",
+        marks=EXHAUSTIVE,
+    ),
     ("planar_detumble", {"omega_b.x": 0.4, "joint_1": 1.0}, "torques"),
-    pytest.param("ets_vii", {"joint_2": 1.0, "omega_b.y": 0.3}, "motors", marks=EXHAUSTIVE),
+    pytest.param(
+        "ets_vii", {"joint_2": 1.0, "omega_b.y": 0.3}, "motors", marks=EXHAUSTIVE
+    ),
 ]
 
 
 @pytest.mark.parametrize(("name", "velocity", "kind"), SWINGS)
-def test_gramians_along_a_motion_have_the_rank_of_another_integration(robots, name, velocity, kind):
+def test_gramians_along_a_motion_have_the_rank_of_another_integration(
+    robots, name, velocity, kind
+):
     robot = robots[name]
     inputs = motors(robot) + ([BaseTorque()] if kind == "torques" else [])
-    robot = robot.replace(inputs=inputs, outputs=[fflin.JointPositions(), fflin.JointVelocities()])
-    t, q, v, Phi, models = flown(robot, robot.neutral(), fflin.velocity(robot, velocity))
+    robot = robot.replace(
+        inputs=inputs, outputs=[fflin.JointPositions(), fflin.JointVelocities()]
+    )
+    t, q, v, Phi, models = flown(
+        robot, robot.neutral(), fflin.velocity(robot, velocity)
+    )
     reached = [Phi[-1] @ np.linalg.solve(Phi[k], lin.B) for k, lin in enumerate(models)]
     seen = [(lin.C @ Phi[k]).T for k, lin in enumerate(models)]
     size = np.tile(np.sqrt(models[-1].M.diagonal()), 2)
-    traj = fflin.linearize_trajectory(robot, t, q, v, np.zeros((len(t), models[0].B.shape[1])))
+    traj = fflin.linearize_trajectory(
+        robot, t, q, v, np.zeros((len(t), models[0].B.shape[1]))
+    )
     rank, kept, lost = gap(np.hstack(reached), size)
     shown, least, hidden = gap(np.hstack(seen), 1.0 / size)
     assert kept > 1e2 * lost and least > 1e2 * hidden
@@ -227,7 +262,9 @@ def test_what_no_output_depends_on_stays_unobservable_in_motion(robots):
                         ("q_b.x", "q_b.y", "q_b.z"),
                         ("r_b.x", "r_b.y", "r_b.z"),
                     )
-                    assert says(str(found), f"at most {24 - hidden} of 24", "not detectable")
+                    assert says(
+                        str(found), f"at most {24 - hidden} of 24", "not detectable"
+                    )
     posed = robot.replace(outputs=[fflin.BasePose(), fflin.JointPositions()])
     lin = fflin.linearize(posed, v=v)
     found = fflin.observability(lin)
@@ -258,18 +295,25 @@ def test_a_trajectory_decides_what_one_point_cannot(robots):
 def test_models_from_files_are_refused_only_if_the_momenta_matter(robots, tmp_path):
     robot = robots["ets_vii"]
     v = fflin.velocity(robot, {"joint_1": 0.2})
-    fflin.linearize(robot.replace(inputs=motors(robot)), v=v).save(tmp_path / "joints.json")
+    fflin.linearize(robot.replace(inputs=motors(robot)), v=v).save(
+        tmp_path / "joints.json"
+    )
     loaded = fflin.LinearModel.load(tmp_path / "joints.json")
     with pytest.raises(fflin.InputError, match="from a file"):
         fflin.controllability(loaded)
     fflin.linearize(robot, v=v).save(tmp_path / "all.json")
-    assert fflin.controllability(fflin.LinearModel.load(tmp_path / "all.json")).dimension == 24
+    assert (
+        fflin.controllability(fflin.LinearModel.load(tmp_path / "all.json")).dimension
+        == 24
+    )
     assert fflin.observability(loaded).dimension == 24
 
 
 def test_in_orbit_no_momentum_is_conserved(robots):
     robot = robots["ets_vii"]
-    robot = robot.replace(inputs=motors(robot), outputs=[fflin.JointPositions()], orbit=700e3)
+    robot = robot.replace(
+        inputs=motors(robot), outputs=[fflin.JointPositions()], orbit=700e3
+    )
     lin = fflin.linearize(robot, v=fflin.velocity(robot, {"joint_1": 0.1}))
     found = fflin.controllability(lin)
     assert found.bound == 24 and found.stabilizable is None

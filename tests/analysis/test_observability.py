@@ -21,7 +21,10 @@ def hidden(lin, found):
     assert len(found.unobservable) == V.shape[1] == len(found.fixed_poles)
     assert np.abs(lin.C @ V).max(initial=0.0) < 1e-8 * max(1.0, np.abs(lin.C).max())
     assert np.abs(lin.A @ V - V @ (V.T @ lin.A @ V)).max(initial=0.0) < 1e-7 * scale
-    assert np.abs(found.rows @ found.basis).max(initial=0.0) < 1e-8 * np.abs(found.rows).max()
+    assert (
+        np.abs(found.rows @ found.basis).max(initial=0.0)
+        < 1e-8 * np.abs(found.rows).max()
+    )
 
 
 @pytest.mark.parametrize("name", ARMS)
@@ -47,9 +50,13 @@ def test_at_rest_it_is_the_kernel_of_C_and_CA(robots, name):
 
 def test_joints_only_hide_the_base(robots):
     robot = robots["ets_vii"]
-    found = fflin.observability(fflin.linearize(robot.replace(outputs=[JointPositions()])))
+    found = fflin.observability(
+        fflin.linearize(robot.replace(outputs=[JointPositions()]))
+    )
     assert found.unobservable == tuple(
-        f"{group}.{axis}" for group in ("q_b", "r_b", "omega_b", "v_b") for axis in "xyz"
+        f"{group}.{axis}"
+        for group in ("q_b", "r_b", "omega_b", "v_b")
+        for axis in "xyz"
     )
     assert "not detectable" in str(found)
 
@@ -63,12 +70,22 @@ def test_springs_and_dampers_against_exact_arithmetic(robots, name):
         joints = list(robot.joint_names)
         # Each spring of 1 to 9 rad/s on what it moves with the base free, each damper of 0.1 to 1.
         own = dict(
-            zip(joints, 1.0 / np.linalg.inv(fflin.linearize(robot).M).diagonal()[6:], strict=True)
+            zip(
+                joints,
+                1.0 / np.linalg.inv(fflin.linearize(robot).M).diagonal()[6:],
+                strict=True,
+            )
         )
-        K = {j: own[j] * float(rng.uniform(1, 90)) for j in joints if rng.random() < 0.6}
-        D = {j: own[j] * float(rng.uniform(0.1, 1)) for j in joints if rng.random() < 0.6}
+        K = {
+            j: own[j] * float(rng.uniform(1, 90)) for j in joints if rng.random() < 0.6
+        }
+        D = {
+            j: own[j] * float(rng.uniform(0.1, 1)) for j in joints if rng.random() < 0.6
+        }
         seen = [j for j in joints if rng.random() < 0.5] or joints[:1]
-        chosen = robot.replace(stiffness=K, damping=D, outputs=[JointPositions(tuple(seen))])
+        chosen = robot.replace(
+            stiffness=K, damping=D, outputs=[JointPositions(tuple(seen))]
+        )
         lin = fflin.linearize(chosen)
         M, k, d = (
             exact.modular(x)
@@ -111,7 +128,9 @@ def test_endless_gramians_solve_lyapunov(robots):
     assert sampled.A @ Wd @ sampled.A.T + sampled.B @ sampled.B.T == pytest.approx(
         Wd, rel=1e-9, abs=1e-9
     )
-    assert fflin.gramians(lin, 1e4).controllability == pytest.approx(Wc, rel=1e-8, abs=1e-10)
+    assert fflin.gramians(lin, 1e4).controllability == pytest.approx(
+        Wc, rel=1e-8, abs=1e-10
+    )
 
 
 def test_finite_gramians_are_the_integrals(robots):
@@ -123,7 +142,9 @@ def test_finite_gramians_are_the_integrals(robots):
     nodes, weights = (0.0, T / 2, T), (T / 6, 4 * T / 6, T / 6)
     terms = [expm(lin.A * t) @ lin.B for t in nodes]
     Wc = sum(w * x @ x.T for w, x in zip(weights, terms, strict=True))
-    assert found.controllability == pytest.approx(Wc, rel=1e-10, abs=1e-10 * np.abs(Wc).max())
+    assert found.controllability == pytest.approx(
+        Wc, rel=1e-10, abs=1e-10 * np.abs(Wc).max()
+    )
     terms = [lin.C @ expm(lin.A * t) for t in nodes]
     Wo = sum(w * x.T @ x for w, x in zip(weights, terms, strict=True))
     assert found.observability == pytest.approx(Wo, rel=1e-10, abs=1e-10)
@@ -145,7 +166,9 @@ def test_gramians_at_rest_are_exact_over_any_horizon(robots, T):
     ):
         Q = B @ B.T
         expected = Q * T + (A @ Q + Q @ A.T) * T**2 / 2 + A @ Q @ A.T * T**3 / 3
-        np.testing.assert_allclose(W, expected, rtol=1e-12, atol=1e-14 * np.abs(expected).max())
+        np.testing.assert_allclose(
+            W, expected, rtol=1e-12, atol=1e-14 * np.abs(expected).max()
+        )
 
 
 def test_gramians_that_do_not_exist(robots):

@@ -14,7 +14,9 @@ LEO, GEO = 1.06e-3, 7.29e-5  # [rad/s]
 def test_passive_panels_sag_beside_motors_in_a_relative_equilibrium():
     robot = fflin.load("servicer_7dof", orbit=800e3, passive=["panel_*"])
     robot = robot.replace(stiffness={"panel_*": 40.0})
-    q = fflin.relative_equilibria(robot, fflin.configuration(robot, {"joint_2": 0.5}))[0].q
+    q = fflin.relative_equilibria(robot, fflin.configuration(robot, {"joint_2": 0.5}))[
+        0
+    ].q
     about = pin.XYZQUATToSE3(q[:7])
     held = fflin.equilibrium(robot, q, reference=about)
     lin = fflin.linearize(robot, held.q, u=held.u, reference=about)
@@ -27,7 +29,12 @@ def test_what_thrust_reaches_is_known(n):
     what is across it have the poles +-jn alike, no more than four."""
     robot = in_orbit(free_body((3.0, 5.0, 4.0)), n)
     frame, center = robot.model.frames[-1].name, (0.0, 0.0, 0.0)
-    expected = {(0.0, 1.0, 0.0): 4, (1.0, 0.0, 0.0): 3, (0.0, 0.0, 1.0): 2, (1.0, 1.0, 1.0): 4}
+    expected = {
+        (0.0, 1.0, 0.0): 4,
+        (1.0, 0.0, 0.0): 3,
+        (0.0, 0.0, 1.0): 2,
+        (1.0, 1.0, 1.0): 4,
+    }
     for direction, dimension in expected.items():
         thrust = robot.replace(inputs=[fflin.Thruster(frame, center, direction)])
         lin = fflin.linearize(thrust, frame="hill")
@@ -37,18 +44,26 @@ def test_what_thrust_reaches_is_known(n):
         assert fflin.observability(lin).dimension == 12
     # The drift of a radial thrust's orbit, dy/dt + 2 n x, is what it cannot change.
     radial = fflin.linearize(
-        robot.replace(inputs=[fflin.Thruster(frame, center, (1.0, 0.0, 0.0))]), frame="hill"
+        robot.replace(inputs=[fflin.Thruster(frame, center, (1.0, 0.0, 0.0))]),
+        frame="hill",
     )
     row = np.zeros(12)
     row[[3, 10]] = 2.0 * n, 1.0
     rows = fflin.controllability(radial).rows
-    assert np.linalg.matrix_rank(np.vstack((rows, row)) / [*(6 * [n]), *(6 * [1.0])], tol=1e-9) == 9
+    assert (
+        np.linalg.matrix_rank(
+            np.vstack((rows, row)) / [*(6 * [n]), *(6 * [1.0])], tol=1e-9
+        )
+        == 9
+    )
 
 
 def test_joints_alone_turn_the_base_against_the_gradient():
     """Momentum is not conserved in orbit, so that attitude and joints are controllable."""
     robot = fflin.load("servicer_7dof", orbit=800e3)
-    robot = robot.replace(inputs=[fflin.JointTorque(name) for name in robot.joint_names])
+    robot = robot.replace(
+        inputs=[fflin.JointTorque(name) for name in robot.joint_names]
+    )
     at = fflin.relative_equilibria(robot)[0].q
     about = {"reference": pin.XYZQUATToSE3(at[:7])}
     held = fflin.equilibrium(robot, at, **about).u
@@ -74,7 +89,10 @@ def test_regulators_hold_the_orbits_terms(n):
 def test_wheels_stay_in_a_design_since_their_carrier_turns():
     robot = in_orbit(fflin.load("cubesat"), LEO)
     robot = robot.replace(
-        inputs=[fflin.BaseForce(), *(fflin.ReactionWheel(axis, inertia=1e-4) for axis in np.eye(3))]
+        inputs=[
+            fflin.BaseForce(),
+            *(fflin.ReactionWheel(axis, inertia=1e-4) for axis in np.eye(3)),
+        ]
     )
     at = fflin.relative_equilibria(robot)[0].q
     lin = fflin.linearize(robot, at, reference=pin.XYZQUATToSE3(at[:7]))

@@ -18,7 +18,9 @@ ATTITUDE = {f"{group}.{axis}" for group in ("q_b", "omega_b") for axis in "xyz"}
 
 
 def held(lin):
-    return {name.partition(".")[2] for name in lin.state_names if name.startswith("qdot_m.")}
+    return {
+        name.partition(".")[2] for name in lin.state_names if name.startswith("qdot_m.")
+    }
 
 
 def quotient_error(lin, part):
@@ -26,12 +28,17 @@ def quotient_error(lin, part):
     at = [lin.state_names.index(name) for name in part.state_names]
     S = np.eye(len(lin.A))[at]
     size = np.abs(lin.A).max()
-    errors = np.abs(S @ lin.A - part.A @ S).max() / size, np.abs(S @ lin.B - part.B).max()
+    errors = (
+        np.abs(S @ lin.A - part.A @ S).max() / size,
+        np.abs(S @ lin.B - part.B).max(),
+    )
     return max(errors)
 
 
 def posed(robot, rng):
-    joints = {name: rng.uniform(-1, 1) for name in robot.joint_names if "wheel" not in name}
+    joints = {
+        name: rng.uniform(-1, 1) for name in robot.joint_names if "wheel" not in name
+    }
     return fflin.configuration(robot, joints, random_pose(rng, 40.0))
 
 
@@ -44,8 +51,15 @@ def motors(robot):
 def test_attitude_and_joints_stay_and_the_quotient_is_exact(count, frame):
     """On a base and links, with springs and drag, whatever the momentum; sampled too."""
     rng = np.random.default_rng(count)
-    for robot in (fflin.load("cubesat"), fflin.load("servicer_7dof"), random_tree(rng, 5)):
-        bodies = [np.linalg.eigvalsh(body.inertia)[0] for body in robot.model.inertias.tolist()]
+    for robot in (
+        fflin.load("cubesat"),
+        fflin.load("servicer_7dof"),
+        random_tree(rng, 5),
+    ):
+        bodies = [
+            np.linalg.eigvalsh(body.inertia)[0]
+            for body in robot.model.inertias.tolist()
+        ]
         own, J = motors(robot), 1e-3 * min(moment for moment in bodies if moment > 0.0)
         on = [None] if robot.name != "servicer_7dof" else [None, "link_3", "panel_left"]
         added = wheels(AXES[:count], J, on)
@@ -67,7 +81,10 @@ def test_attitude_and_joints_stay_and_the_quotient_is_exact(count, frame):
             assert not any("wheel" in name for name in names)
             assert not any(name.startswith(("r_b", "v_b")) for name in names)
             kept = min(count, 3)
-            assert len(part.A) == 2 * (kept + robot.n) and part.M.shape == (kept + robot.n,) * 2
+            assert (
+                len(part.A) == 2 * (kept + robot.n)
+                and part.M.shape == (kept + robot.n,) * 2
+            )
             if count >= 3:
                 assert names >= ATTITUDE
                 assert quotient_error(model, part) < 1e-11
@@ -90,9 +107,13 @@ def test_what_is_left_is_the_carrier_without_its_wheels_under_minus_a_u(count, s
     lin = fflin.linearize(ship, q, fflin.velocity(ship, speeds))
     part = fflin.momentum_reduction(lin)
     assert not any("wheel" in name for name in part.state_names)
-    momentum = J * sum(speed * (1.0 + k) * unit(axis) for k, axis in enumerate(AXES[:count]))
+    momentum = J * sum(
+        speed * (1.0 + k) * unit(axis) for k, axis in enumerate(AXES[:count])
+    )
     size = np.linalg.norm(momentum) or 1.0
-    stored = ReactionWheel(momentum if speed else (1, 0, 0), momentum=size if speed else 0.0)
+    stored = ReactionWheel(
+        momentum if speed else (1, 0, 0), momentum=size if speed else 0.0
+    )
     other = carrier_alone(bare, [(J, axis) for axis in AXES[:count]]).replace(
         inputs=[*motors(bare), BaseTorque(), stored]
     )
@@ -101,10 +122,14 @@ def test_what_is_left_is_the_carrier_without_its_wheels_under_minus_a_u(count, s
     A = beside.A[np.ix_(at, at)]
     assert part.A == pytest.approx(A, abs=1e-11 * max(np.abs(A).max(), 1.0))
     n = bare.n
-    torques = beside.B[at][:, n : n + 3] @ -np.array([unit(axis) for axis in AXES[:count]]).T
+    torques = (
+        beside.B[at][:, n : n + 3] @ -np.array([unit(axis) for axis in AXES[:count]]).T
+    )
     assert part.B[:, n:] == pytest.approx(torques, abs=1e-11 * np.abs(torques).max())
     assert part.B[:, :n] == pytest.approx(beside.B[at][:, :n], abs=1e-11)
-    rates = [beside.state_names.index(name) - 6 - n for name in part.state_names[3 + n :]]
+    rates = [
+        beside.state_names.index(name) - 6 - n for name in part.state_names[3 + n :]
+    ]
     expected = np.linalg.inv(np.linalg.inv(beside.M)[np.ix_(rates, rates)])
     assert part.M == pytest.approx(expected, abs=1e-11 * np.abs(expected).max())
 
@@ -140,9 +165,12 @@ def test_the_speed_of_a_wheel_matters_on_a_carrier_that_turns_and_with_friction(
     ship = bare.replace(inputs=[BaseTorque(), *wheels(AXES[:1], 1e-5)])
     spun = fflin.velocity(ship, {"omega_b.x": 0.3, "wheel_1": 200.0})
     lin = fflin.linearize(ship, v=spun, moving=True)
-    assert held(regulated_part(lin, False)) == set()  # it turns about the wheel's own axis
+    # it turns about the wheel's own axis
+    assert held(regulated_part(lin, False)) == set()
     skew = bare.replace(inputs=[BaseTorque(), *wheels([(1, 0, 0.2)], 1e-5)])
-    lin = fflin.linearize(skew, v=fflin.velocity(skew, {"omega_b.x": 0.3, "wheel_1": 200.0}))
+    lin = fflin.linearize(
+        skew, v=fflin.velocity(skew, {"omega_b.x": 0.3, "wheel_1": 200.0})
+    )
     assert held(regulated_part(lin, False)) == {"wheel_1"}
     dragged = ship.replace(damping={"wheel_1": 1e-4})
     part = regulated_part(fflin.linearize(dragged), False)
@@ -182,12 +210,16 @@ def test_from_inputs_to_what_stays_the_transfer_function_is_kept():
     seen = [lin.output_names.index(name) for name in part.output_names]
     for s in (0.3 + 0.2j, 2.0 - 1.0j):
         whole, kept = (
-            model.C @ np.linalg.solve(s * np.eye(len(model.A)) - model.A, model.B) + model.D
+            model.C @ np.linalg.solve(s * np.eye(len(model.A)) - model.A, model.B)
+            + model.D
             for model in (lin, part)
         )
         assert kept == pytest.approx(whole[seen], abs=1e-10 * np.abs(whole).max())
     assert part.certificate == lin.certificate
-    assert without(lin.discretize(0.1), np.arange(6 + robot.n, 10 + robot.n)).generator is not None
+    assert (
+        without(lin.discretize(0.1), np.arange(6 + robot.n, 10 + robot.n)).generator
+        is not None
+    )
 
 
 def test_a_file_tells_the_wheels_as_well(tmp_path):
@@ -205,13 +237,17 @@ def test_joints_that_are_rotors_stay_joints():
     arm = fflin.load("ets_vii")
     lin = fflin.linearize(arm.replace(inputs=[*motors(arm), *wheels(AXES[:3], 0.1)]))
     assert "q_m.joint_6" in lin.ignorable
-    assert {"q_m.joint_6", "qdot_m.joint_6"} <= set(fflin.momentum_reduction(lin).state_names)
+    assert {"q_m.joint_6", "qdot_m.joint_6"} <= set(
+        fflin.momentum_reduction(lin).state_names
+    )
     plain = fflin.linearize(arm)
     assert regulated_part(plain) is plain
 
 
 @pytest.mark.compiled
-@pytest.mark.parametrize("name, J", [("servicer_7dof", 0.4), ("cubesat", 1e-5), ("ets_vii", 0.5)])
+@pytest.mark.parametrize(
+    "name, J", [("servicer_7dof", 0.4), ("cubesat", 1e-5), ("ets_vii", 0.5)]
+)
 @pytest.mark.parametrize("speed", [1.0, 4000.0])
 @pytest.mark.parametrize("net", [True, False])
 def test_what_rounding_leaves_of_a_spin_is_no_spring(name, J, speed, net):
@@ -223,7 +259,9 @@ def test_what_rounding_leaves_of_a_spin_is_no_spring(name, J, speed, net):
     speeds = {f"wheel_{k + 1}": speed * (1.0 + k * net) for k in range(4)}
     linearizer = fflin.Linearizer(ship)
     for _ in range(3):
-        q = fflin.configuration(ship, {joint: rng.normal() for joint in bare.joint_names})
+        q = fflin.configuration(
+            ship, {joint: rng.normal() for joint in bare.joint_names}
+        )
         still, spun = (linearizer(q, v) for v in (None, fflin.velocity(ship, speeds)))
         expected = fflin.momentum_reduction(still)
         found = fflin.momentum_reduction(spun)

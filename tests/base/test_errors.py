@@ -8,7 +8,9 @@ import fflin
 from fflin.base.errors import one_line
 
 
-@pytest.mark.parametrize("kind", [fflin.FflinError, fflin.UrdfError, fflin.FflinWarning])
+@pytest.mark.parametrize(
+    "kind", [fflin.FflinError, fflin.UrdfError, fflin.FflinWarning]
+)
 def test_messages_are_one_line_whatever_names_hold(kind):
     assert str(kind("no joint named 'a\nb\r\x85\u2028\x1b[2J'")) == (
         r"no joint named 'a\nb\r\x85\u2028\x1b[2J'"
@@ -17,7 +19,9 @@ def test_messages_are_one_line_whatever_names_hold(kind):
 
 def test_a_long_name_keeps_both_ends_and_a_path_is_whole():
     said = one_line(f"no joint named 'first{'x' * 5000}last'; known names: joint_1")
-    assert said.startswith("no joint named 'firstxxx") and said.endswith("; known names: joint_1")
+    assert said.startswith("no joint named 'firstxxx") and said.endswith(
+        "; known names: joint_1"
+    )
     assert "xlast'" in said and len(said) < 110
     path = "/".join(20 * ["a_folder_of_many"]) + "/robot.urdf"
     assert one_line(f"no file at '{path}'") == f"no file at '{path}'"

@@ -26,7 +26,10 @@ def results():
 COPIES = {
     "deepcopy": copy.deepcopy,
     "copy": copy.copy,
-    **{f"pickle {k}": lambda x, k=k: pickle.loads(pickle.dumps(x, k)) for k in range(2, 6)},
+    **{
+        f"pickle {k}": lambda x, k=k: pickle.loads(pickle.dumps(x, k))
+        for k in range(2, 6)
+    },
 }
 
 

@@ -11,7 +11,9 @@ from fflin.base import intervals
 def test_the_share_is_clopper_and_pearsons(successes, count):
     expected = stats.binomtest(successes, count).proportion_ci(0.9)
     found = intervals.clopper_pearson(successes, count, 0.9)
-    assert found == pytest.approx((successes / count, expected.low, expected.high), rel=1e-9)
+    assert found == pytest.approx(
+        (successes / count, expected.low, expected.high), rel=1e-9
+    )
 
 
 @pytest.mark.parametrize("p", [0.05, 0.5, 0.9])
@@ -45,6 +47,10 @@ def test_ranks_are_spearmans_with_ties_and_without_end():
     rng = np.random.default_rng(2)
     columns, values = rng.integers(0, 5, (40, 3)).astype(float), rng.normal(size=40)
     values[:4] = np.inf
-    expected = [stats.spearmanr(column, np.minimum(values, 99.0))[0] for column in columns.T]
-    assert intervals.rank_correlations(columns, values) == pytest.approx(expected, rel=1e-12)
+    expected = [
+        stats.spearmanr(column, np.minimum(values, 99.0))[0] for column in columns.T
+    ]
+    assert intervals.rank_correlations(columns, values) == pytest.approx(
+        expected, rel=1e-12
+    )
     assert intervals.rank_correlations(np.ones((40, 1)), values) == [0.0]

@@ -8,7 +8,14 @@ import pytest
 import fflin
 from fflin.base.names import by_name, chosen, matching, runs
 
-NAMES = ("q_b.x", "q_m.hinge_1", "q_m.hinge_2", "q_m.arm[1]", "qdot_m.hinge_1", "tau_m.boom.2")
+NAMES = (
+    "q_b.x",
+    "q_m.hinge_1",
+    "q_m.hinge_2",
+    "q_m.arm[1]",
+    "qdot_m.hinge_1",
+    "tau_m.boom.2",
+)
 
 
 @pytest.mark.parametrize(
@@ -46,7 +53,11 @@ def test_a_name_goes_before_a_pattern_and_that_before_a_group():
     for order in (values, dict(reversed(values.items()))):
         assert by_name("state", order, NAMES) == {1: 3, 2: 2, 3: 1}
     # So does an entry that stands for itself.
-    for values in ({"arm[1]": 3, "q_m": 1}, {"q_m": 1, "arm[1]": 3}, {"arm*": 2, "arm[1]": 3}):
+    for values in (
+        {"arm[1]": 3, "q_m": 1},
+        {"q_m": 1, "arm[1]": 3},
+        {"arm*": 2, "arm[1]": 3},
+    ):
         assert by_name("state", values, NAMES)[3] == 3
     assert chosen("state", ["qdot_m", "q_m.hinge_*", "q_m.hinge_1"], NAMES) == [1, 2, 4]
 
@@ -55,8 +66,12 @@ def test_robots_take_patterns_of_joints():
     robot = fflin.load("canadarm2", lock={"joint_?": 0.1, "joint_7": None})
     assert robot.n == 0
     assert robot.locked[-2:] == ("joint_6=0.1", "joint_7=0.0")
-    robot = fflin.load("canadarm2", stiffness={"q_m": 1.0, "joint_3": 3.0}, rest={"joint_*": 0.2})
-    assert robot.stiffness == {f"joint_{i}": 3.0 if i == 3 else 1.0 for i in range(1, 8)}
+    robot = fflin.load(
+        "canadarm2", stiffness={"q_m": 1.0, "joint_3": 3.0}, rest={"joint_*": 0.2}
+    )
+    assert robot.stiffness == {
+        f"joint_{i}": 3.0 if i == 3 else 1.0 for i in range(1, 8)
+    }
     assert set(robot.rest.values()) == {0.2}
     with pytest.raises(fflin.UnknownNameError, match="joint_9"):
         robot.replace(damping={"joint_9*": 1.0})
@@ -79,7 +94,10 @@ def test_weights_and_limits_take_the_same_patterns():
     assert np.array_equal(fflin.bryson(lin, {"tau_?.*": 2.0, "F_b": 1.0}), wanted)
     K = fflin.lqr(lin, {"?_?.*": 1.0, "q_m.joint_1": 2.0}, {"*": 1.0}).K
     assert np.array_equal(
-        K, fflin.lqr(lin, {"q_b": 1, "r_b": 1, "v_b": 1, "q_m": 1, "q_m.joint_1": 2}, 1.0).K
+        K,
+        fflin.lqr(
+            lin, {"q_b": 1, "r_b": 1, "v_b": 1, "q_m": 1, "q_m.joint_1": 2}, 1.0
+        ).K,
     )
     run = {"x0": np.r_[0.1, np.zeros(25)], "duration": 0.5}
     policy = fflin.StateFeedback(lin, K)
@@ -109,13 +127,26 @@ def test_thrusters_and_wheels_have_groups_too():
     assert np.array_equal(fflin.bryson(lin, named), wanted)
     assert np.array_equal(wanted[:3] ** -0.5, [2.0, 2.0, 3.0])
     motion = fflin.simulate(
-        robot, lambda *_: np.full(9, 5.0), duration=0.02, limits={"thrust": 1.0, "wheel": 2.0}
+        robot,
+        lambda *_: np.full(9, 5.0),
+        duration=0.02,
+        limits={"thrust": 1.0, "wheel": 2.0},
     )
     assert motion.u[0, :3].tolist() == [1.0, 1.0, 2.0]
 
 
 def test_runs_are_of_one_group_or_of_one_unit():
-    names = ("q_b.x", "q_b.y", "q_m.a", "q_m.b", "up", "down", "turn", "tool.pose.x", "tool.pose.y")
+    names = (
+        "q_b.x",
+        "q_b.y",
+        "q_m.a",
+        "q_m.b",
+        "up",
+        "down",
+        "turn",
+        "tool.pose.x",
+        "tool.pose.y",
+    )
     units = ("1", "1", "rad", "m", "N", "N", "N m", "m", "m")
     assert runs(names, units) == [
         (0, 1, "q_b", "1"),

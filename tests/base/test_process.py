@@ -19,7 +19,16 @@ XACRO = """<robot name="r" xmlns:xacro="http://www.ros.org/wiki/xacro">
 
 # What the processes import, the standard library's included.
 LATE = ("xacro", "xacrodoc", "yaml", "ctypes")
-ALL = (*LATE, "json", "signal", "fflin", "pickle", "multiprocessing", "socket", "contextlib")
+ALL = (
+    *LATE,
+    "json",
+    "signal",
+    "fflin",
+    "pickle",
+    "multiprocessing",
+    "socket",
+    "contextlib",
+)
 
 
 @pytest.fixture
@@ -66,7 +75,9 @@ def test_a_worker_starts_without_the_working_folder(poison):
 def test_a_command_imports_nothing_from_the_working_folder(poison, tmp_path):
     pytest.importorskip("xacrodoc")
     poison(*LATE)
-    code, out, _ = run("info", "r.urdf.xacro", cwd=tmp_path, PYTHONPATH=f"{os.pathsep}{tmp_path}")
+    code, out, _ = run(
+        "info", "r.urdf.xacro", cwd=tmp_path, PYTHONPATH=f"{os.pathsep}{tmp_path}"
+    )
     assert code == 0 and "mass 2 kg" in out
 
 
@@ -75,7 +86,9 @@ def test_the_program_imports_nothing_from_the_working_folder(poison, tmp_path):
     pytest.importorskip("xacrodoc")
     poison(*LATE, "json", "signal", "pathlib")
     package = str(Path(fflin.__file__).parents[1])
-    code, out, error = run_in_process("info", "r.urdf.xacro", cwd=tmp_path, PYTHONPATH=package)
+    code, out, error = run_in_process(
+        "info", "r.urdf.xacro", cwd=tmp_path, PYTHONPATH=package
+    )
     assert code == 0, error
     assert "mass 2 kg" in out
 
@@ -87,5 +100,7 @@ def test_a_long_run_shows_its_hint(monkeypatch, capsys):
     for now[0] in (15.0, 25.0):
         bar(1, 4, hint="(faster: --engine compiled)")
     early, late = capsys.readouterr().err.split("\r")[1:]
-    assert "faster" not in early and late.rstrip().endswith("75 s left (faster: --engine compiled)")
+    assert "faster" not in early and late.rstrip().endswith(
+        "75 s left (faster: --engine compiled)"
+    )
     assert len(late) <= 80

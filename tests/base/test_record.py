@@ -45,7 +45,8 @@ def made(kind):
 FORMATS = {
     "batch": (".npz", ".h5"),
 } | dict.fromkeys(
-    ("model", "gain", "schedule", "estimator", "motion", "gains"), (".npz", ".mat", ".json")
+    ("model", "gain", "schedule", "estimator", "motion", "gains"),
+    (".npz", ".mat", ".json"),
 )
 OTHERS = ["gain", "model", "estimator", "compensator", "motion", "schedule"]
 CASES = [(kind, ending) for kind, endings in FORMATS.items() for ending in endings]
@@ -77,14 +78,20 @@ def files_of(path):
     return sorted(path.parent.glob(f"{path.stem}.*"))
 
 
-@pytest.mark.parametrize("flips", [FLIPS // 6, pytest.param(FLIPS, marks=pytest.mark.fuzz)])
+@pytest.mark.parametrize(
+    "flips", [FLIPS // 6, pytest.param(FLIPS, marks=pytest.mark.fuzz)]
+)
 @pytest.mark.parametrize(("kind", "ending"), CASES)
 def test_no_flipped_bit_is_silent_or_a_crash(kind, ending, flips, tmp_path):
     thing, path = made(kind), tmp_path / f"x{ending}"
     thing.save(path)
     load = type(thing).load
     whole = load(path)
-    assert whole.verified and content(whole) == content(thing) and NOT_VERIFIED not in str(whole)
+    assert (
+        whole.verified
+        and content(whole) == content(thing)
+        and NOT_VERIFIED not in str(whole)
+    )
     rng = np.random.default_rng(sum(map(ord, kind + ending)))
     files = {file: file.read_bytes() for file in files_of(path)}
     sizes = np.array([len(data) for data in files.values()])
@@ -131,7 +138,9 @@ def unsealed(path):
         with np.load(io.BytesIO(data)) as file:
             np.savez(path, **{key: file[key] for key in file.files if key != "sha256"})
     elif path.suffix == ".mat":
-        path.write_bytes(b"MATLAB 5.0 MAT-file, Platform: GLNXA64".ljust(116) + data[116:])
+        path.write_bytes(
+            b"MATLAB 5.0 MAT-file, Platform: GLNXA64".ljust(116) + data[116:]
+        )
     elif path.suffix == ".json":
         record = json.loads(data)
         assert record.pop("sha256")
@@ -143,7 +152,9 @@ def unsealed(path):
 
 
 @pytest.mark.parametrize(("kind", "ending"), CASES)
-def test_a_file_without_a_digest_is_read_and_said_to_be_unverified(kind, ending, tmp_path):
+def test_a_file_without_a_digest_is_read_and_said_to_be_unverified(
+    kind, ending, tmp_path
+):
     if ending == ".h5":
         pytest.importorskip("h5py")
     thing, path = made(kind), tmp_path / f"x{ending}"
@@ -160,7 +171,9 @@ def test_a_file_without_a_digest_is_read_and_said_to_be_unverified(kind, ending,
     assert not anew.verified and content(anew) == content(thing)
 
 
-@pytest.mark.parametrize("trials", [FLIPS, pytest.param(6 * FLIPS, marks=pytest.mark.fuzz)])
+@pytest.mark.parametrize(
+    "trials", [FLIPS, pytest.param(6 * FLIPS, marks=pytest.mark.fuzz)]
+)
 @pytest.mark.parametrize("ending", [".npz", ".json"])
 def test_a_damaged_file_without_a_digest_is_no_crash(ending, trials, tmp_path):
     thing, path = made("gain"), tmp_path / f"x{ending}"
@@ -170,8 +183,12 @@ def test_a_damaged_file_without_a_digest_is_no_crash(ending, trials, tmp_path):
     for trial in range(trials):
         damaged = bytearray(whole)
         for _ in range(1 + trial % 3):
-            damaged[rng.integers(len(damaged) if trial % 2 else 400)] ^= 1 << rng.integers(8)
-        path.write_bytes(damaged if trial % 5 else damaged[: rng.integers(len(damaged))])
+            damaged[rng.integers(len(damaged) if trial % 2 else 400)] ^= (
+                1 << rng.integers(8)
+            )
+        path.write_bytes(
+            damaged if trial % 5 else damaged[: rng.integers(len(damaged))]
+        )
         try:
             assert not fflin.Gain.load(path).verified
         except fflin.FileError as error:
@@ -201,7 +218,9 @@ def test_a_damaged_file_without_a_digest_is_no_crash(ending, trials, tmp_path):
         ("model", {"state_units": ["rad"]}, "number of its state_units"),
     ],
 )
-def test_an_impossible_value_in_a_file_without_a_digest_is_refused(kind, change, said, tmp_path):
+def test_an_impossible_value_in_a_file_without_a_digest_is_refused(
+    kind, change, said, tmp_path
+):
     thing, path = made(kind), tmp_path / "x.npz"
     thing.save(path)
     with np.load(path) as file:
@@ -256,7 +275,9 @@ def test_the_digest_is_what_the_documents_say(tmp_path):
 def test_a_number_of_a_group_that_is_not_finite_is_refused(ending, tmp_path):
     path = tmp_path / f"x{ending}"
     with pytest.raises(fflin.InputError, match="second of figures is not finite"):
-        write_record(path, {"figures": {"first": 1.0, "second": np.inf}}, checksummed=True)
+        write_record(
+            path, {"figures": {"first": 1.0, "second": np.inf}}, checksummed=True
+        )
     assert not path.exists()
 
 
@@ -278,7 +299,10 @@ def test_matlab_files_of_others_are_read(tmp_path):
         found, verified = read_record(tmp_path / "x.mat")
         assert not verified and set(found) == set(record)
         for key in ("A", "z", "i"):
-            assert found[key].shape == record[key].shape and (found[key] == record[key]).all()
+            assert (
+                found[key].shape == record[key].shape
+                and (found[key] == record[key]).all()
+            )
         assert (found["text"], found["nothing"]) == ("größe", "")
         assert found["rows"] == ["ab", "cde"] and found["cells"] == ["one", "", "three"]
         assert found["group"]["x"].item() == 1.5 and found["group"]["name"] == "n"
@@ -294,7 +318,9 @@ def test_plain_numpy_and_scipy_read_what_is_saved(tmp_path):
     gain.save(tmp_path / "g.npz")
     gain.save(tmp_path / "g.mat")
     with np.load(tmp_path / "g.npz") as file:
-        assert (file["K"] == gain.K).all() and tuple(file["state_names"]) == gain.state_names
+        assert (file["K"] == gain.K).all() and tuple(
+            file["state_names"]
+        ) == gain.state_names
     mat = loadmat(tmp_path / "g.mat", simplify_cells=True)
     assert (mat["K"] == gain.K).all() and tuple(mat["state_names"]) == gain.state_names
 
@@ -307,7 +333,11 @@ def test_verified_is_kept_where_a_thing_is_changed(tmp_path):
     gain, estimator = fflin.lqr(read, 1.0, 1.0), fflin.kalman(read, 1.0, 1.0)
     sound = fflin.lqr(made("model"), 1.0, 1.0)
     made_of_it = (
-        *(read.discretize(0.1), replace(read, u0=read.u0 + 1.0), fflin.momentum_reduction(read)),
+        *(
+            read.discretize(0.1),
+            replace(read, u0=read.u0 + 1.0),
+            fflin.momentum_reduction(read),
+        ),
         *(gain, fflin.acceleration_lqr(read, 1.0, 1.0, 1.0), estimator),
         *(fflin.lqg(gain, made("estimator")), fflin.lqg(sound, estimator)),
         fflin.lqr_batch(replace(made("batch"), verified=False), 1.0, 1.0),
@@ -348,12 +378,17 @@ def test_a_batch_that_is_not_held_against_its_digest_says_so(tmp_path):
 @pytest.mark.parametrize(
     ("content", "format_"),
     [
-        (b"# Created by Octave 7.3.0\n# name: A\n# type: matrix\n", "Octave's own format"),
+        (
+            b"# Created by Octave 7.3.0\n# name: A\n# type: matrix\n",
+            "Octave's own format",
+        ),
         (b"Octave-1-L", "Octave's own format"),
         (b"\x89HDF\r\n\x1a\n", "HDF5 file"),
     ],
 )
-def test_other_formats_of_octave_and_matlab_are_told_with_the_remedy(tmp_path, content, format_):
+def test_other_formats_of_octave_and_matlab_are_told_with_the_remedy(
+    tmp_path, content, format_
+):
     (tmp_path / "x.mat").write_bytes(content.ljust(200, b" "))
     with pytest.raises(fflin.FileError, match=rf"{format_}; save it with save -v7"):
         fflin.Gain.load(tmp_path / "x.mat")
@@ -387,7 +422,8 @@ WRONG = {
 
 
 @pytest.mark.parametrize(
-    "kind", ["trajectory", *(pytest.param(x, marks=pytest.mark.exhaustive) for x in OTHERS)]
+    "kind",
+    ["trajectory", *(pytest.param(x, marks=pytest.mark.exhaustive) for x in OTHERS)],
 )
 def test_any_value_in_the_place_of_any_entry_is_refused_or_accepted(kind, tmp_path):
     path = tmp_path / "file.json"
@@ -418,7 +454,10 @@ def test_a_gain_whose_entries_contradict_each_other_is_refused(tmp_path):
     record, _ = read_record(tmp_path / "gain.json")
     for change in (
         {"regulated": ["nosuch"]},
-        {"state_names": [*record["state_names"][:-1], "x"], "regulated": record["state_names"]},
+        {
+            "state_names": [*record["state_names"][:-1], "x"],
+            "regulated": record["state_names"],
+        },
         {"poles": []},
     ):
         (tmp_path / "gain.json").write_text(json.dumps(record | change))
@@ -436,18 +475,27 @@ def test_files_are_not_unpacked_if_they_would_fill_the_memory(monkeypatch, tmp_p
     room = 2 * zeros.nbytes
     for name in ("bomb.npz", "bomb.mat"):
         assert (tmp_path / name).stat().st_size < 10_000
-        for memory, said in ((room, "not fit into memory"), (room + 10_000, "500 inputs")):
-            monkeypatch.setattr("fflin.base.record.memory", lambda memory=memory: memory)
+        for memory, said in (
+            (room, "not fit into memory"),
+            (room + 10_000, "500 inputs"),
+        ):
+            monkeypatch.setattr(
+                "fflin.base.record.memory", lambda memory=memory: memory
+            )
             with pytest.raises(fflin.FflinError, match=said):
                 fflin.LinearController(tmp_path / name, lin)
 
 
-def test_the_largest_mat_files_are_read_without_decompressing_them_whole(monkeypatch, tmp_path):
+def test_the_largest_mat_files_are_read_without_decompressing_them_whole(
+    monkeypatch, tmp_path
+):
     from scipy.io import savemat
 
     from fflin.base.record import _unpacked_size
 
-    savemat(tmp_path / "a.mat", {"D": np.zeros(10**6), "E": np.ones(3)}, do_compression=True)
+    savemat(
+        tmp_path / "a.mat", {"D": np.zeros(10**6), "E": np.ones(3)}, do_compression=True
+    )
     content = (tmp_path / "a.mat").read_bytes()
     assert 8e6 < _unpacked_size(content) < 8.1e6
     monkeypatch.setattr("fflin.base.record.memory", lambda: 100)

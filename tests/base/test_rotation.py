@@ -18,6 +18,10 @@ def test_quaternion_product_is_that_of_rotations():
     pin.seed(1)
     a, b = pin.SE3.Random().rotation, pin.SE3.Random().rotation
     qa, qb = (pin.Quaternion(R).coeffs() for R in (a, b))
-    assert rotation_matrix(quaternion_product(qa, qb)) == pytest.approx(a @ b, abs=1e-14)
+    assert rotation_matrix(quaternion_product(qa, qb)) == pytest.approx(
+        a @ b, abs=1e-14
+    )
     assert rotation_matrix(conjugate(qa)) == pytest.approx(a.T, abs=1e-14)
-    assert quaternion_product(qa, conjugate(qa)) == pytest.approx([0, 0, 0, 1], abs=1e-15)
+    assert quaternion_product(qa, conjugate(qa)) == pytest.approx(
+        [0, 0, 0, 1], abs=1e-15
+    )

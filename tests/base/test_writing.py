@@ -14,7 +14,13 @@ import numpy as np
 import pytest
 
 import fflin
-from fflin.base.writing import check_output_path, csv_table, reason, replacing, write_atomically
+from fflin.base.writing import (
+    check_output_path,
+    csv_table,
+    reason,
+    replacing,
+    write_atomically,
+)
 from fflin.robot.catalog import bundled_directory
 from tests.support.commands import run
 from tests.support.messages import says
@@ -38,7 +44,9 @@ WRITERS = {
 
 @pytest.fixture
 def urdf(tmp_path):
-    return Path(shutil.copy(bundled_directory() / "astrobee_arm.urdf", tmp_path / "own.urdf"))
+    return Path(
+        shutil.copy(bundled_directory() / "astrobee_arm.urdf", tmp_path / "own.urdf")
+    )
 
 
 def written(name):
@@ -47,7 +55,9 @@ def written(name):
 
 
 @pytest.mark.parametrize("name", WRITERS)
-def test_an_input_is_never_written_to_whatever_its_name(name, urdf, tmp_path, capsys, monkeypatch):
+def test_an_input_is_never_written_to_whatever_its_name(
+    name, urdf, tmp_path, capsys, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
     command, *options = WRITERS[name]
     target, before = tmp_path / written(name), urdf.read_bytes()
@@ -56,7 +66,9 @@ def test_an_input_is_never_written_to_whatever_its_name(name, urdf, tmp_path, ca
         code, _, error = run(command, urdf, *options, name)
         assert code == 2 and "input file" in error and "\n" == error[-1]
         assert urdf.read_bytes() == before and target.samefile(urdf)
-        assert sorted(path.name for path in tmp_path.iterdir()) == sorted(("own.urdf", target.name))
+        assert sorted(path.name for path in tmp_path.iterdir()) == sorted(
+            ("own.urdf", target.name)
+        )
         target.unlink()
 
 
@@ -72,7 +84,9 @@ def test_a_pipe_is_never_written_to(name, urdf, tmp_path, capsys, monkeypatch):
 
 
 @pytest.mark.parametrize("name", WRITERS)
-def test_a_link_is_followed_and_modes_are_kept(name, urdf, tmp_path, capsys, monkeypatch):
+def test_a_link_is_followed_and_modes_are_kept(
+    name, urdf, tmp_path, capsys, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
     command, *options = WRITERS[name]
     (tmp_path / "there").mkdir()
@@ -92,7 +106,9 @@ def test_a_link_is_followed_and_modes_are_kept(name, urdf, tmp_path, capsys, mon
     finally:
         os.umask(before)
     assert target.stat().st_mode & 0o777 == 0o640
-    assert not list(tmp_path.glob("**/.fflin*")) and not list(tmp_path.glob("**/*.part"))
+    assert not list(tmp_path.glob("**/.fflin*")) and not list(
+        tmp_path.glob("**/*.part")
+    )
 
 
 def test_an_unfinished_file_is_under_the_rule(urdf, tmp_path, capsys, monkeypatch):
@@ -114,7 +130,9 @@ def test_other_inputs_are_protected_too(urdf, tmp_path, capsys, monkeypatch):
     code, _, error = run(*command)
     assert code == 2 and "input file" in error
     os.link("in.json", "q.h5")
-    code, _, error = run("sweep", urdf, "--random", 3, "--inputs", "in.json", "-o", "q.h5")
+    code, _, error = run(
+        "sweep", urdf, "--random", 3, "--inputs", "in.json", "-o", "q.h5"
+    )
     assert code == 2 and "input file" in error and error.count("\n") == 1
 
 
@@ -122,7 +140,9 @@ def test_a_session_may_save_over_what_it_has_read(urdf, tmp_path, capsys, monkey
     monkeypatch.chdir(tmp_path)
     robot = fflin.load(urdf)
     t, q = np.array([0.0, 1.0]), np.tile(robot.neutral(), (2, 1))
-    rest = fflin.Trajectory(robot, t, q, np.zeros((2, robot.nv)), np.zeros((2, robot.nv)))
+    rest = fflin.Trajectory(
+        robot, t, q, np.zeros((2, robot.nv)), np.zeros((2, robot.nv))
+    )
     for name in ("t.csv", "t.npz"):
         rest.save(name)
         read = fflin.Trajectory.load(name, robot)
@@ -169,7 +189,15 @@ def test_what_a_xacro_reads_is_protected(included, tmp_path):
     there.mkdir()
     for name in ("x.urdf.xacro", "inc.xacro", "deep.xacro", "mass.yaml"):
         (tmp_path / name).rename(there / name)
-    linked(tmp_path, there / included, "linearize", "there/x.urdf.xacro", "--force", "-o", "o.json")
+    linked(
+        tmp_path,
+        there / included,
+        "linearize",
+        "there/x.urdf.xacro",
+        "--force",
+        "-o",
+        "o.json",
+    )
 
 
 @pytest.mark.process
@@ -243,7 +271,9 @@ for command in json.loads(sys.argv[1]):
 def test_a_limit_of_the_size_of_a_file_is_one_line(tmp_path):
     """As where the disk is full; all in one process, which must outlive them."""
     writers = {**WRITERS, "large.h5": ("sweep", "--random", "2000", "-o")}
-    commands = [[first, "astrobee_arm", *rest, name] for name, (first, *rest) in writers.items()]
+    commands = [
+        [first, "astrobee_arm", *rest, name] for name, (first, *rest) in writers.items()
+    ]
     done = finished(
         [sys.executable, "-c", _LIMITED, json.dumps(commands)],
         cwd=tmp_path,
@@ -251,7 +281,9 @@ def test_a_limit_of_the_size_of_a_file_is_one_line(tmp_path):
         text=True,
     )
     said = [
-        line for line in done.stderr.splitlines() if not re.search("warning|about .* points", line)
+        line
+        for line in done.stderr.splitlines()
+        if not re.search("warning|about .* points", line)
     ]
     assert done.returncode == 0 and said[1::2] == ["2"] * len(commands), done.stderr
     for line in said[::2]:
@@ -290,7 +322,9 @@ def test_the_room_of_a_sweep_is_its_own_from_the_start(tmp_path):
             held.append(found.st_blocks * 512 / found.st_size)
 
     points = fflin.random_configurations(robot, 1500)
-    fflin.sweep(robot, points, out=tmp_path / "x.h5", chunk=100, progress=look, threads=1)
+    fflin.sweep(
+        robot, points, out=tmp_path / "x.h5", chunk=100, progress=look, threads=1
+    )
     assert held[0] >= 1.0
 
 

@@ -50,7 +50,9 @@ def test_a_worker_unpickles_the_robot_once(robot, monkeypatch):
     dispatching._unpickled.cache_clear()
     made = []
     load = dispatching.pickle.loads
-    monkeypatch.setattr(dispatching.pickle, "loads", lambda job: made.append(job) or load(job))
+    monkeypatch.setattr(
+        dispatching.pickle, "loads", lambda job: made.append(job) or load(job)
+    )
     q, _, _ = points(robot, 60)
     with ThreadPoolExecutor(1) as executor:
         batch = fflin.sweep(robot, q, engine="python", executor=executor, chunk=2)
@@ -132,7 +134,10 @@ if __name__ == "__main__":
         ("workers.submit(busy, 0)", "begun"),
         ("workers.submit(time.sleep, 9999); print('begun', flush=True)", "begun"),
         ("print('idle', flush=True)", "idle"),
-        ("workers.submit(pow, 2, 4); workers.submit(pow, 2, 4); print('new', flush=True)", "new"),
+        (
+            "workers.submit(pow, 2, 4); workers.submit(pow, 2, 4); print('new', flush=True)",
+            "new",
+        ),
     ],
 )
 @pytest.mark.parametrize("end", ["kill", "return"])
@@ -141,7 +146,10 @@ def test_no_worker_outlives_its_caller(task, said, end, tmp_path):
     script = tmp_path / "script.py"
     script.write_text(BEGIN.format(task=task))
     with subprocess.Popen(
-        [sys.executable, script], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        [sys.executable, script],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
     ) as process:
         with finishing(process, said):
             assert process.stdout.readline() == f"{said}\n"
@@ -203,7 +211,9 @@ def test_workers_that_cannot_start_are_one_line(tmp_path):
 
 @pytest.mark.compiled
 @pytest.mark.process
-def test_an_executor_that_dies_is_one_line_and_what_is_finished_is_kept(robot, killing, tmp_path):
+def test_an_executor_that_dies_is_one_line_and_what_is_finished_is_kept(
+    robot, killing, tmp_path
+):
     pytest.importorskip("h5py")
     q, _, _ = points(robot, 80)
     killing(1)
@@ -217,7 +227,12 @@ def test_an_executor_that_dies_is_one_line_and_what_is_finished_is_kept(robot, k
     assert (24, 32) in [failure[:2] for failure in caught.value.failed]
     told = []
     batch = fflin.sweep(
-        robot, q, executor=None, chunk=8, out=path, progress=lambda done, _: told.append(done)
+        robot,
+        q,
+        executor=None,
+        chunk=8,
+        out=path,
+        progress=lambda done, _: told.append(done),
     )
     assert told[0] == 24
     assert np.abs(batch.B_lower - fflin.sweep(robot, q).B_lower).max() < 1e-13
@@ -230,7 +245,9 @@ def test_an_object_that_only_submits_is_an_executor(robot):
 
     q = np.tile(robot.neutral(), (4, 1))
     with ThreadPoolExecutor(1) as pool:
-        batch = fflin.sweep(robot, q, engine="python", executor=Submitting(pool), chunk=2)
+        batch = fflin.sweep(
+            robot, q, engine="python", executor=Submitting(pool), chunk=2
+        )
     np.testing.assert_array_equal(batch.A, fflin.sweep(robot, q, engine="python").A)
     with pytest.raises(fflin.InputError, match="executor has type int"):
         fflin.sweep(robot, q, executor=3)
@@ -280,9 +297,14 @@ def test_dask(robot):
 
     waits = ("connect", "tcp")
     with (
-        dask.config.set({f"distributed.comm.timeouts.{each}": f"{STALL} s" for each in waits}),
+        dask.config.set(
+            {f"distributed.comm.timeouts.{each}": f"{STALL} s" for each in waits}
+        ),
         distributed.LocalCluster(
-            n_workers=2, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0"
+            n_workers=2,
+            threads_per_worker=1,
+            processes=True,
+            dashboard_address="127.0.0.1:0",
         ) as cluster,
         distributed.Client(cluster) as client,
     ):
@@ -294,7 +316,9 @@ def test_dask(robot):
         here = fflin.sweep(robot, q, v, u).A
         assert np.abs(moving.A - here).max() < 1e-12 * np.abs(here).max()
         worker = next(iter(client.scheduler_info()["workers"].values()))["id"]
-        pid = next(nanny.pid for name, nanny in cluster.workers.items() if name == worker)
+        pid = next(
+            nanny.pid for name, nanny in cluster.workers.items() if name == worker
+        )
         killed = []
 
         def kill(done, _):
@@ -303,7 +327,11 @@ def test_dask(robot):
                 os.kill(pid, signal.SIGKILL)
 
         batch = fflin.sweep(
-            robot, configurations, executor=client.get_executor(), chunk=10, progress=kill
+            robot,
+            configurations,
+            executor=client.get_executor(),
+            chunk=10,
+            progress=kill,
         )
     assert killed
     assert np.array_equal(batch.q, expected.q)

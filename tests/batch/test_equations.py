@@ -19,7 +19,10 @@ pytestmark = pytest.mark.compiled
 TILTED = pin.SE3(pin.exp3(np.array([0.3, 0.5, -0.2])), np.array([1.0, 2.0, 3.0]))
 CASES = {
     **{frame: {"frame": frame} for frame in ("hybrid", "local", "world")},
-    **{f"{frame}, tilted": {"frame": frame, "reference": TILTED} for frame in ("hybrid", "world")},
+    **{
+        f"{frame}, tilted": {"frame": frame, "reference": TILTED}
+        for frame in ("hybrid", "world")
+    },
     "local, tilted": {"frame": "local", "reference": TILTED},
     "moving": {"moving": True},
 }
@@ -57,7 +60,9 @@ def agreement(robot, count=11, **options):
         expected["_drift"] = lin.drift
         for key, array in out.items():
             scale = max(1e-3, np.abs(expected[key]).max(initial=0.0)) * condition
-            worst = max(worst, np.abs(array[row] - expected[key]).max(initial=0.0) / scale)
+            worst = max(
+                worst, np.abs(array[row] - expected[key]).max(initial=0.0) / scale
+            )
     return worst
 
 
@@ -90,7 +95,11 @@ def test_kernel_knows_springs_gravity_thrusters_and_wheels(case, robots):
         fflin.ReactionWheel((0.0, 1.0, 1.0), frame="link_2", inertia=0.05),
     ]
     robot = robot.replace(
-        inputs=inputs, stiffness=2.0, damping=0.3, rest={"joint_2": 0.4}, gravity=(1.0, 2.0, -9.81)
+        inputs=inputs,
+        stiffness=2.0,
+        damping=0.3,
+        rest={"joint_2": 0.4},
+        gravity=(1.0, 2.0, -9.81),
     )
     assert agreement(robot, **CASES[case]) < 1e-13
 
@@ -101,10 +110,16 @@ def test_kernel_counts_rotors(robots):
     assert agreement(fflin.from_model(model)) < 1e-13
 
 
-@pytest.mark.parametrize("types", [("revolute", "revolute"), ("prismatic", "continuous")])
-def test_kernel_knows_joints_that_turn_against_others_with_rotors_of_their_own(types, tmp_path):
+@pytest.mark.parametrize(
+    "types", [("revolute", "revolute"), ("prismatic", "continuous")]
+)
+def test_kernel_knows_joints_that_turn_against_others_with_rotors_of_their_own(
+    types, tmp_path
+):
     mimic = '<mimic joint="b" multiplier="-2" offset="0.3"/>'
-    document = MIMIC.format(links=LINKS, a=types[0], b=types[1], parent="la", mimic=mimic)
+    document = MIMIC.format(
+        links=LINKS, a=types[0], b=types[1], parent="la", mimic=mimic
+    )
     (tmp_path / "r.urdf").write_text(document)
     robot = fflin.load(tmp_path / "r.urdf")
     model = robot.model.copy()
@@ -112,7 +127,9 @@ def test_kernel_knows_joints_that_turn_against_others_with_rotors_of_their_own(t
     assert agreement(replace(robot, model=model)) < 1e-13
 
 
-def test_kernel_knows_what_mimics_a_joint_of_another_branch_beside_one_that_does_not(tmp_path):
+def test_kernel_knows_what_mimics_a_joint_of_another_branch_beside_one_that_does_not(
+    tmp_path,
+):
     """c on b mimics a; d, on b too, is not moved by a, and yet its row of the inverse is."""
     more = "".join(
         f"""<link name="l{name}"><inertial><origin xyz=".1 .2 .3"/><mass value="0.9"/>
@@ -124,7 +141,9 @@ def test_kernel_knows_what_mimics_a_joint_of_another_branch_beside_one_that_does
             ("d", "0 1 0", ""),
         )
     )
-    document = MIMIC.format(links=LINKS, a="revolute", b="revolute", parent="base", mimic="")
+    document = MIMIC.format(
+        links=LINKS, a="revolute", b="revolute", parent="base", mimic=""
+    )
     (tmp_path / "r.urdf").write_text(document.replace("</robot>", f"{more}</robot>"))
     robot = fflin.load(tmp_path / "r.urdf")
     assert robot.joint_names == ("a", "b", "d")
@@ -141,7 +160,10 @@ def test_kernel_agrees_where_joints_mimic_others_and_turn_without_end(name):
 
 def test_fewer_points_than_lanes_and_more_than_a_block(robots):
     for count in (1, 7, 8, 9, 300):
-        assert agreement(robots["planar_detumble"], count, frame="world", reference=TILTED) < 1e-13
+        assert (
+            agreement(robots["planar_detumble"], count, frame="world", reference=TILTED)
+            < 1e-13
+        )
 
 
 def test_a_sweep_takes_the_kernel_and_leaves_what_the_linearizer_refuses(robots):
@@ -190,7 +212,9 @@ def test_an_engine_may_be_chosen(robots, monkeypatch):
     q, v, u = operating_points(robot, 20)
     by_python = fflin.sweep(robot, q, v, u, engine="python")
     expected = fflin.linearize(robot, q[4], v[4], u[4])
-    assert (by_python.A[4] == expected.A).all() and (by_python.B_lower[4] == expected.B[9:]).all()
+    assert (by_python.A[4] == expected.A).all() and (
+        by_python.B_lower[4] == expected.B[9:]
+    ).all()
     compiled = fflin.sweep(robot, q, v, u, engine="compiled")
     assert compiled.A == pytest.approx(by_python.A, rel=1e-9, abs=1e-9)
     with pytest.raises(fflin.UnknownNameError, match="'fast'"):
@@ -203,10 +227,16 @@ def test_an_engine_may_be_chosen(robots, monkeypatch):
 
 def test_one_set_of_machine_code_serves_every_robot_and_option(robots):
     derive = kernel("derivatives", "derive")
-    thrusters = [fflin.Thruster("base", (0.1, 0.2, 0.3), (0.3, 0.5, 1.0)), fflin.BaseTorque()]
+    thrusters = [
+        fflin.Thruster("base", (0.1, 0.2, 0.3), (0.3, 0.5, 1.0)),
+        fflin.BaseTorque(),
+    ]
     for name in BUNDLED:
         robot = robots[name]
-        variants = [robot, robot.replace(gravity=(0.0, 0.0, -9.81), stiffness=0.5, damping=0.1)]
+        variants = [
+            robot,
+            robot.replace(gravity=(0.0, 0.0, -9.81), stiffness=0.5, damping=0.1),
+        ]
         if name == "servicer_7dof":
             variants.append(robot.replace(inputs=thrusters))
         for each in variants:

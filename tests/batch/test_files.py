@@ -28,7 +28,9 @@ def robot(robots):
 
 @pytest.mark.parametrize("ending", FORMATS)
 @pytest.mark.parametrize("moving", [False, True])
-def test_a_batch_that_is_saved_is_read_back_to_the_last_bit(ending, moving, robot, tmp_path):
+def test_a_batch_that_is_saved_is_read_back_to_the_last_bit(
+    ending, moving, robot, tmp_path
+):
     q, v, u = points(robot, 7)
     batch = fflin.sweep(robot, q, *((v, u) if moving else ()))
     batch.save(tmp_path / f"b{ending}")
@@ -108,7 +110,9 @@ def interrupted(robot, q, path, after):
 
 
 @pytest.mark.compiled
-def test_a_run_goes_on_from_the_chunks_that_are_there_and_intact(robot, tmp_path, monkeypatch):
+def test_a_run_goes_on_from_the_chunks_that_are_there_and_intact(
+    robot, tmp_path, monkeypatch
+):
     q, _, _ = points(robot, 80)
     path, part = tmp_path / "b.h5", tmp_path / "b.h5.part"
     interrupted(robot, q, path, 64)
@@ -126,10 +130,15 @@ def test_a_run_goes_on_from_the_chunks_that_are_there_and_intact(robot, tmp_path
     monkeypatch.setattr(
         FileStore,
         "write",
-        lambda store, start, *rest: (written.append(start), original(store, start, *rest)),
+        lambda store, start, *rest: (
+            written.append(start),
+            original(store, start, *rest),
+        ),
     )
     told = []
-    batch = fflin.sweep(robot, q, chunk=16, out=path, progress=lambda *x: told.append(x))
+    batch = fflin.sweep(
+        robot, q, chunk=16, out=path, progress=lambda *x: told.append(x)
+    )
     assert written == [16, 64] and told == [(48, 80), (64, 80), (80, 80)]
     assert [entry.name for entry in tmp_path.iterdir()] == ["b.h5"]
     assert np.abs(batch.B_lower / fflin.sweep(robot, q).B_lower - 1).max() < 1e-9
@@ -156,7 +165,9 @@ def test_a_run_that_cannot_go_on_keeps_what_is_finished(robot, tmp_path, monkeyp
             fflin.sweep(robot, q, chunk=4, out=path)
     assert part.exists()
     counts = []
-    fflin.sweep(robot, q, chunk=4, out=path, progress=lambda done, _: counts.append(done))
+    fflin.sweep(
+        robot, q, chunk=4, out=path, progress=lambda done, _: counts.append(done)
+    )
     assert counts == [8, 12] and path.exists() and not part.exists()
 
 
@@ -168,7 +179,9 @@ def test_a_run_goes_on_in_the_chunks_that_it_was_begun_in(chunk, robot, tmp_path
     path = tmp_path / "b.h5"
     interrupted(robot, q, path, 64)
     told = []
-    batch = fflin.sweep(robot, q, chunk=chunk, out=path, progress=lambda *x: told.append(x))
+    batch = fflin.sweep(
+        robot, q, chunk=chunk, out=path, progress=lambda *x: told.append(x)
+    )
     assert told == [(64, 80), (80, 80)]
     assert np.array_equal(batch.B_lower, fflin.sweep(robot, q, threads=1).B_lower)
 
@@ -182,7 +195,9 @@ def test_a_file_that_another_run_writes_is_left_alone(robot, tmp_path):
     script = "import h5py, sys; f = h5py.File(sys.argv[1], 'r+'); print(1, flush=True); input()"
     command = [sys.executable, "-c", script, f"{path}.part"]
     with (
-        subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process,
+        subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        ) as process,
         finishing(process),
     ):
         assert process.stdout.readline()
@@ -193,7 +208,9 @@ def test_a_file_that_another_run_writes_is_left_alone(robot, tmp_path):
 
 
 @pytest.mark.compiled
-def test_a_damaged_unfinished_file_is_one_line_or_its_chunk_is_done_again(robot, tmp_path):
+def test_a_damaged_unfinished_file_is_one_line_or_its_chunk_is_done_again(
+    robot, tmp_path
+):
     q, _, _ = points(robot, 80)
     path, part = tmp_path / "b.h5", tmp_path / "b.h5.part"
     interrupted(robot, q, path, 64)
@@ -206,7 +223,9 @@ def test_a_damaged_unfinished_file_is_one_line_or_its_chunk_is_done_again(robot,
         content[rng.integers(0, 2500 if trial % 2 else len(whole))] ^= 0xFF
         part.write_bytes(content if trial % 10 else content[: rng.integers(len(whole))])
         try:
-            assert np.array_equal(fflin.sweep(robot, q, out=path, threads=1).B_lower, expected)
+            assert np.array_equal(
+                fflin.sweep(robot, q, out=path, threads=1).B_lower, expected
+            )
         except fflin.FileError as error:
             refused += 1
             assert ".part" in str(error) and "\n" not in str(error)
@@ -218,7 +237,9 @@ def test_where_nothing_is_finished_nothing_is_left(robot, tmp_path):
     executor = ThreadPoolExecutor(1)
     executor.shutdown()
     with pytest.raises(fflin.SweepError, match=r"after shutdown$"):
-        fflin.sweep(robot, points(robot, 8)[0], executor=executor, out=tmp_path / "b.h5")
+        fflin.sweep(
+            robot, points(robot, 8)[0], executor=executor, out=tmp_path / "b.h5"
+        )
     assert not list(tmp_path.iterdir())
 
 
@@ -252,11 +273,18 @@ def test_a_killed_run_goes_on(robot, tmp_path):
     told = []
     points = fflin.random_configurations(robot, 4000, seed=3)
     batch = fflin.sweep(
-        robot, points, chunk=80, out=path, progress=lambda *counts: told.append(counts[0])
+        robot,
+        points,
+        chunk=80,
+        out=path,
+        progress=lambda *counts: told.append(counts[0]),
     )
     assert 240 <= told[0] < 4000, "some chunks were kept"
     expected = fflin.sweep(robot, points)
-    assert np.abs(batch.B_lower - expected.B_lower).max() <= 1e-13 * np.abs(batch.B_lower).max()
+    assert (
+        np.abs(batch.B_lower - expected.B_lower).max()
+        <= 1e-13 * np.abs(batch.B_lower).max()
+    )
     assert np.array_equal(batch.q, expected.q)
 
 
@@ -296,7 +324,9 @@ def store(path, request="a"):
 
 
 @pytest.mark.parametrize("step", ["_begin", "_name"])
-def test_a_run_that_ends_before_it_begins_leaves_no_unfinished_file(step, tmp_path, monkeypatch):
+def test_a_run_that_ends_before_it_begins_leaves_no_unfinished_file(
+    step, tmp_path, monkeypatch
+):
     def killed(*_):
         raise Killed
 

@@ -33,7 +33,9 @@ class Walks:
         for at, seed in enumerate(rows["seed"].astype(int)):
             if seed == self.endless:
                 raise fflin.FflinError(f"walk {start + at} has no end")
-            out["walk"][at] = np.random.default_rng(seed).normal(size=(9, 3)).sum(axis=0)
+            out["walk"][at] = (
+                np.random.default_rng(seed).normal(size=(9, 3)).sum(axis=0)
+            )
         return ["tired"] * (start == 0)
 
 
@@ -61,7 +63,9 @@ def test_a_file_goes_on_where_a_run_ended_and_is_the_same_on_any_workers(
         texts = {"kind": "walks"}
         pace = {"pace": np.array([1.5])}
         with (
-            closing(FileStore(path, "request", COUNT, CHUNK, STORED, pace, texts)) as store,
+            closing(
+                FileStore(path, "request", COUNT, CHUNK, STORED, pace, texts)
+            ) as store,
             Execution(workers=workers or None, threads=threads) as how,
         ):
             tell = lambda done, _: told.append(done)  # noqa: E731
@@ -96,7 +100,9 @@ def test_in_memory_the_error_has_what_is_made_of_the_rest():
         any_wording(),
         pytest.raises(fflin.SweepError) as caught,
     ):
-        run_chunks(Walks(endless=20), seeds, store, ALONE, made=lambda rows: rows["seed"])
+        run_chunks(
+            Walks(endless=20), seeds, store, ALONE, made=lambda rows: rows["seed"]
+        )
     error = caught.value
     assert error.failed == ((16, 24, "walk 20 has no end"),)
     assert np.array_equal(error.batch, np.r_[0:16, 24:50])
@@ -156,7 +162,11 @@ def test_a_worker_that_dies_while_it_sends_a_result_is_replaced(tmp_path):
     script = tmp_path / "dying.py"
     script.write_text(textwrap.dedent(DYING))
     done = finished(
-        [sys.executable, script], capture_output=True, text=True, env=os.environ, check=True
+        [sys.executable, script],
+        capture_output=True,
+        text=True,
+        env=os.environ,
+        check=True,
     )
     assert "a worker process died" in done.stdout
     assert done.stdout.splitlines()[-1] == "0"

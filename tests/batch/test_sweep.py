@@ -35,7 +35,10 @@ def test_at_operating_points_every_model_is_that_of_linearize(frame, robots):
     reference = random_pose(np.random.default_rng(3), 20.0)
     batch = fflin.sweep(robot, q, v, u, frame=frame, reference=reference, chunk=2)
     for index, point in enumerate(zip(q, v, u, strict=True)):
-        assert_same(batch[index], fflin.linearize(robot, *point, frame=frame, reference=reference))
+        assert_same(
+            batch[index],
+            fflin.linearize(robot, *point, frame=frame, reference=reference),
+        )
     # One velocity and one input for all.
     batch = fflin.sweep(robot, q, v[0], u[0], frame=frame)
     assert_same(batch[3], fflin.linearize(robot, q[3], v[0], u[0], frame=frame))
@@ -73,9 +76,14 @@ def test_wheels_with_an_inertia_are_joints(robots):
     batch = fflin.sweep(robot, fflin.random_configurations(robot, 20, seed=1))
     for lin in batch:
         assert_same(lin, fflin.linearize(robot, lin.q), 1e-11)
-    moving = fflin.sweep(robot, batch.q, fflin.velocity(robot, {robot.joint_names[-1]: 50.0}))
+    moving = fflin.sweep(
+        robot, batch.q, fflin.velocity(robot, {robot.joint_names[-1]: 50.0})
+    )
     lin = fflin.linearize(robot, batch.q[3], moving.v[3])
-    assert moving[3].ignorable == lin.ignorable and f"q_m.{robot.joint_names[-1]}" in lin.ignorable
+    assert (
+        moving[3].ignorable == lin.ignorable
+        and f"q_m.{robot.joint_names[-1]}" in lin.ignorable
+    )
     assert moving[3].is_equilibrium() == lin.is_equilibrium()
 
 
@@ -111,8 +119,11 @@ def test_slices_masks_and_joint_values(robots):
     configurations = fflin.grid(robot, axes, joints={"joint_1": 0.3})
     batch = fflin.sweep(robot, configurations)
     assert len(batch) == len(configurations) == 15
-    expected = fflin.configuration(robot, {"joint_1": 0.3, "joint_2": -0.5, "joint_4": 0.5})
-    assert batch[4].q == pytest.approx(expected, abs=0.0)  # the last joint varies fastest
+    expected = fflin.configuration(
+        robot, {"joint_1": 0.3, "joint_2": -0.5, "joint_4": 0.5}
+    )
+    # the last joint varies fastest
+    assert batch[4].q == pytest.approx(expected, abs=0.0)
     assert_same(batch[4:9][1], batch[5])
     assert_same(batch[-1], batch[14])
     assert_same(batch[np.arange(15) % 4 == 0][2], batch[8])
@@ -140,9 +151,13 @@ def test_a_continuous_joint_is_near_the_short_way_round():
 
 
 @pytest.mark.compiled
-def test_random_configurations_keep_the_limits_and_do_not_depend_on_how_they_are_read(robots):
+def test_random_configurations_keep_the_limits_and_do_not_depend_on_how_they_are_read(
+    robots,
+):
     robot = robots["servicer_7dof"]
-    drawn = fflin.random_configurations(robot, 9000, seed=7, ranges={"joint_3": (0.1, 0.2)})
+    drawn = fflin.random_configurations(
+        robot, 9000, seed=7, ranges={"joint_3": (0.1, 0.2)}
+    )
     q = drawn.rows(0, 9000)
     assert np.array_equal(np.vstack([drawn.rows(0, 100), drawn.rows(100, 9000)]), q)
     batch = fflin.sweep(robot, drawn, chunk=512)
@@ -154,8 +169,14 @@ def test_random_configurations_keep_the_limits_and_do_not_depend_on_how_they_are
             assert at.min() >= 0.1 and at.max() <= 0.2
         elif not joint.unbounded:
             low, high = max(lower[joint.idx_q], -7), min(upper[joint.idx_q], 7)
-            assert at.min() >= low and at.max() <= high and np.ptp(at) > 0.95 * (high - low)
-    assert not np.array_equal(fflin.random_configurations(robot, 9, seed=8).rows(0, 9), q[:9])
+            assert (
+                at.min() >= low
+                and at.max() <= high
+                and np.ptp(at) > 0.95 * (high - low)
+            )
+    assert not np.array_equal(
+        fflin.random_configurations(robot, 9, seed=8).rows(0, 9), q[:9]
+    )
 
 
 @pytest.mark.parametrize(
@@ -168,7 +189,9 @@ def test_random_configurations_keep_the_limits_and_do_not_depend_on_how_they_are
         ((-100.0, -1.0), (-1.0 - 2.0 * np.pi, -1.0)),
     ],
 )
-def test_angles_are_drawn_within_the_limits_also_far_from_zero(limits, drawn_from, robots):
+def test_angles_are_drawn_within_the_limits_also_far_from_zero(
+    limits, drawn_from, robots
+):
     robot = robots["servicer_7dof"]
     model, at = robot.model.copy(), robot.joint("joint_1").idx_q
     model.lowerPositionLimit[at], model.upperPositionLimit[at] = limits
@@ -180,7 +203,9 @@ def test_angles_are_drawn_within_the_limits_also_far_from_zero(limits, drawn_fro
 
 def test_mimic_joints_follow_on_a_grid():
     robot = fflin.load("panda")
-    batch = fflin.sweep(robot, fflin.grid(robot, {"panda_finger_joint1": [0.0, 0.01, 0.04]}))
+    batch = fflin.sweep(
+        robot, fflin.grid(robot, {"panda_finger_joint1": [0.0, 0.01, 0.04]})
+    )
     for lin in batch:
         assert_same(lin, fflin.linearize(robot, lin.q), 1e-11)
     assert batch.joint_positions[:, -1] == pytest.approx([0.0, 0.01, 0.04])
@@ -234,9 +259,14 @@ def damaged(robot, row, column, value):
         (lambda r: {"q": fflin.grid(r, {"joint_1": []})}, "joint_1'"),
         (lambda r: {"q": fflin.grid(r, {"joint_1": [1.0, 0.0]})}, "increase"),
         (lambda r: {"q": fflin.random_configurations(r, 0)}, "count"),
-        (lambda r: {"q": fflin.grid(fflin.load("ur5"), {"elbow_joint": [1.0]})}, "'ur5'"),
         (
-            lambda r: {"q": fflin.grid(r, {f"joint_{i}": range(10**4) for i in range(1, 7)})},
+            lambda r: {"q": fflin.grid(fflin.load("ur5"), {"elbow_joint": [1.0]})},
+            "'ur5'",
+        ),
+        (
+            lambda r: {
+                "q": fflin.grid(r, {f"joint_{i}": range(10**4) for i in range(1, 7)})
+            },
             "1,000,000,000,000,000,000,000,000",
         ),
         (lambda r: {"q": fflin.random_configurations(r, 10**20)}, "9,223"),
@@ -257,7 +287,9 @@ def test_what_has_no_room_is_refused_before_it_is_begun(robots, tmp_path):
     robot = robots["servicer_7dof"]
     many = fflin.random_configurations(robot, 10**15)
     for out in (None, tmp_path / "x.npz"):
-        with pytest.raises(fflin.InputError, match=r"1,000,000,000,000,000 rows.*memory"):
+        with pytest.raises(
+            fflin.InputError, match=r"1,000,000,000,000,000 rows.*memory"
+        ):
             fflin.sweep(robot, many, out=out)
     pytest.importorskip("h5py")
     with pytest.raises(fflin.FileError, match=r"x\.h5\.part"):
@@ -271,7 +303,9 @@ def test_a_singular_configuration_fails_its_chunk_and_the_rest_is_kept(parallel)
     robot = singular_at(0.5)
     configurations = fflin.grid(robot, {"slide": np.arange(64) / 64.0})
     with ThreadPoolExecutor(2) as pool, pytest.raises(fflin.SweepError) as caught:
-        fflin.sweep(robot, configurations, chunk=10, executor=pool if parallel else None)
+        fflin.sweep(
+            robot, configurations, chunk=10, executor=pool if parallel else None
+        )
     error = caught.value
     assert says(str(error), "30 to 39", "32", "'singular'")
     assert [failure[:2] for failure in error.failed] == [(30, 40)]
@@ -297,7 +331,9 @@ def test_ill_conditioned_points_are_told_once():
 def test_progress_is_told(robots):
     told = []
     q = np.tile(robots["cubesat"].neutral(), (25, 1))
-    fflin.sweep(robots["cubesat"], q, chunk=10, progress=lambda *counts: told.append(counts))
+    fflin.sweep(
+        robots["cubesat"], q, chunk=10, progress=lambda *counts: told.append(counts)
+    )
     assert told == [(10, 25), (20, 25), (25, 25)]
 
 

@@ -20,7 +20,9 @@ def agree(batch, tool, **options):
         for name in FIELDS:
             expected = getattr(alone, name)
             size = 1.0 + np.abs(expected).max()
-            assert getattr(together, name)[i] == pytest.approx(expected, abs=1e-12 * size), name
+            assert getattr(together, name)[i] == pytest.approx(
+                expected, abs=1e-12 * size
+            ), name
         assert together.state_names == alone.state_names
         assert together.input_names == alone.input_names
         assert (together.dt, together.reference) == (alone.dt, alone.reference)
@@ -60,7 +62,9 @@ def test_a_time_step_gives_the_matrices_of_the_tool(tool):
     robot = fflin.load("ets_vii")
     rng = np.random.default_rng(3)
     points = fflin.random_configurations(robot, 4, seed=2)
-    batch = fflin.sweep(robot, points, 0.2 * rng.normal(size=(4, robot.nv)), moving=True)
+    batch = fflin.sweep(
+        robot, points, 0.2 * rng.normal(size=(4, robot.nv)), moving=True
+    )
     agree(batch, tool, dt=0.01)
 
 
@@ -76,7 +80,9 @@ def test_references_and_frames_of_the_base_are_kept(frame):
 
 def test_a_batch_without_its_robot_names_the_remedy(tmp_path):
     robot = fflin.load("planar_detumble")
-    fflin.sweep(robot, fflin.grid(robot, {"joint_1": [0.0, 0.1]})).save(tmp_path / "batch.npz")
+    fflin.sweep(robot, fflin.grid(robot, {"joint_1": [0.0, 0.1]})).save(
+        tmp_path / "batch.npz"
+    )
     with pytest.raises(fflin.InputError, match="robot"):
         fflin.LinearBatch.load(tmp_path / "batch.npz").to("drake")
     batch = fflin.LinearBatch.load(tmp_path / "batch.npz", robot)

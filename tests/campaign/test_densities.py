@@ -19,7 +19,10 @@ def drawn(robot, given):
 def same_bodies(robot, other):
     for body, expected in zip(robot.model.inertias, other.model.inertias, strict=True):
         there = expected.toDynamicParameters()
-        assert np.abs(body.toDynamicParameters() - there).max() <= 1e-13 * np.abs(there).max()
+        assert (
+            np.abs(body.toDynamicParameters() - there).max()
+            <= 1e-13 * np.abs(there).max()
+        )
 
 
 @pytest.mark.parametrize(
@@ -49,17 +52,25 @@ def test_a_centre_of_mass_moves_as_that_of_uncertain_robots(name, link, body):
     shift = {"x": 0.03, "y": -0.02, "z": 0.05}
     parameters = fflin.sensitivity(fflin.linearize(robot)).parameters
     now = {axis: parameters[f"{link}.com.{axis}"].value for axis in shift}
-    of = fflin.uncertain(robot, {f"{link}.com.{a}": (x - 0.1, x + 0.1) for a, x in now.items()})
-    job = CampaignJob(robot, None, {f"{body}.com": 0.02}, 0, "python", {"duration": 1.0})
+    of = fflin.uncertain(
+        robot, {f"{link}.com.{a}": (x - 0.1, x + 0.1) for a, x in now.items()}
+    )
+    job = CampaignJob(
+        robot, None, {f"{body}.com": 0.02}, 0, "python", {"duration": 1.0}
+    )
     assert job.dispersions.names == tuple(f"{body}.com.{axis}" for axis in shift)
     found = job.dispersions.one(np.array([*shift.values()]))[0].robot
     same_bodies(found, of.at({f"{link}.com.{a}": now[a] + d for a, d in shift.items()}))
     at = robot.model.getJointId(body) if body != "base" else 1
-    assert not np.array_equal(found.model.inertias[at].lever, robot.model.inertias[at].lever)
+    assert not np.array_equal(
+        found.model.inertias[at].lever, robot.model.inertias[at].lever
+    )
 
 
 def test_one_draw_for_all_that_a_pattern_names():
-    robot = fflin.load("servicer_7dof", stiffness={"panel_left": 60.0, "panel_right": 80.0})
+    robot = fflin.load(
+        "servicer_7dof", stiffness={"panel_left": 60.0, "panel_right": 80.0}
+    )
     given = {
         "panel_*.stiffness": {"range": (-0.3, 0.3), "tied": True},
         "joint_*.mass": {"range": 0.1, "tied": True},
@@ -78,19 +89,25 @@ def test_one_draw_for_all_that_a_pattern_names():
         value = dict(zip(names, row, strict=True))
         plant, _, q, _ = job.dispersions.one(row)
         factor = 1.0 + value["panel_*.stiffness"]
-        left, right = (plant.robot.stiffness[f"panel_{side}"] for side in ("left", "right"))
+        left, right = (
+            plant.robot.stiffness[f"panel_{side}"] for side in ("left", "right")
+        )
         assert (left, right) == pytest.approx((factor * 60.0, factor * 80.0))
         x = fflin.StateMap(robot).to_state(q, np.zeros(robot.nv))
         assert x[:3] == pytest.approx([value["q_b"]] * 3)
         for i, body in enumerate(plant.robot.model.names):
             before, after = robot.model.inertias[i], plant.robot.model.inertias[i]
             if body.startswith("joint_"):
-                assert after.mass == pytest.approx(before.mass * (1.0 + value["joint_*.mass"]))
+                assert after.mass == pytest.approx(
+                    before.mass * (1.0 + value["joint_*.mass"])
+                )
             if body.startswith("panel_"):
                 shift = [value[f"panel_*.com.{axis}"] for axis in "xyz"]
                 assert after.lever - before.lever == pytest.approx(shift)
     # The draws of what is not tied stay those that they are alone.
-    alone = CampaignJob(robot, None, {"joint_2.com": 0.01}, 0, "python", {"duration": 1.0})
+    alone = CampaignJob(
+        robot, None, {"joint_2.com": 0.01}, 0, "python", {"duration": 1.0}
+    )
     same = [names.index(name) for name in alone.dispersions.names]
     assert (alone.dispersions.drawn(0, 4) == rows[:, same]).all()
 
@@ -100,7 +117,9 @@ def test_a_tied_density_is_of_all_its_links():
     found = drawn(robot, {"link_*.density": {"range": [0.3], "tied": True}})
     same_bodies(found, drawn(robot, {"link_*.density": [0.3]}))
     with pytest.raises(fflin.InputError, match="disperse the same mass"):
-        drawn(robot, {"link_*.density": {"range": 0.3, "tied": True}, "joint_1.mass": 0.1})
+        drawn(
+            robot, {"link_*.density": {"range": 0.3, "tied": True}, "joint_1.mass": 0.1}
+        )
 
 
 def test_a_body_of_one_link_has_the_name_of_its_joint_too():
@@ -112,7 +131,9 @@ def test_a_body_of_one_link_has_the_name_of_its_joint_too():
             drawn(robot, by_link | by_joint)
 
 
-@pytest.mark.parametrize("name", ["servicer_7dof", "planar_detumble", "robots/inspector.toml"])
+@pytest.mark.parametrize(
+    "name", ["servicer_7dof", "planar_detumble", "robots/inspector.toml"]
+)
 def test_a_mass_leaves_the_inertia_about_the_centre_as_in_uncertain_robots(name):
     robot = fflin.load(name)
     links = [name for name, piece in robot.pieces.items() if not piece.whole][:4]
@@ -124,7 +145,9 @@ def test_a_mass_leaves_the_inertia_about_the_centre_as_in_uncertain_robots(name)
     one = next(x for n, x in robot.pieces.items() if n == links[0])
     alone = drawn(robot, {f"{links[0]}.mass": [0.3]}).model.inertias[one.joint]
     if len([x for x in robot.pieces.values() if x.joint == one.joint]) == 1:
-        assert np.allclose(alone.inertia, robot.model.inertias[one.joint].inertia, rtol=1e-12)
+        assert np.allclose(
+            alone.inertia, robot.model.inertias[one.joint].inertia, rtol=1e-12
+        )
         if robot.wheels:  # the carrier counts them, and they stay as they are
             return
         denser = drawn(robot, {f"{links[0]}.density": [0.3]}).model.inertias[one.joint]
@@ -133,25 +156,39 @@ def test_a_mass_leaves_the_inertia_about_the_centre_as_in_uncertain_robots(name)
 
 def test_the_root_link_has_two_names_everywhere(tmp_path):
     (tmp_path / "bus.urdf").write_text(
-        bundled_directory().joinpath("ets_vii.urdf").read_text().replace('"base"', '"bus"')
+        bundled_directory()
+        .joinpath("ets_vii.urdf")
+        .read_text()
+        .replace('"base"', '"bus"')
     )
     robot = fflin.load(tmp_path / "bus.urdf")
     assert robot.link_of["base"] == "bus"
     S = fflin.sensitivity(fflin.linearize(robot))
     for part in ("mass", "com.x", "inertia.xx", "density"):
         assert S[f"bus.{part}"].name == S[f"base.{part}"].name == f"bus.{part}"
-    for part, value in {"mass": 0.3, "density": 0.3, "com": 0.02, "inertia": 0.1}.items():
-        changed = (drawn(robot, {f"{name}.{part}": [value]}) for name in ("bus", "base"))
+    for part, value in {
+        "mass": 0.3,
+        "density": 0.3,
+        "com": 0.02,
+        "inertia": 0.1,
+    }.items():
+        changed = (
+            drawn(robot, {f"{name}.{part}": [value]}) for name in ("bus", "base")
+        )
         same_bodies(*changed)
     ranges = ({f"{name}.mass": 0.2} for name in ("bus", "base"))
-    one, two = (fflin.uncertain(robot, each).at({"bus.mass": 3000.0}) for each in ranges)
+    one, two = (
+        fflin.uncertain(robot, each).at({"bus.mass": 3000.0}) for each in ranges
+    )
     same_bodies(one, two)
 
 
 def test_a_pattern_means_the_links_and_not_the_bodies_that_they_form_too():
     robot = fflin.load("planar_detumble")
     links = {f"{link}.mass" for link in robot.links}
-    assert {each.parameter.name for each in fflin.uncertain(robot, {"*.mass": 0.1}).ranges} == links
+    assert {
+        each.parameter.name for each in fflin.uncertain(robot, {"*.mass": 0.1}).ranges
+    } == links
     job = CampaignJob(robot, None, {"*.mass": 0.1}, 0, "python", {"duration": 1.0})
     assert set(job.dispersions.names) == links
     S = fflin.sensitivity(fflin.linearize(robot))
@@ -159,8 +196,14 @@ def test_a_pattern_means_the_links_and_not_the_bodies_that_they_form_too():
     assert np.allclose(S.along({"*.mass": 1.0}).dB, total, rtol=1e-12)
     body = next(name for name, piece in robot.pieces.items() if piece.whole)
     both_of = {"*.mass": 0.1, f"{body}.mass": 0.2}
-    names = CampaignJob(robot, None, both_of, 0, "python", {"duration": 1.0}).dispersions.names
-    on = {f"{n}.mass" for n, x in robot.pieces.items() if x.joint == robot.pieces[body].joint}
+    names = CampaignJob(
+        robot, None, both_of, 0, "python", {"duration": 1.0}
+    ).dispersions.names
+    on = {
+        f"{n}.mass"
+        for n, x in robot.pieces.items()
+        if x.joint == robot.pieces[body].joint
+    }
     assert set(names) == links - on | {f"{body}.mass"}
     link = next(name for name in robot.links if f"{name}.mass" in on)
     with pytest.raises(fflin.InputError, match="disperse the same mass"):
@@ -184,6 +227,8 @@ def test_what_is_wrong_is_one_line():
     with pytest.raises(fflin.InputError, match=r"'joint_3\.mass'.*'link_3\.density'"):
         drawn(robot, both_of)
     with pytest.raises(fflin.InputError, match="-1"):
-        fflin.monte_carlo(robot, None, {"link_3.density": [-1.0]}, runs=1, duration=0.1, dt=0.1)
+        fflin.monte_carlo(
+            robot, None, {"link_3.density": [-1.0]}, runs=1, duration=0.1, dt=0.1
+        )
     with pytest.raises(fflin.UnknownNameError, match="link_3"):
         drawn(robot, {"link_33.density": 0.1})

@@ -23,9 +23,18 @@ pytestmark = pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
 ENGINES = ["python", pytest.param("compiled", marks=pytest.mark.compiled)]
 DRAWN = {
     policies.state: {"q_b": 0.05, "*.noise": 1e-3, "delay": (0.0, 0.15)},
-    policies.outputs: {"q_b": 0.05, "*.noise": 1e-3, "*.sensor": 1e-3, "delay": [0.0, 0.07]},
+    policies.outputs: {
+        "q_b": 0.05,
+        "*.noise": 1e-3,
+        "*.sensor": 1e-3,
+        "delay": [0.0, 0.07],
+    },
     policies.controlled: {"q_b": 0.05, "*.sensor": 1e-3},
-    policies.controlled_in_samples: {"q_b": 0.05, "*.noise": 1e-3, "delay": [0.0, 0.07]},
+    policies.controlled_in_samples: {
+        "q_b": 0.05,
+        "*.noise": 1e-3,
+        "delay": [0.0, 0.07],
+    },
     policies.followed: {"q_b": 0.05},
     policies.followed_outputs: {"q_b": 0.05, "*.noise": (1e-4, 1e-3), "*.sensor": 1e-3},
     policies.between_gains: {"q_m.*": 0.2},
@@ -43,7 +52,9 @@ def test_lanes_fly_every_policy(robots, name, make):
     if make is policies.between_gains and not robots[name].n:
         pytest.skip("there are no joints to lay a grid over")
     robot, policy, options = make(policies.plain(robots[name]))
-    options = {key: value for key, value in options.items() if key not in ("linear", "x0")}
+    options = {
+        key: value for key, value in options.items() if key not in ("linear", "x0")
+    }
     sample = {"sample": 0.1} if make is policies.state else {}
     case = {"dt": 0.02, "duration": 1.0, "method": "cf4"} | options | sample
     drawn = DRAWN[make] | {"base.mass": 0.1}
@@ -54,7 +65,9 @@ def test_lanes_fly_every_policy(robots, name, make):
 def equipped():
     """A robot with inputs of all kinds, two of its wheels not on the base."""
     motors = [fflin.JointTorque(f"joint_{k}") for k in range(1, 8)]
-    jet = fflin.Thruster("link_3", (0.2, 0.1, 0.0), (1.0, 0.5, 0.2), "jet", max=5.0, torque=0.4)
+    jet = fflin.Thruster(
+        "link_3", (0.2, 0.1, 0.0), (1.0, 0.5, 0.2), "jet", max=5.0, torque=0.4
+    )
     storing = fflin.ReactionWheel((1, 2, 2), "link_2", name="storing", momentum=3.0)
     spin = fflin.ReactionWheel((1, -2, 1), "link_3", name="spin", inertia=1e-3)
     inputs = [fflin.BaseForce(), *motors, jet, storing, fflin.BaseTorque(), spin]
@@ -79,12 +92,15 @@ def test_a_run_with_misaligned_thrusters_goes_on_past_half_a_turn(engine):
     if engine == "compiled":
         pytest.importorskip("numba")
     given = fflin.load_inputs("cubesat")
-    robot = fflin.load("cubesat", inputs=[x for x in given if isinstance(x, fflin.Thruster)])
+    robot = fflin.load(
+        "cubesat", inputs=[x for x in given if isinstance(x, fflin.Thruster)]
+    )
     design = robot.replace(inputs=[fflin.BaseTorque(), fflin.BaseForce()])
     lin = fflin.linearize(design)
     policy = fflin.Allocation(fflin.StateFeedback(lin, np.zeros((6, 12))), design)
     x0 = np.zeros(12)
-    x0[0], x0[6] = np.sin(np.radians(85.0)), 0.5  # half of 170 deg; beyond 180 deg after 0.35 s
+    # half of 170 deg; beyond 180 deg after 0.35 s
+    x0[0], x0[6] = np.sin(np.radians(85.0)), 0.5
     case = {"runs": 2, "duration": 1.0, "dt": 0.05, "x0": x0, "engine": engine}
     campaign = fflin.monte_carlo(robot, policy, {"thrust.misalignment": 0.01}, **case)
     assert not campaign.stopped.any()
@@ -134,14 +150,18 @@ def turned_by_noise(engine, size=0.05, **more):
     K[0, 6] = 1.0
     policy = fflin.StateFeedback(fflin.linearize(robot), K)
     options = {"duration": 40.0, "dt": 0.1, "sample": 0.2, "engine": engine, "runs": 20}
-    return fflin.monte_carlo(robot, policy, {"omega_b.x.noise": size}, **(options | more))
+    return fflin.monte_carlo(
+        robot, policy, {"omega_b.x.noise": size}, **(options | more)
+    )
 
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_sensor_errors_act_on_the_policy_that_an_allocation_realises(engine):
     if engine == "compiled":
         pytest.importorskip("numba")
-    robot = free_body((2.0, 3.0, 4.0)).replace(inputs=[fflin.BaseTorque(), fflin.BaseForce()])
+    robot = free_body((2.0, 3.0, 4.0)).replace(
+        inputs=[fflin.BaseTorque(), fflin.BaseForce()]
+    )
     lin = fflin.linearize(robot)
     policy = fflin.StateFeedback(lin, fflin.acceleration_lqr(lin, 0.04, 0.2, 1.0).K)
     given = {"q_b.x.sensor": (0.02, 0.03), "omega_b.noise": 1e-3}
@@ -217,7 +237,9 @@ def test_a_delay_that_is_drawn_is_that_of_a_run(robots):
         for run, late in enumerate(campaign.values("drawn delay").tolist()):
             options["delay"] = max(0.0, round((delay + late) / 0.01) * 0.01)
             motion = fflin.simulate(robot, policy, **options)
-            np.testing.assert_allclose(campaign.q[run], motion.q[-1], rtol=0, atol=1e-12)
+            np.testing.assert_allclose(
+                campaign.q[run], motion.q[-1], rtol=0, atol=1e-12
+            )
         assert len({*campaign.values("drawn delay")}) == 4
 
 
@@ -251,14 +273,19 @@ def test_dask_flies_the_same(robots):
     here = fflin.monte_carlo(robot, policy, given, **case)
     with (
         distributed.LocalCluster(
-            n_workers=2, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0"
+            n_workers=2,
+            threads_per_worker=1,
+            processes=True,
+            dashboard_address="127.0.0.1:0",
         ) as cluster,
         distributed.Client(cluster) as client,
     ):
         there = fflin.monte_carlo(
             robot, policy, given, executor=client.get_executor(), chunk=8, **case
         )
-    assert all(np.array_equal(getattr(here, name), getattr(there, name)) for name in ARRAYS)
+    assert all(
+        np.array_equal(getattr(here, name), getattr(there, name)) for name in ARRAYS
+    )
     assert np.array_equal(there.replay(19).q[-1], here.q[19])
 
 
@@ -270,7 +297,10 @@ def test_a_lost_worker_of_dask_is_told(robots):
     here = fflin.monte_carlo(robot, None, {"q_b": 0.05}, **case)
     with (
         distributed.LocalCluster(
-            n_workers=2, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0"
+            n_workers=2,
+            threads_per_worker=1,
+            processes=True,
+            dashboard_address="127.0.0.1:0",
         ) as cluster,
         distributed.Client(cluster) as client,
     ):
@@ -283,6 +313,11 @@ def test_a_lost_worker_of_dask_is_told(robots):
 
         with pytest.warns(fflin.FflinWarning, match="1 worker of the executor ended"):
             there = fflin.monte_carlo(
-                robot, None, {"q_b": 0.05}, executor=client.get_executor(), progress=kill, **case
+                robot,
+                None,
+                {"q_b": 0.05},
+                executor=client.get_executor(),
+                progress=kill,
+                **case,
             )
     assert np.array_equal(here.q, there.q)

@@ -42,9 +42,13 @@ def test_all_kinds_of_spreads(tmp_path):
 
 
 def test_a_tied_spread_is_one_draw(tmp_path, robots):
-    found = read(tmp_path, '"*.mass" = {uniform = [-0.1, 0.2], tied = true}\nq_b = 0.01\n')
+    found = read(
+        tmp_path, '"*.mass" = {uniform = [-0.1, 0.2], tied = true}\nq_b = 0.01\n'
+    )
     assert found["*.mass"] == {"range": (-0.1, 0.2), "tied": True}
-    scaled = read(tmp_path, 'q_b = {distribution = "norm", scale = 0.1, tied = true}')["q_b"]
+    scaled = read(tmp_path, 'q_b = {distribution = "norm", scale = 0.1, tied = true}')[
+        "q_b"
+    ]
     assert scaled["range"].ppf(0.5) == 0.0
 
 
@@ -90,7 +94,9 @@ def test_a_tied_spread_is_one_draw(tmp_path, robots):
 def test_what_is_wrong_has_file_and_line(tmp_path, robots, text, line, said):
     with pytest.raises(fflin.FflinError, match=said) as caught:
         given = read(tmp_path, "r_b = 0.01\n" + text)
-        fflin.monte_carlo(robots["planar_detumble"], None, given, runs=100, duration=0.1)
+        fflin.monte_carlo(
+            robots["planar_detumble"], None, given, runs=100, duration=0.1
+        )
     assert str(caught.value).startswith(f"{tmp_path / 'uncertain.toml'}:{line}: ")
     assert "\n" not in str(caught.value)
 
@@ -134,9 +140,18 @@ def test_a_distribution_draws_each_value_once_whatever_is_asked_for(robots):
     """Those of scipy.stats that integrate take a second for two values."""
     dispersions = [
         CampaignJob(
-            robots["planar_detumble"], None, {"r_b.x": given}, 7, "python", {"duration": 1.0}
+            robots["planar_detumble"],
+            None,
+            {"r_b.x": given},
+            7,
+            "python",
+            {"duration": 1.0},
         ).dispersions
-        for given in (Given(stats.logistic(scale=0.1).ppf), (-0.1, 0.1), Given(lambda u: u))
+        for given in (
+            Given(stats.logistic(scale=0.1).ppf),
+            (-0.1, 0.1),
+            Given(lambda u: u),
+        )
     ]
     once, uniform, plain = dispersions
     before = [each.columns[0].inverse.__self__.count for each in (once, plain)]
@@ -147,7 +162,9 @@ def test_a_distribution_draws_each_value_once_whatever_is_asked_for(robots):
     counts = [each.columns[0].inverse.__self__.count for each in (once, plain)]
     assert counts == [each + 2100 for each in before]
     u = plain.drawn(0, 2100)
-    np.testing.assert_allclose(np.concatenate(parts), stats.logistic(scale=0.1).ppf(u), rtol=1e-14)
+    np.testing.assert_allclose(
+        np.concatenate(parts), stats.logistic(scale=0.1).ppf(u), rtol=1e-14
+    )
     np.testing.assert_allclose(uniform.drawn(5, 2100), -0.1 + 0.2 * u[5:], rtol=1e-14)
 
 
@@ -162,9 +179,13 @@ def test_a_distribution_draws_each_value_once_whatever_is_asked_for(robots):
         ),
     ],
 )
-def test_what_cannot_be_drawn_is_refused_before_the_runs(ppf, said, robots, monkeypatch):
+def test_what_cannot_be_drawn_is_refused_before_the_runs(
+    ppf, said, robots, monkeypatch
+):
     monkeypatch.setattr("fflin.campaign.monte_carlo.run_chunks", None)  # the runs
     given = {"r_b.x": Given(ppf)}
     with pytest.raises(fflin.InputError, match=said) as caught:
-        fflin.monte_carlo(robots["planar_detumble"], None, given, runs=100, duration=0.1)
+        fflin.monte_carlo(
+            robots["planar_detumble"], None, given, runs=100, duration=0.1
+        )
     assert "r_b.x" in str(caught.value)

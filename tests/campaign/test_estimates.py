@@ -53,7 +53,9 @@ def test_a_campaign_and_validity_say_what_they_will_take(clock):
     robot = fflin.load("cubesat")
     lin, gain, policy = loop_of(robot)
     bar, options = Told(), {"duration": 10.0, "dt": 0.1, "engine": "python"}
-    campaign = fflin.monte_carlo(robot, policy, {"q_b": 0.1}, runs=3, progress=bar, **options)
+    campaign = fflin.monte_carlo(
+        robot, policy, {"q_b": 0.1}, runs=3, progress=bar, **options
+    )
     assert bar.told == (pytest.approx(3 * 120 * STEP), 1)
     work = [(campaign._job, campaign._job.dispersions.drawn(0, 1), 3)]
     runs_module.expect(bar, work, Execution(ThreadPoolExecutor(2)))
@@ -85,7 +87,8 @@ def test_an_estimate_is_a_line_on_stderr(capsys, seconds, cores, said):
 
 
 @pytest.mark.parametrize(
-    "command", ["validity cubesat --samples 2", "montecarlo cubesat u.toml --runs 2 --duration 1"]
+    "command",
+    ["validity cubesat --samples 2", "montecarlo cubesat u.toml --runs 2 --duration 1"],
 )
 def test_commands_print_it_before_they_begin(command, tmp_path, monkeypatch, capsys):
     (tmp_path / "u.toml").write_text("[dispersions]\nq_b = 0.1\n")
@@ -94,4 +97,7 @@ def test_commands_print_it_before_they_begin(command, tmp_path, monkeypatch, cap
     monkeypatch.chdir(tmp_path)
     assert cli.main(command.split()) == 0
     err = capsys.readouterr().err
-    assert err.splitlines()[0] in ("fflin: about 17 min on 1 core", "fflin: about 33 min on 1 core")
+    assert err.splitlines()[0] in (
+        "fflin: about 17 min on 1 core",
+        "fflin: about 33 min on 1 core",
+    )

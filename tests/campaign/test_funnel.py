@@ -46,7 +46,9 @@ def arm(robots):
 
 @pytest.fixture(scope="module")
 def found(arm):
-    return fflin.funnel(*arm, {"attitude": 5.0, "joints": 0.1}, knots=3, samples=16, dt=0.05)
+    return fflin.funnel(
+        *arm, {"attitude": 5.0, "joints": 0.1}, knots=3, samples=16, dt=0.05
+    )
 
 
 def passage(still, schedule, t):
@@ -55,7 +57,9 @@ def passage(still, schedule, t):
 
     def rate(time, e):
         A, B = along.matrices(min(time, DURATION))
-        return ((A - B @ schedule.gain(min(time, DURATION))) @ e.reshape(12, 12)).ravel()
+        return (
+            (A - B @ schedule.gain(min(time, DURATION))) @ e.reshape(12, 12)
+        ).ravel()
 
     way = solve_ivp(rate, (t, DURATION), np.eye(12).ravel(), rtol=1e-9, atol=1e-12)
     return way.y[:, -1].reshape(12, 12)
@@ -88,7 +92,9 @@ def test_of_a_linear_loop_it_is_known(still, schedule):
         assert found.rho[k] < found.tried[k]
         good = (found.outcomes[k] == OUTCOME["within"]).sum()
         share = successes(M, goal, np.sqrt(found.tried[k]), rng).mean()
-        assert abs(good - 120 * share) < 4.0 * np.sqrt(120 * share * (1.0 - share)) + 1.0
+        assert (
+            abs(good - 120 * share) < 4.0 * np.sqrt(120 * share * (1.0 - share)) + 1.0
+        )
     # What is left to lose grows on the way: the linear loop's cost falls.
     assert (np.diff(found.rho) < 0.0).all() and (found.rho > goal).all()
 
@@ -97,25 +103,38 @@ def test_of_a_linear_loop_it_is_known(still, schedule):
 def test_a_narrower_goal_is_a_narrower_funnel(still, schedule):
     wide, narrow = (
         fflin.funnel(still[0], schedule, goal, knots=2, samples=40, dt=0.1)
-        for goal in ({"attitude": 1.0, "position": 0.02}, {"attitude": 0.25, "position": 0.005})
+        for goal in (
+            {"attitude": 1.0, "position": 0.02},
+            {"attitude": 0.25, "position": 0.005},
+        )
     )
     ratio = np.sqrt(wide.rho / narrow.rho)
     assert ((ratio > 2.5) & (ratio < 6.5)).all()  # 4 in a linear loop, but for chance
     kept = fflin.funnel(
-        still[0], schedule, {"attitude": 1.0, "position": 0.02}, within={"omega_b": 1e-4}, knots=2
+        still[0],
+        schedule,
+        {"attitude": 1.0, "position": 0.02},
+        within={"omega_b": 1e-4},
+        knots=2,
     )
     with pytest.raises(fflin.UnknownNameError, match="did you mean omega_b"):
-        fflin.funnel(still[0], schedule, {"attitude": 1.0}, within={"omega": 1e-4}, knots=2)
+        fflin.funnel(
+            still[0], schedule, {"attitude": 1.0}, within={"omega": 1e-4}, knots=2
+        )
     assert (kept.rho < wide.rho).all() and OUTCOME["beyond"] in kept.outcomes
     # The errors of a start count, not only the errors at the end.
     goal = {"attitude": 1.0}
     free, bound = (
-        fflin.funnel(still[0], schedule, goal, within=within, knots=2, samples=40, dt=0.1)
+        fflin.funnel(
+            still[0], schedule, goal, within=within, knots=2, samples=40, dt=0.1
+        )
         for within in (None, goal)
     )
     assert bound.rho[0] < free.rho[0] and OUTCOME["beyond"] not in free.outcomes
     # No motion of its own keeps an arm to a goal that it never comes near.
-    weak = fflin.funnel(still[0], schedule, {"attitude": 1.0}, knots=1, limits=1e-12, samples=8)
+    weak = fflin.funnel(
+        still[0], schedule, {"attitude": 1.0}, knots=1, limits=1e-12, samples=8
+    )
     strong = fflin.funnel(still[0], schedule, {"attitude": 1.0}, knots=1, samples=8)
     assert weak.rho[0] < strong.rho[0]
 
@@ -127,7 +146,9 @@ def test_what_is_sure_is_so_in_as_many_cases_as_it_says(still, schedule):
     size = 2.0 * np.sqrt(goal) / np.linalg.norm(M, 2)
     for _ in range(200):
         z = rng.normal(size=(count, 12))
-        z *= (size * (np.arange(count) + 0.5) / count / np.linalg.norm(z, axis=1))[:, None]
+        z *= (size * (np.arange(count) + 0.5) / count / np.linalg.norm(z, axis=1))[
+            :, None
+        ]
         failed = ((z @ M.T) ** 2).sum(axis=1) > goal
         inside = int(failed.argmax()) if failed.any() else count
         reach = size * (inside - 0.5) / count
@@ -144,7 +165,11 @@ def test_it_is_the_same_whoever_does_it(arm, found):
     told = []
     compiled = fflin.funnel(*arm, goal, **options, engine="compiled")
     for more in (
-        {"threads": 3, "engine": "compiled", "progress": lambda *each: told.append(each)},
+        {
+            "threads": 3,
+            "engine": "compiled",
+            "progress": lambda *each: told.append(each),
+        },
         {"workers": 2, "engine": "compiled"},
         {"engine": "compiled", "threads": 1},
     ):
@@ -171,12 +196,16 @@ def test_a_run_from_a_knot_is_one_of_simulate(arm):
     x = moved_by("local", campaign.x0[None], e[None])[0]
     end = campaign.replay(x - campaign.x0)
     q, v = StateMap(robot, reference=end.reference, frame="local").to_pinocchio(x)
-    error = moving_error(StateMap(robot, frame="local"), *motion.point(motion.t[5])[:2], q, v)
+    error = moving_error(
+        StateMap(robot, frame="local"), *motion.point(motion.t[5])[:2], q, v
+    )
     assert error == pytest.approx(e, abs=1e-12)
     whole = fflin.simulate(robot, policy, dt=0.05)
     rest = campaign.replay(np.zeros(campaign.x0.size))
     apart = pin.difference(robot.model, rest.q[-1], whole.q[-1])
-    assert np.abs(apart).max() < 1e-6 and rest.v[-1] == pytest.approx(whole.v[-1], abs=1e-6)
+    assert np.abs(apart).max() < 1e-6 and rest.v[-1] == pytest.approx(
+        whole.v[-1], abs=1e-6
+    )
 
 
 @pytest.mark.exhaustive
@@ -190,8 +219,13 @@ def test_sizes_and_contains(arm, found):
         e = np.sqrt(found.rho[k]) * z @ np.linalg.inv(np.linalg.cholesky(P))
         assert (e @ P * e).sum(axis=1) == pytest.approx(found.rho[k])
         sines = np.sin(np.radians(found.attitude[k] / 2.0))
-        for reach, part in ((sines.max(), e[:, :3]), (found.position[k].max(), e[:, 3:6])):
-            assert 0.6 * reach < np.linalg.norm(part, axis=1).max() <= reach * (1.0 + 1e-9)
+        for reach, part in (
+            (sines.max(), e[:, :3]),
+            (found.position[k].max(), e[:, 3:6]),
+        ):
+            assert (
+                0.6 * reach < np.linalg.norm(part, axis=1).max() <= reach * (1.0 + 1e-9)
+            )
         assert (np.abs(e[:, 6:9]).max(axis=0) <= found.joints[k] * (1.0 + 1e-9)).all()
         q, v, _ = found.trajectory.point(t)
         chart = StateMap(robot, reference=pin.XYZQUATToSE3(q[:7]), frame="local")
@@ -211,7 +245,9 @@ def test_sizes_and_contains(arm, found):
 
 
 def test_it_prints_saves_and_is_drawn(arm, found, tmp_path):
-    assert max(map(len, str(found).splitlines())) <= 80 and says(str(found), "95 % confidence")
+    assert max(map(len, str(found).splitlines())) <= 80 and says(
+        str(found), "95 % confidence"
+    )
     assert len(found.rate) == 3 and (found.rate[:, 0] <= found.rate[:, 1]).all()
     for ending in ("npz", "json", "mat"):
         found.save(tmp_path / f"a.{ending}")
@@ -231,13 +267,27 @@ def test_command(arm, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     robot, schedule = arm
     schedule.save("gains.npz")
-    given = ("funnel", "planar_detumble", "--schedule", "gains.npz", "--knots", "2", "--samples")
+    given = (
+        "funnel",
+        "planar_detumble",
+        "--schedule",
+        "gains.npz",
+        "--knots",
+        "2",
+        "--samples",
+    )
     kept = ("-o", "f.npz", "--plot", "f.png", "--seed", "3")
     goal = ("--goal", "attitude=5", "--goal", "joints=0.1", "--limits", "none")
     code, out, err = run(*given, "8", *goal, "--dt", "0.05", *kept, "--threads", "2")
     assert code == 0 and not err and out.count("wrote") == 2
     made = fflin.funnel(
-        robot, schedule, {"attitude": 5.0, "joints": 0.1}, knots=2, samples=8, seed=3, dt=0.05
+        robot,
+        schedule,
+        {"attitude": 5.0, "joints": 0.1},
+        knots=2,
+        samples=8,
+        seed=3,
+        dt=0.05,
     )
     assert np.array_equal(fflin.Funnel.load("f.npz", robot).outcomes, made.outcomes)
     assert "goal" in refused(*given, "8")

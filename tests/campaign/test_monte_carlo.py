@@ -38,7 +38,10 @@ START = {"q_b": 0.05, "r_b.x": (-0.1, 0.2), "omega_b": 0.02}
 
 @pytest.fixture(autouse=True)
 def _numba(request):
-    if "engine" in request.fixturenames and request.getfixturevalue("engine") == "compiled":
+    if (
+        "engine" in request.fixturenames
+        and request.getfixturevalue("engine") == "compiled"
+    ):
         pytest.importorskip("numba")
 
 
@@ -91,8 +94,16 @@ def test_wheels_with_inertia_and_their_limits():
     lin = fflin.linearize(robot)
     K = np.zeros((3, lin.A.shape[0]))
     K[:, :3], K[:, 9:12] = -3.0 * np.eye(3), -8.0 * np.eye(3)
-    given = {"q_b": 0.1, "base.mass": 0.1, "base.com": 0.1, "base.inertia": 0.1, "w0.gain": 0.2}
-    lanes = both(robot, fflin.StateFeedback(lin, K), given, limits="urdf", duration=10.0)
+    given = {
+        "q_b": 0.1,
+        "base.mass": 0.1,
+        "base.com": 0.1,
+        "base.inertia": 0.1,
+        "w0.gain": 0.2,
+    }
+    lanes = both(
+        robot, fflin.StateFeedback(lin, K), given, limits="urdf", duration=10.0
+    )
     assert lanes["largest_x"][:, 12:15].max() <= 30.0 + 1e-9
 
 
@@ -116,7 +127,12 @@ def test_bodies_are_their_own_beside_wheels_on_another_branch(robots):
     assert robot.joint_names[-1] == last and robot.joint_names.index("w") < robot.n - 1
     lin = fflin.linearize(robot)
     K = np.random.default_rng(1).normal(size=lin.B.T.shape) * 1e-3
-    given = {"qdot_m.*": 0.1, f"{last}.mass": 0.3, f"{last}.com": 0.3, f"{first}.inertia": 0.2}
+    given = {
+        "qdot_m.*": 0.1,
+        f"{last}.mass": 0.3,
+        f"{last}.com": 0.3,
+        f"{first}.inertia": 0.2,
+    }
     both(robot, fflin.StateFeedback(lin, K), given, duration=0.5)
 
 
@@ -142,11 +158,15 @@ def test_a_compensator_that_feels_acceleration_runs_in_python():
 @pytest.mark.compiled
 def test_along_a_trajectory(robots):
     robot = robots["ets_vii"]
-    slew = fflin.simulate(robot, feedback(robot), q0=robot.neutral(), duration=2.0, dt=0.1)
+    slew = fflin.simulate(
+        robot, feedback(robot), q0=robot.neutral(), duration=2.0, dt=0.1
+    )
     path = fflin.Trajectory(robot, slew.t, slew.q, slew.v, slew.u, frame="hybrid")
     along = fflin.linearize_trajectory(robot, path)
     schedule = fflin.tvlqr(along, *unit_weights(fflin.linearize(robot)))
-    lanes = both(robot, schedule, {"q_b": 0.05, "q_m": 0.1, "*.mass": 0.05}, duration=2.5)
+    lanes = both(
+        robot, schedule, {"q_b": 0.05, "q_m": 0.1, "*.mass": 0.05}, duration=2.5
+    )
     assert (lanes["errors"][:, 0] < lanes["largest"][:, 0]).all()
 
 
@@ -160,9 +180,13 @@ def test_a_run_is_flown_again_to_the_last_bit_and_keeps_its_momentum(robots, eng
         motion = campaign.replay(run)
         assert motion.engine == campaign.engine == engine
         for name in ("q", "v", "u"):
-            assert np.array_equal(getattr(motion, name)[-1], getattr(campaign, name)[run]), name
+            assert np.array_equal(
+                getattr(motion, name)[-1], getattr(campaign, name)[run]
+            ), name
         # The state is read from these by other code.
-        np.testing.assert_allclose(motion.x[-1], campaign.x[run], rtol=1e-13, atol=1e-15)
+        np.testing.assert_allclose(
+            motion.x[-1], campaign.x[run], rtol=1e-13, atol=1e-15
+        )
         assert motion.momentum_drift.max() < 1e-13 and motion.com_drift.max() < 1e-13
     masses = campaign.values("drawn base.mass")
     assert motion.energy[0] > 0.0 and len({*masses}) == 11
@@ -171,7 +195,9 @@ def test_a_run_is_flown_again_to_the_last_bit_and_keeps_its_momentum(robots, eng
     plant, _, q, v = job.dispersions.one(campaign.drawn[10])
     assert plant.robot.mass != robot.mass
     base = plant.robot.model.inertias[1]
-    assert base.mass == pytest.approx(robot.model.inertias[1].mass * (1.0 + masses[10]), rel=1e-14)
+    assert base.mass == pytest.approx(
+        robot.model.inertias[1].mass * (1.0 + masses[10]), rel=1e-14
+    )
     other = fflin.simulate(plant.robot, None, q0=q, v0=v, duration=2.0, dt=0.02)
     assert np.abs(other.q[-1] - campaign.q[10]).max() < 1e-12
 
@@ -182,7 +208,10 @@ def test_a_body_that_is_drawn_is_a_body(robots):
     bodies = job.dispersions.bodies(job.dispersions.drawn(0, 200))
     assert len(bodies) == 8
     for mass, _, inertia in bodies.values():
-        second = 0.5 * np.trace(inertia, axis1=1, axis2=2)[:, None, None] * np.eye(3) - inertia
+        second = (
+            0.5 * np.trace(inertia, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+            - inertia
+        )
         assert (mass > 0.0).all()
         assert np.linalg.eigvalsh(second).min() > 0.0
 
@@ -212,16 +241,27 @@ def test_a_campaign_is_the_same_on_any_workers_and_after_a_kill(tmp_path):
     script.write_text(textwrap.dedent(SCRIPT))
 
     def run(name, workers, after=1000):
-        command = [sys.executable, "-W", "ignore", script, tmp_path / name, workers, after]
+        command = [
+            sys.executable,
+            "-W",
+            "ignore",
+            script,
+            tmp_path / name,
+            workers,
+            after,
+        ]
         return finished(list(map(str, command)), env=os.environ).returncode
 
     for name, workers in (("one.h5", 1), ("two.h5", 2), ("four.h5", 4)):
         assert run(name, workers) == 0
     assert run("killed.h5", 2, 40) == 9
-    assert not (tmp_path / "killed.h5").exists() and (tmp_path / "killed.h5.part").exists()
+    assert (
+        not (tmp_path / "killed.h5").exists() and (tmp_path / "killed.h5.part").exists()
+    )
     assert run("killed.h5", 1) == 0
     one, *others = (
-        fflin.Campaign.load(tmp_path / f"{name}.h5") for name in ("one", "two", "four", "killed")
+        fflin.Campaign.load(tmp_path / f"{name}.h5")
+        for name in ("one", "two", "four", "killed")
     )
     robot = fflin.load("planar_detumble")
     given = {"q_b": 0.05, "*.mass": 0.1, "q_m": (-0.2, 0.2)}
@@ -240,9 +280,16 @@ def test_any_executor_does_it(robots):
     here = fflin.monte_carlo(robot, feedback(robot), {"q_b": 0.05}, **case)
     with ThreadPoolExecutor(2) as executor:
         there = fflin.monte_carlo(
-            robot, feedback(robot), {"q_b": 0.05}, executor=executor, engine=here.engine, **case
+            robot,
+            feedback(robot),
+            {"q_b": 0.05},
+            executor=executor,
+            engine=here.engine,
+            **case,
         )
-    assert all(np.array_equal(getattr(here, name), getattr(there, name)) for name in ARRAYS)
+    assert all(
+        np.array_equal(getattr(here, name), getattr(there, name)) for name in ARRAYS
+    )
     assert np.array_equal(there.replay(19).q[-1], here.q[19])
 
 
@@ -281,7 +328,9 @@ def test_each_kind_of_spread_has_its_distribution(robots):
         "r_b.z": [1.0, 2.0, 4.0],
         "r_b.y": stats.gamma(3.0, scale=0.1),
     }
-    job = CampaignJob(robots["planar_detumble"], None, given, 0, "python", {"duration": 1.0})
+    job = CampaignJob(
+        robots["planar_detumble"], None, given, 0, "python", {"duration": 1.0}
+    )
     of = dict(zip(job.dispersions.names, job.dispersions.drawn(0, 4000).T, strict=True))
     for name, expected in (
         ("q_b.x", stats.norm(0.0, 0.05)),
@@ -332,7 +381,10 @@ def linear_loop():
 @pytest.mark.compiled
 def test_intervals_hold_the_known_answer_as_often_as_they_say():
     robot, policy, row = linear_loop()
-    spread, held = {"r_b.x": 0.2, "v_b.x": 0.1}, {"mean": 0, "half": 0, "most": 0, "share": 0}
+    spread, held = (
+        {"r_b.x": 0.2, "v_b.x": 0.1},
+        {"mean": 0, "half": 0, "most": 0, "share": 0},
+    )
     truth = stats.norm(0.0, float(np.hypot(*(row * [0.2, 0.1]))))
     bound = float(truth.ppf(0.7))
     for seed in range(200):
@@ -343,7 +395,10 @@ def test_intervals_hold_the_known_answer_as_often_as_they_say():
             "mean": (campaign.mean("r_b.x", confidence=0.9), 0.0),
             "half": (campaign.quantile("r_b.x", 0.5, confidence=0.9), 0.0),
             "most": (campaign.quantile("r_b.x", 0.9, confidence=0.9), truth.ppf(0.9)),
-            "share": (campaign.fraction(f"r_b.x < {bound:.17g} m", confidence=0.9), 0.7),
+            "share": (
+                campaign.fraction(f"r_b.x < {bound:.17g} m", confidence=0.9),
+                0.7,
+            ),
         }
         for name, (each, answer) in found.items():
             held[name] += each.low <= answer <= each.high
@@ -405,7 +460,9 @@ def test_it_stops_when_the_interval_is_narrow_enough(robots, tmp_path):
 @pytest.fixture(scope="module")
 def campaign(robots):
     robot = robots["ets_vii"]
-    return fflin.monte_carlo(robot, feedback(robot), START, runs=40, duration=6.0, dt=0.02)
+    return fflin.monte_carlo(
+        robot, feedback(robot), START, runs=40, duration=6.0, dt=0.02
+    )
 
 
 @pytest.mark.compiled
@@ -415,7 +472,11 @@ def test_it_is_saved_and_loaded_to_the_last_bit(campaign, ending, tmp_path):
         pytest.importorskip("h5py")
     campaign.save(tmp_path / f"runs{ending}")
     again = fflin.Campaign.load(tmp_path / f"runs{ending}")
-    assert (again.names, again.asked, again.judged) == (campaign.names, 40, campaign.judged)
+    assert (again.names, again.asked, again.judged) == (
+        campaign.names,
+        40,
+        campaign.judged,
+    )
     for name in ARRAYS:
         assert np.array_equal(getattr(again, name), getattr(campaign, name))
     assert str(again) == str(campaign)
@@ -432,7 +493,10 @@ def test_its_tables_have_every_figure_with_its_unit(tmp_path):
     robot = fflin.load("planar_detumble")
     lin = fflin.linearize(robot)
     policy = fflin.StateFeedback(lin, fflin.lqr(lin).K)
-    given, options = {"q_b": 0.02}, {"runs": 3, "duration": 0.2, "dt": 0.05, "engine": "python"}
+    given, options = (
+        {"q_b": 0.02},
+        {"runs": 3, "duration": 0.2, "dt": 0.05, "engine": "python"},
+    )
     campaign = fflin.monte_carlo(robot, policy, given, **options)
     for ending in ("csv", "mat"):
         campaign.save(tmp_path / f"runs.{ending}")
@@ -444,7 +508,11 @@ def test_its_tables_have_every_figure_with_its_unit(tmp_path):
     values = np.array(rows, dtype=float)
     np.testing.assert_array_equal(saved["runs"], values)
     columns = dict(zip(names, values.T, strict=True))
-    shown = {"attitude [deg]": "attitude", "settle joints [s]": "settle joints", "end [s]": "end"}
+    shown = {
+        "attitude [deg]": "attitude",
+        "settle joints [s]": "settle joints",
+        "end [s]": "end",
+    }
     shown |= {"worst tau_b.x [N m]": "worst tau_b.x", "omega_b.z [rad/s]": "omega_b.z"}
     shown |= {f"drawn {name}": f"drawn {name}" for name in campaign.names}
     for column, name in shown.items():
@@ -478,7 +546,9 @@ def test_histories_are_those_of_the_motions(robots, engine, tmp_path):
         motion = campaign.replay(run)
         rows = np.arange(0, len(motion.t), 25)
         errors, inputs = campaign.error_history[run], campaign.input_history[run]
-        assert errors[: len(rows), 0] == pytest.approx(motion.attitude_error[rows], abs=1e-12)
+        assert errors[: len(rows), 0] == pytest.approx(
+            motion.attitude_error[rows], abs=1e-12
+        )
         sizes = np.abs(motion.error[rows, 3:6]).max(axis=1)
         assert errors[: len(rows), 1] == pytest.approx(sizes, abs=1e-12)
         assert np.array_equal(inputs[: len(rows)], motion.u[rows])
@@ -490,11 +560,15 @@ def test_goals_are_told_and_say_what_the_worst_is(robots):
     robot = robots["ets_vii"]
     goals = ["position < 1 mm and settle < 5 s", "attitude > 0 deg"]
     case = {"runs": 30, "duration": 6.0, "dt": 0.02, "goals": goals, "confidence": 0.9}
-    campaign = fflin.monte_carlo(robot, feedback(robot), START, until="attitude < 2 deg", **case)
+    campaign = fflin.monte_carlo(
+        robot, feedback(robot), START, until="attitude < 2 deg", **case
+    )
     of = ["position", "settle", "attitude", "worst attitude", "worst position"]
     assert [*influences(campaign)] == of
     assert "rank correlations with position: " in str(campaign)
-    assert campaign.goals == (*goals, "attitude < 2 deg") and campaign.about == "position"
+    assert (
+        campaign.goals == (*goals, "attitude < 2 deg") and campaign.about == "position"
+    )
     assert campaign.worst(1) == [int(campaign.values("position").argmax())]
     share = campaign.fraction("attitude < 2 deg", confidence=0.9)
     assert f"attitude < 2 deg: {100 * share.value:.4g} % (" in str(campaign)
@@ -505,10 +579,15 @@ def test_goals_are_told_and_say_what_the_worst_is(robots):
 def test_figures_are_those_of_the_motions(campaign):
     run = campaign.worst(1)[0]
     motion = campaign.replay(run)
-    of = {name: campaign.values(name)[run] for name in ("attitude", "worst attitude", "position")}
+    of = {
+        name: campaign.values(name)[run]
+        for name in ("attitude", "worst attitude", "position")
+    }
     assert of["attitude"] == pytest.approx(motion.attitude_error[-1], rel=1e-14)
     assert of["worst attitude"] == pytest.approx(motion.attitude_error.max(), rel=1e-12)
-    assert of["position"] == pytest.approx(np.abs(motion.error[-1, 3:6]).max(), rel=1e-12)
+    assert of["position"] == pytest.approx(
+        np.abs(motion.error[-1, 3:6]).max(), rel=1e-12
+    )
     assert campaign.values("worst tau_b.x")[run] == np.abs(motion.u[:, 0]).max()
     assert campaign.values("worst attitude").max() == of["worst attitude"]
 
@@ -517,7 +596,12 @@ def test_figures_are_those_of_the_motions(campaign):
 def test_the_time_to_settle_is_that_of_the_motions_table(robots):
     robot = robots["planar_detumble"]
     campaign = fflin.monte_carlo(
-        robot, feedback(robot), {"q_b": 0.05, "r_b": 0.1}, runs=3, duration=60.0, dt=0.05
+        robot,
+        feedback(robot),
+        {"q_b": 0.05, "r_b": 0.1},
+        runs=3,
+        duration=60.0,
+        dt=0.05,
     )
     for run in range(3):
         motion = campaign.replay(run)
@@ -528,9 +612,15 @@ def test_the_time_to_settle_is_that_of_the_motions_table(robots):
             when = np.inf if course.settled is None else course.settled
             found = campaign.values(f"settle {title}")[run]
             assert found == pytest.approx(when, rel=1e-12), title
-    for former, name in (("turning", "omega_b"), ("moving", "v_b"), ("rates", "joint rates")):
+    for former, name in (
+        ("turning", "omega_b"),
+        ("moving", "v_b"),
+        ("rates", "joint rates"),
+    ):
         for of in ("", "worst ", "settle "):
-            assert np.array_equal(campaign.values(of + former), campaign.values(of + name))
+            assert np.array_equal(
+                campaign.values(of + former), campaign.values(of + name)
+            )
         assert campaign.met(f"worst {former} < 1").all()
     assert np.isfinite(campaign.values("settle")).any()
 
@@ -547,10 +637,13 @@ def test_conditions(campaign):
     degrees = campaign.values("attitude")
     assert np.array_equal(campaign.met("attitude < 1 deg"), degrees < 1.0)
     assert np.array_equal(campaign.met("attitude<0.01 rad"), np.radians(degrees) < 0.01)
-    assert np.array_equal(campaign.met("position <= 3 mm"), campaign.values("position") <= 3e-3)
+    assert np.array_equal(
+        campaign.met("position <= 3 mm"), campaign.values("position") <= 3e-3
+    )
     two = campaign.met("worst q_b.x > 0.05 and drawn r_b.x >= 0")
     assert np.array_equal(
-        two, (campaign.values("worst q_b.x") > 0.05) & (campaign.values("drawn r_b.x") >= 0)
+        two,
+        (campaign.values("worst q_b.x") > 0.05) & (campaign.values("drawn r_b.x") >= 0),
     )
     assert campaign.fraction(two).value == two.mean()
     for text, said in (
@@ -604,7 +697,9 @@ def test_bad_input_is_one_line(robots, case, said, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     options = {"given": {"q_b": 0.01}, "runs": 100, "duration": 0.1} | case
     with pytest.raises(fflin.FflinError, match=said) as caught:
-        fflin.monte_carlo(robots["planar_detumble"], None, options.pop("given"), **options)
+        fflin.monte_carlo(
+            robots["planar_detumble"], None, options.pop("given"), **options
+        )
     assert "\n" not in str(caught.value)
     assert not list(tmp_path.iterdir())
 
@@ -612,7 +707,11 @@ def test_bad_input_is_one_line(robots, case, said, tmp_path, monkeypatch):
 def test_a_policy_in_python_runs_in_python(robots):
     robot = robots["planar_detumble"]
     campaign = fflin.monte_carlo(
-        robot, lambda t, q, v: -0.5 * np.ones(6 + robot.n), {"q_b": 0.01}, runs=3, duration=0.1
+        robot,
+        lambda t, q, v: -0.5 * np.ones(6 + robot.n),
+        {"q_b": 0.01},
+        runs=3,
+        duration=0.1,
     )
     assert campaign.engine == "python" and campaign.largest_u.max() == 0.5
 
@@ -623,7 +722,12 @@ def test_what_cannot_be_sent_to_workers_is_named(robots):
 
     with pytest.raises(fflin.InputError, match="nothing"):
         fflin.monte_carlo(
-            robots["planar_detumble"], nothing, {"q_b": 0.01}, runs=2, duration=0.1, workers=1
+            robots["planar_detumble"],
+            nothing,
+            {"q_b": 0.01},
+            runs=2,
+            duration=0.1,
+            workers=1,
         )
 
 
@@ -631,7 +735,9 @@ def test_what_cannot_be_sent_to_workers_is_named(robots):
 def test_what_is_kept_does_not_grow_with_the_duration(robots):
     robot = robots["planar_detumble"]
     short, long = (
-        fflin.monte_carlo(robot, None, {"q_b": 0.01}, runs=2, duration=duration, dt=0.01)
+        fflin.monte_carlo(
+            robot, None, {"q_b": 0.01}, runs=2, duration=duration, dt=0.01
+        )
         for duration in (0.1, 3.0)
     )
     for name in ARRAYS:
@@ -654,7 +760,9 @@ def test_warnings_are_given_once(robots):
     robot = robots["ets_vii"]
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        fflin.monte_carlo(robot, feedback(robot), START, runs=20, duration=0.1, limits=1e-9)
+        fflin.monte_carlo(
+            robot, feedback(robot), START, runs=20, duration=0.1, limits=1e-9
+        )
     assert len([str(each.message) for each in caught]) <= 1
 
 
@@ -670,10 +778,12 @@ def test_a_mean_with_what_never_settled_is_refused(robots):
     with pytest.raises(fflin.InputError, match="times"):
         fflin.monte_carlo(robot, policy, {"tau_b.x.fails": 3.0}, runs=1, duration=1.0)
     noisy = {"q_b": 0.05, "q_b.x.noise": 1e-4}
-    found = fflin.monte_carlo(robot, policy, noisy, runs=8, duration=1.0, dt=0.05, sample=0.05)
-    assert "noise" in found.names and {key.strip("|") for key in found.sensitivity()} == {
-        *("q_b.x", "q_b.y", "q_b.z", "q_b.x.noise")
-    }
+    found = fflin.monte_carlo(
+        robot, policy, noisy, runs=8, duration=1.0, dt=0.05, sample=0.05
+    )
+    assert "noise" in found.names and {
+        key.strip("|") for key in found.sensitivity()
+    } == {*("q_b.x", "q_b.y", "q_b.z", "q_b.x.noise")}
 
 
 @pytest.mark.compiled
@@ -686,19 +796,31 @@ def test_runs_that_a_file_has_are_not_flown_again(robots, tmp_path, monkeypatch)
     with monkeypatch.context() as patch:
         patch.setattr("fflin.campaign.monte_carlo.run_chunks", None)
         goals = ["attitude < 1 deg"]
-        after = fflin.monte_carlo(robot, policy, {"q_b": 0.05}, runs=16, goals=goals, **options)
+        after = fflin.monte_carlo(
+            robot, policy, {"q_b": 0.05}, runs=16, goals=goals, **options
+        )
         assert after.goals == tuple(goals) and (after.x == before.x).all()
         assert (after.replay(3).x[-1] == before.x[3]).all()
 
 
 @pytest.mark.parametrize("ending", [".h5", ".npz"])
-def test_a_file_of_anything_else_is_replaced_only_on_request(ending, robots, tmp_path, monkeypatch):
+def test_a_file_of_anything_else_is_replaced_only_on_request(
+    ending, robots, tmp_path, monkeypatch
+):
     pytest.importorskip("h5py")
     path = tmp_path / f"c{ending}"
 
     def fly(**changes):
-        options = {"runs": 2, "duration": 0.1, "engine": "python", "out": path, **changes}
-        return fflin.monte_carlo(robots["planar_detumble"], None, {"omega_b": 0.1}, **options)
+        options = {
+            "runs": 2,
+            "duration": 0.1,
+            "engine": "python",
+            "out": path,
+            **changes,
+        }
+        return fflin.monte_carlo(
+            robots["planar_detumble"], None, {"omega_b": 0.1}, **options
+        )
 
     np.savez(tmp_path / "other.npz", x=1.0)
     foreign = b"notes", (tmp_path / "other.npz").read_bytes()
@@ -713,7 +835,12 @@ def test_a_file_of_anything_else_is_replaced_only_on_request(ending, robots, tmp
         assert path.read_bytes() == content and len(list(tmp_path.iterdir())) == 2
     first = fly(overwrite=True)
     before = path.read_bytes()
-    for changes in ({"seed": 1}, {"runs": 3}, {"duration": 0.2}, {"until": "end > 0", "seed": 1}):
+    for changes in (
+        {"seed": 1},
+        {"runs": 3},
+        {"duration": 0.2},
+        {"until": "end > 0", "seed": 1},
+    ):
         with (
             pytest.raises(fflin.FileError, match="was not written by this call"),
             monkeypatch.context() as no,
@@ -738,7 +865,13 @@ def test_a_file_of_another_policy_or_robot_is_refused_before_compiling(
     K, path = fflin.lqr(lin).K, tmp_path / "c.h5"
 
     def fly(gain=1.0, robot=robot, **changes):
-        options = {"runs": 8, "duration": 0.2, "dt": 0.02, "engine": "compiled", "out": path}
+        options = {
+            "runs": 8,
+            "duration": 0.2,
+            "dt": 0.02,
+            "engine": "compiled",
+            "out": path,
+        }
         policy = fflin.StateFeedback(lin, gain * K)
         return fflin.monte_carlo(robot, policy, {"q_b": 0.05}, **options | changes)
 
@@ -778,7 +911,8 @@ def test_what_no_input_pushes_is_judged_in_no_campaign_either():
     assert row.endswith(" not yet")
     late = replace(runs, settle=np.full_like(runs.settle, np.inf))
     assert not any(
-        "inf" in line.split() for line in [*str(late).splitlines(), *worst_runs(late, 2)]
+        "inf" in line.split()
+        for line in [*str(late).splitlines(), *worst_runs(late, 2)]
     )
     assert " not yet " in worst_runs(late, 1)[1]
 
@@ -813,7 +947,13 @@ def test_the_table_shows_wheels_and_leaves_out_what_is_always_zero():
 def test_what_an_earlier_call_has_written_is_told(tmp_path):
     pytest.importorskip("h5py")
     robot = fflin.load("planar_detumble")
-    call = {"runs": 4, "duration": 0.1, "dt": 0.05, "engine": "python", "out": tmp_path / "a.h5"}
+    call = {
+        "runs": 4,
+        "duration": 0.1,
+        "dt": 0.05,
+        "engine": "python",
+        "out": tmp_path / "a.h5",
+    }
     first = fflin.monte_carlo(robot, None, {"q_b": 0.02}, **call)
     again = fflin.monte_carlo(robot, None, {"q_b": 0.02}, **call)
     assert again.notes[: len(first.notes)] == first.notes
@@ -847,4 +987,7 @@ def test_a_resumed_campaign_says_how_many_runs_it_keeps(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         fflin.monte_carlo(robot, None, {"q_b": 0.02}, progress=stop, **call)
     campaign = fflin.monte_carlo(robot, None, {"q_b": 0.02}, **call)
-    assert campaign.notes[-1] == "8 of 24 runs are from the unfinished file of an earlier call"
+    assert (
+        campaign.notes[-1]
+        == "8 of 24 runs are from the unfinished file of an earlier call"
+    )

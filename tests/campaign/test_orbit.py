@@ -19,7 +19,9 @@ def test_a_campaign_flies_as_simulate_does(regulated):
     robot, lin, gain = regulated
     policy = fflin.StateFeedback(lin, gain.K)
     dispersions = {"q_b": 0.05, "base.mass": 0.1}
-    flown = fflin.monte_carlo(robot, policy, dispersions, runs=3, duration=0.5, engine="python")
+    flown = fflin.monte_carlo(
+        robot, policy, dispersions, runs=3, duration=0.5, engine="python"
+    )
     motion = flown.replay(1)
     assert motion.orbit == robot.orbit and motion.frame == "lvlh"
     assert motion.momentum_drift.max() < 1e-6
@@ -48,7 +50,9 @@ def test_refused(regulated):
     there = fflin.linearize(free)
     policy = fflin.StateFeedback(there, fflin.lqr(there).K)
     with pytest.raises(fflin.InputError, match="compiled"):
-        fflin.monte_carlo(robot, None, {"q_b": 0.1}, runs=2, duration=0.1, engine="compiled")
+        fflin.monte_carlo(
+            robot, None, {"q_b": 0.1}, runs=2, duration=0.1, engine="compiled"
+        )
     for refused in (
         lambda: fflin.funnel(robot, schedule, goal={"attitude": 1.0}),
         lambda: fflin.simulate(robot, schedule),
@@ -67,7 +71,9 @@ def test_refused(regulated):
 def test_a_capture_stays_in_orbit():
     robot = in_orbit(fflin.load("cubesat", inputs=fflin.load_inputs("cubesat")))
     body = fflin.from_model(fflin.load("cubesat").model)
-    caught = fflin.capture(robot, "base", pin.Inertia(1.0, np.zeros(3), 0.01 * np.eye(3)))
+    caught = fflin.capture(
+        robot, "base", pin.Inertia(1.0, np.zeros(3), 0.01 * np.eye(3))
+    )
     assert robot.wheels and caught.robot.orbit == robot.orbit
     with pytest.raises(fflin.InputError, match="orbit"):
         fflin.capture(robot, "base", body)

@@ -59,19 +59,31 @@ def test_bands_hold_their_share_of_the_runs_and_the_worst_are_on_top(campaign):
 def test_goals_limits_and_histograms(campaign):
     figure = fflin.plot_campaign(campaign)
     goal = "goal or limit"
-    bounds = [x for x in of(figure, "attitude error").get_lines() if x.get_label() == goal]
+    bounds = [
+        x for x in of(figure, "attitude error").get_lines() if x.get_label() == goal
+    ]
     assert [x.get_ydata()[0] for x in bounds] == [3.0]
-    limits = [x for x in of(figure, "largest |F_b|").get_lines() if x.get_label() == goal]
+    limits = [
+        x for x in of(figure, "largest |F_b|").get_lines() if x.get_label() == goal
+    ]
     assert [x.get_ydata()[0] for x in limits] == [0.5]
-    assert not [x for x in of(figure, "largest |tau_b|").get_lines() if x.get_label() == goal]
+    assert not [
+        x for x in of(figure, "largest |tau_b|").get_lines() if x.get_label() == goal
+    ]
     [position] = [x for x in figure.axes if x.get_xlabel() == "position error [m]"]
-    assert [x.get_xdata()[0] for x in position.get_lines() if x.get_label() == goal] == [1.0]
-    counts = [int(sum(bar.get_height() for bar in bars)) for bars in position.containers]
+    assert [
+        x.get_xdata()[0] for x in position.get_lines() if x.get_label() == goal
+    ] == [1.0]
+    counts = [
+        int(sum(bar.get_height() for bar in bars)) for bars in position.containers
+    ]
     assert counts == [int((~campaign.stopped).sum())] * 2
     bars = of(figure, "correlation with attitude").containers[0]
     sizes = sorted(campaign.sensitivity().values(), key=abs)
     assert [bar.get_width() for bar in bars] == sizes[-10:]
-    assert "% confidence" in figure.get_suptitle() and "diverged" in figure.get_suptitle()
+    assert (
+        "% confidence" in figure.get_suptitle() and "diverged" in figure.get_suptitle()
+    )
 
 
 @pytest.mark.exhaustive

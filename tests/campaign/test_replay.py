@@ -105,12 +105,16 @@ def test_a_run_on_oblique_axes_is_repeated_bit_for_bit(oblique, engine, runs):
     if engine == "compiled":
         pytest.importorskip("numba")
     robot, policy = oblique
-    campaign = fflin.monte_carlo(robot, policy, SPREADS, runs=runs, engine=engine, **OPTIONS)
+    campaign = fflin.monte_carlo(
+        robot, policy, SPREADS, runs=runs, engine=engine, **OPTIONS
+    )
     assert campaign.engine == engine
     for run in (0, runs - 1):
         motion = campaign.replay(run)
         for name in ("q", "v", "u"):
-            assert np.array_equal(getattr(motion, name)[-1], getattr(campaign, name)[run]), name
+            assert np.array_equal(
+                getattr(motion, name)[-1], getattr(campaign, name)[run]
+            ), name
 
 
 def _pushed(t, q, v):
@@ -143,7 +147,9 @@ def test_a_run_of_a_file_is_repeated_bit_for_bit(oblique, tmp_path):
 
 def test_runs_of_another_robot_are_not_repeated(oblique, tmp_path):
     robot, policy = oblique
-    made = fflin.monte_carlo(robot, policy, {"q_b": 0.01}, runs=1, engine="python", **OPTIONS)
+    made = fflin.monte_carlo(
+        robot, policy, {"q_b": 0.01}, runs=1, engine="python", **OPTIONS
+    )
     made.save(tmp_path / "runs.npz")
     loaded = fflin.Campaign.load(tmp_path / "runs.npz")
     with pytest.raises(fflin.InputError, match="another URDF"):
@@ -179,5 +185,7 @@ def test_a_policy_with_memory_starts_each_run_anew(resets):
     expected = fflin.simulate(robot, Remembering(resets), **options)
     for run in range(3):
         motion = flown.replay(run)
-        assert np.array_equal(motion.u, expected.u) and np.array_equal(motion.v, expected.v)
+        assert np.array_equal(motion.u, expected.u) and np.array_equal(
+            motion.v, expected.v
+        )
     assert np.ptp(flown.values("worst tau_b.x")) == 0.0

@@ -14,7 +14,12 @@ from fflin.campaign.runs import (
     RunStatistics,
     kinds_of,
 )
-from fflin.dynamics.coordinates import attitude_errors, moving_errors, states_of, unwound
+from fflin.dynamics.coordinates import (
+    attitude_errors,
+    moving_errors,
+    states_of,
+    unwound,
+)
 from fflin.kernel.loop import take
 from fflin.kernel.tree import LANES
 from fflin.simulation.report import DWELL, SETTLED, THERE
@@ -29,7 +34,9 @@ FRAMES = ["hybrid", "local", "world"]
 def turning(tmp_path):
     path = tmp_path / "turning.urdf"
     mimic = '<mimic joint="b" multiplier="-0.7" offset="0.2"/>'
-    text = MIMIC.format(links=LINKS, a="prismatic", b="continuous", parent="base", mimic=mimic)
+    text = MIMIC.format(
+        links=LINKS, a="prismatic", b="continuous", parent="base", mimic=mimic
+    )
     path.write_text(text)
     return fflin.load(path)
 
@@ -50,10 +57,14 @@ def arm(_):
 def rows_of(state, rng, inputs):
     """Return rows (steps, lanes, ..) of q, nu and u that turn far and come to rest, each so far."""
     robot = state.robot
-    fade = np.exp(-rng.uniform(1.0, 90.0, LANES) * np.linspace(0.0, 1.0, STEPS)[:, None])
+    fade = np.exp(
+        -rng.uniform(1.0, 90.0, LANES) * np.linspace(0.0, 1.0, STEPS)[:, None]
+    )
     nu = fade[..., None] * rng.normal(size=(STEPS, LANES, 6 + robot.n))
     v = state.spread(nu).reshape(-1, robot.nv)
-    q = np.array([pin.integrate(robot.model, robot.neutral(), 2.0 * each) for each in v])
+    q = np.array(
+        [pin.integrate(robot.model, robot.neutral(), 2.0 * each) for each in v]
+    )
     q[rng.random(len(q)) < 0.5, 3:7] *= -1.0  # the same attitude
     for row in q:
         robot.follow(row)
@@ -63,14 +74,18 @@ def rows_of(state, rng, inputs):
 def defined(job, target, q, nu, u, stop):
     """The outcome of a run by the definitions, from all its rows at once."""
     state, dt = job.plant.state, job.plan.times.dt
-    x = unwound(state, states_of(state, q, nu), target if target.ndim == 1 else target[0])
+    x = unwound(
+        state, states_of(state, q, nu), target if target.ndim == 1 else target[0]
+    )
     e = x - target
     if target.ndim == 2:
         e = unwound(state, moving_errors(state.frame, x, target))
     kind = kinds_of(state, state.robot.wheels)
     signed = e.copy()
     e[:, kind < 0] = 0.0
-    sizes = [np.abs(e[:, kind == k]).max(axis=1, initial=0.0) for k in range(len(KINDS))]
+    sizes = [
+        np.abs(e[:, kind == k]).max(axis=1, initial=0.0) for k in range(len(KINDS))
+    ]
     sizes = np.column_stack([attitude_errors(x, target), *sizes[1:]])
     largest = sizes.max(axis=0)
     outside = sizes > np.maximum(SETTLED * largest, THERE)
@@ -92,7 +107,12 @@ def test_statistics_of_a_run_in_python_are_those_of_the_definition(tmp_path):
         (turning, wheeled, flexible), FRAMES, (False, True)
     ):
         robot, rng = made(tmp_path), np.random.default_rng(3)
-        options = {"duration": 0.01 * (STEPS - 1), "dt": 0.01, "frame": frame, "histories": 11}
+        options = {
+            "duration": 0.01 * (STEPS - 1),
+            "dt": 0.01,
+            "frame": frame,
+            "histories": 11,
+        }
         job = CampaignJob(robot, None, {"q_b.x": 0.01}, 0, "python", options)
         state, target = job.plant.state, job.target
         q, nu, u = (each[:, 0] for each in rows_of(state, rng, len(job.plan.initial)))
@@ -104,7 +124,10 @@ def test_statistics_of_a_run_in_python_are_those_of_the_definition(tmp_path):
         rest = [np.zeros((STEPS, size)) for size in (6, 3)]
         t, v = job.plan.times.dt * np.arange(STEPS), state.spread(nu)
         run = Recording(t, q, v, u, *rest, STEPS - 1, "", "python")
-        job.target, job.path = target, [each.ravel() for each in star] if follows else []
+        job.target, job.path = (
+            target,
+            [each.ravel() for each in star] if follows else [],
+        )
         outcome = job.outcome(run)
         for name, expected in defined(job, target, q, nu, u, 0.0).items():
             np.testing.assert_allclose(
@@ -134,11 +157,14 @@ def test_statistics_of_a_run_in_python_are_those_of_the_definition(tmp_path):
 
 def test_errors_settle_within_a_fiftieth_of_the_largest_or_within_the_tolerance():
     robot = free_body((20.0, 30.0, 40.0))
-    job = CampaignJob(robot, None, {"q_b.x": 0.01}, 0, "python", {"duration": 0.05, "dt": 0.01})
+    job = CampaignJob(
+        robot, None, {"q_b.x": 0.01}, 0, "python", {"duration": 0.05, "dt": 0.01}
+    )
     marks, nu = as_lists(RunStatistics(job)._marks), np.zeros((6, 6))
     q = np.tile(robot.neutral(), (6, 1))
     q[:, 1] = (-1.0, 0.5, 0.03, 0.01, -0.021, 0.019)
-    nu[:, 2] = (4e-9, 2e-9, 1.1e-9, 0.9e-9, 0.5e-9, 0.9e-9)  # more than a fiftieth of 4e-9
+    # more than a fiftieth of 4e-9
+    nu[:, 2] = (4e-9, 2e-9, 1.1e-9, 0.9e-9, 0.5e-9, 0.9e-9)
     nu[:, 4] = 0.9 * THERE
     take(marks, np.hstack((q, nu, np.zeros((6, 6 + 9)))).ravel().tolist(), 0, 6)
     last = dict(zip(KINDS, marks.outside, strict=True))
@@ -163,7 +189,12 @@ def test_marks_of_lanes_are_those_of_the_definition(tmp_path, made, frame, follo
     pytest.importorskip("numba")
     robot, rng = made(tmp_path), np.random.default_rng(7)
     turn = pin.Quaternion(0.5, -0.1, 0.7, 0.3).normalized()
-    options = {"duration": 0.01 * (STEPS - 1), "dt": 0.01, "frame": frame, "histories": 11}
+    options = {
+        "duration": 0.01 * (STEPS - 1),
+        "dt": 0.01,
+        "frame": frame,
+        "histories": 11,
+    }
     options["reference"] = pin.SE3(turn, np.array((1.0, -2.0, 0.5)))
     q0 = pin.integrate(robot.model, robot.neutral(), 0.3 * rng.normal(size=robot.nv))
     robot.follow(q0)
@@ -175,7 +206,9 @@ def test_marks_of_lanes_are_those_of_the_definition(tmp_path, made, frame, follo
         star = [each[:, 0] for each in rows_of(state, rng, 0)[:2]]
         home = states_of(state, *star)
         job.target, job.path = home, [each.ravel() for each in star]
-    rows = np.concatenate((q, nu, u, np.zeros((STEPS, LANES, 9))), axis=2).transpose(0, 2, 1)
+    rows = np.concatenate((q, nu, u, np.zeros((STEPS, LANES, 9))), axis=2).transpose(
+        0, 2, 1
+    )
     stop, ends = np.arange(LANES) % 3.0, []
     for cuts in ([0, STEPS], [0, 1, 33, STEPS]):
         lanes = RunStatistics(job)
@@ -192,15 +225,21 @@ def test_marks_of_lanes_are_those_of_the_definition(tmp_path, made, frame, follo
             expected = np.array([each[name] for each in plain])
             found = ends[-1][name]
             assert found.shape == expected.shape
-            np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-10, err_msg=name)
-    assert np.isfinite(ends[0]["settle"]).any() and (ends[0]["largest"][:, :2] > 0.1).all()
+            np.testing.assert_allclose(
+                found, expected, rtol=1e-12, atol=1e-10, err_msg=name
+            )
+    assert (
+        np.isfinite(ends[0]["settle"]).any() and (ends[0]["largest"][:, :2] > 0.1).all()
+    )
     for name, one in ends[0].items():
         assert np.array_equal(one, ends[1][name])
 
 
 def halved(first, e):
     """Whether the position error has fallen to half of the one at the start."""
-    return np.linalg.norm(e[:, 3:6], axis=1) <= 0.5 * np.linalg.norm(first[:, 3:6], axis=1)
+    return np.linalg.norm(e[:, 3:6], axis=1) <= 0.5 * np.linalg.norm(
+        first[:, 3:6], axis=1
+    )
 
 
 @pytest.mark.compiled
@@ -212,7 +251,10 @@ def test_a_stop_condition_ends_each_run_where_it_is_first_looked_at_and_met(engi
     lin = fflin.linearize(robot)
     inputs = {"tau_b": 1e6, "F_b.x": 1.0, "F_b.y": 100.0, "F_b.z": 1e4}
     gain = fflin.lqr(lin, 1.0, inputs)
-    policy, options = fflin.StateFeedback(lin, gain.K), {"duration": 80.0, "dt": 0.05, "every": 1}
+    policy, options = (
+        fflin.StateFeedback(lin, gain.K),
+        {"duration": 80.0, "dt": 0.05, "every": 1},
+    )
     starts = np.zeros((10, len(lin.x0)))
     starts[:9, 3:6] = 0.2 * np.eye(3).repeat(3, axis=0) + 0.01 * np.arange(9)[:, None]
     starts[9, 5] = 1e-3

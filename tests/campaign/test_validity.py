@@ -121,7 +121,8 @@ def test_a_comparison_with_the_linear_loop_ends_at_half_a_turn(robots, predicts)
     lin, gain = held(robots["cubesat"])
     loop = Loop(robots["cubesat"], lin, gain.K)
     x = lin.x0.copy()
-    x[0], x[6] = np.sin(np.radians(85.0)), 2.0  # half of 170 deg, and a rate [rad/s] away from 0
+    # half of 170 deg, and a rate [rad/s] away from 0
+    x[0], x[6] = np.sin(np.radians(85.0)), 2.0
     job = loop.runs(predicts, None, 0.0, "python")
     stopped = go(job.plan_of(x - lin.x0)).stopped
     assert stopped.startswith("left the chart at t = ")
@@ -192,7 +193,9 @@ def test_a_run_that_ends_unsettled_may_settle_later_or_never():
         robot="cubesat",
         frame="hybrid",
     )
-    assert "; 2 did not settle in the allowed time, 1 diverged" in " ".join(str(found).split())
+    assert "; 2 did not settle in the allowed time, 1 diverged" in " ".join(
+        str(found).split()
+    )
 
 
 @pytest.mark.compiled
@@ -205,10 +208,16 @@ def test_what_the_counts_say(robots):
     assert failed and found.inside == failed[0] > 0
     assert found.settled == 16 - len(failed)
     level = found.sampled[found.inside - 1]
-    assert found.holds == {"attitude": 174.0 * level, "position": 0.5 * level, "joint": level}
+    assert found.holds == {
+        "attitude": 174.0 * level,
+        "position": 0.5 * level,
+        "joint": level,
+    }
     assert found.inside_rate == pytest.approx(0.05 ** (1.0 / found.inside))
     assert says(str(found), f"{found.inside} of {found.inside}")
-    near = fflin.validity(robot, lin, gain, attitude=30.0, position=0.5, joint=0.3, samples=4)
+    near = fflin.validity(
+        robot, lin, gain, attitude=30.0, position=0.5, joint=0.3, samples=4
+    )
     assert near.settled == 4
 
 
@@ -217,16 +226,21 @@ def test_what_the_counts_say(robots):
 def test_both_engines_say_the_same(robots, name):
     pytest.importorskip("numba")
     lin, gain = held(robots[name], dt=0.5 * (name == "cubesat"))
-    if name == "planar_detumble":  # whose light joints have a pole at -160 by the other weights
+    # whose light joints have a pole at -160 by the other weights
+    if name == "planar_detumble":
         gain = fflin.lqr(lin)
     options = {"attitude": 170.0, "samples": 9, "seed": 5}
     one, two = (
         fflin.validity(robots[name], lin, gain, engine=engine, **options)
         for engine in ("python", "compiled")
     )
-    assert one.outcomes == two.outcomes and one.slope == pytest.approx(two.slope, abs=1e-6)
+    assert one.outcomes == two.outcomes and one.slope == pytest.approx(
+        two.slope, abs=1e-6
+    )
     near = slice(0, 5)  # where nothing is near the edge of the chart
-    assert one.prediction_error[near] == pytest.approx(two.prediction_error[near], rel=1e-6)
+    assert one.prediction_error[near] == pytest.approx(
+        two.prediction_error[near], rel=1e-6
+    )
 
 
 def test_a_linear_loop_is_foreseen_to_rounding_and_settles_when_it_says(robots):
@@ -277,7 +291,9 @@ def test_poles_too_far_apart_are_refused(robots):
 def test_interval_is_clopper_and_pearsons():
     for successes, count in ((0, 10), (3, 10), (10, 10), (97, 100)):
         for confidence in (0.9, 0.99):
-            exact = binomtest(successes, count).proportion_ci(confidence, method="exact")
+            exact = binomtest(successes, count).proportion_ci(
+                confidence, method="exact"
+            )
             found = clopper_pearson(successes, count, confidence)[1:]
             assert found == pytest.approx((exact.low, exact.high), rel=1e-9)
 
@@ -285,7 +301,9 @@ def test_interval_is_clopper_and_pearsons():
 @pytest.mark.compiled
 def test_joints_only_hold_the_reduced_model(robots):
     robot = robots["ets_vii"]
-    robot = robot.replace(inputs=[fflin.JointTorque(name) for name in robot.joint_names])
+    robot = robot.replace(
+        inputs=[fflin.JointTorque(name) for name in robot.joint_names]
+    )
     lin, gain = held(robot, reduce=True)
     found = fflin.validity(robot, lin, gain, joint=0.5, samples=5)
     assert found.slope == pytest.approx(2.0, abs=0.1)
@@ -315,7 +333,9 @@ def test_what_cannot_be_told_is_not(robots, arm):
 @pytest.mark.compiled
 def test_what_a_reduced_model_has_not_is_not_told(robots):
     robot = robots["ets_vii"]
-    robot = robot.replace(inputs=[fflin.JointTorque(name) for name in robot.joint_names])
+    robot = robot.replace(
+        inputs=[fflin.JointTorque(name) for name in robot.joint_names]
+    )
     lin, gain = held(robot, reduce=True)
     found = fflin.validity(robot, lin, gain, joint=0.5, samples=2)
     assert found.largest == {"attitude": 0.0, "position": 0.0, "joint": 0.5}
@@ -365,7 +385,17 @@ def test_jobs_are_at_most_one_for_each_core():
         code, out, _ = run("validity", "cubesat", "--samples", "2", "--jobs", 10**15)
     assert code == 0 and says(out, "of 2", "settled")
     done = finished(
-        [sys.executable, "-m", "fflin", "validity", "cubesat", "--samples", "2", "--jobs", "99999"],
+        [
+            sys.executable,
+            "-m",
+            "fflin",
+            "validity",
+            "cubesat",
+            "--samples",
+            "2",
+            "--jobs",
+            "99999",
+        ],
         capture_output=True,
         text=True,
         check=True,
@@ -379,7 +409,10 @@ def test_progress_is_told_up_to_every_run(robots):
     lin, gain = held(robot)
     for executor in (None, ThreadPoolExecutor(2)):
         told = []
-        more = {"executor": executor, "progress": lambda *each, told=told: told.append(each)}
+        more = {
+            "executor": executor,
+            "progress": lambda *each, told=told: told.append(each),
+        }
         fflin.validity(robot, lin, gain, samples=40, **more)
         done = [each for each, _ in told]
         assert done == sorted(set(done)) and len(done) > 8
@@ -393,9 +426,17 @@ def test_a_process_that_dies_is_one_line(robots, monkeypatch):
     robot = robots["cubesat"]
     lin, gain = held(robot)
     # A function of Python's own, for which a worker imports nothing.
-    monkeypatch.setattr(Loop, "__reduce__", lambda _: (signal.raise_signal, (signal.SIGKILL,)))
-    for pool in (OwnWorkers(1), ProcessPoolExecutor(1, mp_context=get_context("spawn"))):
-        with pool as executor, pytest.raises(fflin.FflinError, match=r"died|terminated abruptly"):
+    monkeypatch.setattr(
+        Loop, "__reduce__", lambda _: (signal.raise_signal, (signal.SIGKILL,))
+    )
+    for pool in (
+        OwnWorkers(1),
+        ProcessPoolExecutor(1, mp_context=get_context("spawn")),
+    ):
+        with (
+            pool as executor,
+            pytest.raises(fflin.FflinError, match=r"died|terminated abruptly"),
+        ):
             fflin.validity(robot, lin, gain, samples=2, executor=executor)
 
 
@@ -444,4 +485,6 @@ def test_the_table_of_frames_is_what_its_command_makes():
     table = (DOCS / "conventions.md").read_text(encoding="utf-8")
     design = "acceleration_lqr(lin, 1, 1, 1)"
     found = frames["settled"](fflin.load("servicer_7dof"), design, 150.0)
-    assert re.search(rf"`{re.escape(design)}`, servicer_7dof \|.* {found} \|$", table, re.MULTILINE)
+    assert re.search(
+        rf"`{re.escape(design)}`, servicer_7dof \|.* {found} \|$", table, re.MULTILINE
+    )

@@ -5,7 +5,9 @@ import pytest
 from tests.support.commands import refused, run
 from tests.support.messages import says
 
-JOINTS = "\n".join(f'[[input]]\ntype = "joint_torque"\njoint = "joint_{i}"' for i in range(1, 7))
+JOINTS = "\n".join(
+    f'[[input]]\ntype = "joint_torque"\njoint = "joint_{i}"' for i in range(1, 7)
+)
 
 
 def test_joints_only_says_what_is_conserved(tmp_path):
@@ -39,9 +41,19 @@ def test_in_orbit_its_field_acts_on_all_momenta():
 def test_points_off_rest_are_told(tmp_path):
     code, out, err = run("analyze", "ets_vii", "--velocity", "omega_b.z=0.1")
     assert code == 0 and not err
-    assert says(out.splitlines()[0], "controllable, observable") and "not an equilibrium" in out
+    assert (
+        says(out.splitlines()[0], "controllable, observable")
+        and "not an equilibrium" in out
+    )
     (tmp_path / "joints.toml").write_text(JOINTS)
-    moving = ("analyze", "ets_vii", "--inputs", "joints.toml", "--velocity", "joint_1=0.1")
+    moving = (
+        "analyze",
+        "ets_vii",
+        "--inputs",
+        "joints.toml",
+        "--velocity",
+        "joint_1=0.1",
+    )
     code, out, err = run(*moving, cwd=tmp_path)
     assert code == 0 and not err
     assert says(out, "analyze: not controllable (at most 15/24)", "of the frozen A")
@@ -72,4 +84,6 @@ def test_wheels_change_the_momentum_of_the_other_bodies(tmp_path):
     (tmp_path / "wheels.toml").write_text("".join(wheels))
     code, out, _ = run("analyze", "cubesat", "--inputs", "wheels.toml", cwd=tmp_path)
     assert code == 0
-    assert says(out, "3 components of the momentum of the robot without its wheels cannot be")
+    assert says(
+        out, "3 components of the momentum of the robot without its wheels cannot be"
+    )

@@ -42,7 +42,9 @@ def test_info_shows_tree_masses_and_limits():
     assert code == 0 and not err
     assert says(out, "8 joints, 28 states, 14 inputs")
     lines = out.splitlines()
-    left, deeper = (next(x for x in lines if x.strip().startswith(n)) for n in ("left_1", "left_2"))
+    left, deeper = (
+        next(x for x in lines if x.strip().startswith(n)) for n in ("left_1", "left_2")
+    )
     assert len(deeper) - len(deeper.lstrip()) == len(left) - len(left.lstrip()) + 2
     assert "revolute" in left and "tool_left" in out
     assert says(out, "rad, N m and rad/s")
@@ -91,9 +93,16 @@ def test_warnings_are_one_line_each_on_stderr_and_in_info():
 
 def test_round_off_is_not_shown_as_figures():
     values = np.array([[2.0, 1e-17, 1e-20], [3e-16, 1.0, 0.0]])
-    shown = [line.split() for line in matrix(values, ["a", "b"], ["x", "y", "z"]).splitlines()]
+    shown = [
+        line.split()
+        for line in matrix(values, ["a", "b"], ["x", "y", "z"]).splitlines()
+    ]
     # 1e-20 stands alone in its column, and 3e-16 is just above the rounding of a one.
-    assert shown == [["x", "y", "z"], ["a", "2", "~0", "1e-20"], ["b", "3e-16", "1", "."]]
+    assert shown == [
+        ["x", "y", "z"],
+        ["a", "2", "~0", "1e-20"],
+        ["b", "3e-16", "1", "."],
+    ]
 
 
 def test_linearize_prints_readable_tables():
@@ -111,11 +120,20 @@ def test_linearize_prints_readable_tables():
 
 def test_units_stand_above_the_tables():
     motion = ("--velocity", "joint_1=0.1", "--stiffness", "panel_left=100")
-    code, out, err = run("linearize", "servicer_7dof", *motion, "--output", "frame:tool")
+    code, out, err = run(
+        "linearize", "servicer_7dof", *motion, "--output", "frame:tool"
+    )
     assert code == 0 and not err
     text = " ".join(out.split())
-    assert "u: tau_b [N m], F_b [N], tau_m [N m] y: tool.position [m], tool.rotation [rad]" in text
-    assert "f0: q_m.joint_1 = 0.1 rad/s," in text and "rad/s^2" in text and "/s/s" not in text
+    assert (
+        "u: tau_b [N m], F_b [N], tau_m [N m] y: tool.position [m], tool.rotation [rad]"
+        in text
+    )
+    assert (
+        "f0: q_m.joint_1 = 0.1 rad/s," in text
+        and "rad/s^2" in text
+        and "/s/s" not in text
+    )
     assert max(map(len, out.splitlines())) <= 80
     # No entry is broken between its name, its value and its unit.
     shown = out.split("f0: ")[1].split("\n\n")[0]
@@ -131,12 +149,16 @@ def test_sampled_model_is_that_of_python(tmp_path):
     code, _, err = run("linearize", *options, "-o", path)
     assert code == 0 and not err
     robot = fflin.load("planar_detumble")
-    expected = fflin.linearize(robot, v=fflin.velocity(robot, {"joint_1": 0.1})).discretize(0.1)
+    expected = fflin.linearize(
+        robot, v=fflin.velocity(robot, {"joint_1": 0.1})
+    ).discretize(0.1)
     saved = fflin.LinearModel.load(path)
     assert saved.dt == 0.1
     for key in ("A", "B", "f0"):
         # The command reads the robot by another route, which rounds otherwise.
-        np.testing.assert_allclose(getattr(saved, key), getattr(expected, key), rtol=0, atol=1e-13)
+        np.testing.assert_allclose(
+            getattr(saved, key), getattr(expected, key), rtol=0, atol=1e-13
+        )
     code, out, err = run("linearize", *options)
     assert code == 0 and not err and says(out, "sampled", "0.1 s")
     assert "q_m.joint_1 = 0.0099" in out and "/s^2" not in out  # f0 is what a step adds
@@ -148,11 +170,20 @@ def test_sampled_model_is_that_of_python(tmp_path):
     "command",
     [
         ("linearize", "servicer_7dof", "--joint", "joint_2=9", "--joint", "joint_4=1"),
-        ("simulate", "servicer_7dof", "--target-joint", "joint_2=9", "--duration", "0.01"),
+        (
+            "simulate",
+            "servicer_7dof",
+            "--target-joint",
+            "joint_2=9",
+            "--duration",
+            "0.01",
+        ),
     ],
 )
 def test_joints_beyond_their_limits_are_named(command):
-    done = finished([sys.executable, "-m", "fflin", *command], capture_output=True, text=True)
+    done = finished(
+        [sys.executable, "-m", "fflin", *command], capture_output=True, text=True
+    )
     assert done.returncode == 0
     assert says(done.stderr, "'joint_2' at 9 rad", "-2.094 to 2.094 rad")
     assert done.stderr.startswith("fflin: warning: ") and done.stderr.count("\n") == 1
@@ -189,14 +220,25 @@ def test_linearize_saves_what_python_gives(ending, tmp_path):
     assert code == 0 and not err and "24 states, 12 inputs" in out
     saved = fflin.LinearModel.load(path)
     robot = fflin.load("dual_arm", lock={"right_1": 0.2, "right_4": None})
-    lin = fflin.linearize(robot, fflin.configuration(robot, {"left_2": 0.3}), frame="local")
+    lin = fflin.linearize(
+        robot, fflin.configuration(robot, {"left_2": 0.3}), frame="local"
+    )
     assert (saved.B == lin.B).all() and saved.state_names == lin.state_names
     assert saved.frame == "local" and saved.certificate == lin.certificate
 
 
 def test_linearize_for_a_tool_saves_what_python_gives(tmp_path):
     code, out, _ = run(
-        *("linearize", "cubesat", "--rpy", "20", "10", "0", "--velocity", "omega_b.z=0.2"),
+        *(
+            "linearize",
+            "cubesat",
+            "--rpy",
+            "20",
+            "10",
+            "0",
+            "--velocity",
+            "omega_b.z=0.2",
+        ),
         *("--for", "drake", "-o", str(tmp_path / "a.mat")),
     )
     lines = ["linearize: cubesat: 13 states, 6 inputs", f"wrote {tmp_path / 'a.mat'}"]
@@ -207,7 +249,11 @@ def test_linearize_for_a_tool_saves_what_python_gives(tmp_path):
     v = fflin.velocity(robot, {"omega_b.z": 0.2})
     lin = fflin.linearize(robot, fflin.configuration(robot, {}, turned), v)
     assert np.array_equal(saved.A, lin.to("drake").A) and saved.tool == "drake"
-    for options in ((), ("-o", str(tmp_path / "a.csv")), ("--trajectory", "x.csv", "-o", "a.npz")):
+    for options in (
+        (),
+        ("-o", str(tmp_path / "a.csv")),
+        ("--trajectory", "x.csv", "-o", "a.npz"),
+    ):
         assert refused("linearize", "cubesat", "--for", "drake", *options)
     assert [path.name for path in tmp_path.iterdir()] == ["a.mat"]
 
@@ -232,9 +278,17 @@ def test_bad_input_is_one_line_and_leaves_nothing(tmp_path):
         ("linearize", "ets_vi", "-o", output): "'ets_vi'",
         ("linearize", bad, "-o", output): "bad.urdf:1",
         ("linearize", tmp_path / "no.urdf", "-o", output): "no file",
-        ("check", tmp_path / "bad.tml"): f"in the folder {tmp_path}; did you mean 'bad.toml'",
+        (
+            "check",
+            tmp_path / "bad.tml",
+        ): f"in the folder {tmp_path}; did you mean 'bad.toml'",
         ("check", tmp_path / "none" / "bad.toml"): "its folder does not exist",
-        ("check", "cubesat", "--inputs", tmp_path / "bud.toml"): "did you mean 'bad.toml'",
+        (
+            "check",
+            "cubesat",
+            "--inputs",
+            tmp_path / "bud.toml",
+        ): "did you mean 'bad.toml'",
         ("montecarlo", "cubesat", "--runs", 2): '[dispersions] and "base.mass" = 0.05',
         ("linearize", tmp_path, "-o", output): "folder",
         ("linearize", "ets_vii", "--joint", "joint_9=1", "-o", output): "'joint_9'",
@@ -292,7 +346,9 @@ def test_existing_output_survives_a_failure(tmp_path):
 
 def test_robots_own_file_is_never_the_output(tmp_path):
     robot = tmp_path / "robot.json"
-    robot.write_bytes((Path(__file__).parents[2] / "robots" / "cubesat.urdf").read_bytes())
+    robot.write_bytes(
+        (Path(__file__).parents[2] / "robots" / "cubesat.urdf").read_bytes()
+    )
     before = robot.read_bytes()
     assert "input file" in refused("linearize", robot, "-o", robot)
     assert robot.read_bytes() == before
@@ -305,7 +361,8 @@ def test_robots_own_file_is_never_the_output(tmp_path):
 
 @pytest.mark.process
 @pytest.mark.parametrize(
-    "arguments", [("linearize", "cubesat"), ("--help",), ("lqr", "--help"), ("--version",)]
+    "arguments",
+    [("linearize", "cubesat"), ("--help",), ("lqr", "--help"), ("--version",)],
 )
 def test_unwritable_stdout_is_one_line(arguments):
     with open("/dev/full", "w") as full:
@@ -338,8 +395,12 @@ def test_unwritable_stderr_does_not_change_the_exit_code(arguments):
     ],
 )
 def test_names_neither_split_nor_fill_the_line(arguments):
-    said = refused(*(each.format("a\nb\x1b[31m" + 5000 * "c" + "d") for each in arguments))
-    assert r"a\nb\x1b[31mc" in said and "...c" in said and "cd" in said and len(said) < 500
+    said = refused(
+        *(each.format("a\nb\x1b[31m" + 5000 * "c" + "d") for each in arguments)
+    )
+    assert (
+        r"a\nb\x1b[31mc" in said and "...c" in said and "cd" in said and len(said) < 500
+    )
 
 
 def test_an_empty_name_is_said_to_be_empty():
@@ -351,14 +412,25 @@ def test_an_empty_name_is_said_to_be_empty():
 
 
 def test_negative_numbers_are_no_options():
-    code, out, _ = run("check", "cubesat", "--rpy", "-30", "-1e-3", "0", "--position", "-.5", 0, 0)
+    code, out, _ = run(
+        "check", "cubesat", "--rpy", "-30", "-1e-3", "0", "--position", "-.5", 0, 0
+    )
     assert code == 0 and "A and B are verified" in out
 
 
 def test_passive_joints_and_gravity(tmp_path):
     path = tmp_path / "m.npz"
-    options = ("--stiffness", "panel_left=100", "--stiffness", "panel_right=90", "--damping", "0.5")
-    code, _, _ = run("linearize", "servicer_7dof", *options, "--gravity", 0, 0, -1.6, "-o", path)
+    options = (
+        "--stiffness",
+        "panel_left=100",
+        "--stiffness",
+        "panel_right=90",
+        "--damping",
+        "0.5",
+    )
+    code, _, _ = run(
+        "linearize", "servicer_7dof", *options, "--gravity", 0, 0, -1.6, "-o", path
+    )
     assert code == 0
     robot = fflin.load(
         "servicer_7dof",
@@ -369,7 +441,14 @@ def test_passive_joints_and_gravity(tmp_path):
     # The compiled equations, where a process has them, round otherwise.
     again = fflin.Linearizer(robot)()
     assert (fflin.LinearModel.load(path).A == again.A).all()
-    options = ("--damping", "urdf", "--velocity", "joint_2=0.3", "--effort", "tau_m.joint_1=2")
+    options = (
+        "--damping",
+        "urdf",
+        "--velocity",
+        "joint_2=0.3",
+        "--effort",
+        "tau_m.joint_1=2",
+    )
     code, out, _ = run("check", "planar_detumble", *options)
     assert code == 0 and "A and B are verified" in out
 
@@ -392,7 +471,9 @@ def test_inputs_and_outputs_are_those_of_python(tmp_path):
     lin, saved = fflin.Linearizer(robot)(), fflin.LinearModel.load(path)
     for key in "ABCD":
         assert (getattr(saved, key) == getattr(lin, key)).all()
-    assert saved.input_names == lin.input_names and saved.output_names == lin.output_names
+    assert (
+        saved.input_names == lin.input_names and saved.output_names == lin.output_names
+    )
     code, out, _ = run("check", "servicer_7dof", *options)
     assert code == 0 and "A and B are verified" in out
 
@@ -413,7 +494,9 @@ def test_check_exits_1_where_it_falls_short(monkeypatch, capsys):
 
     right = fflin.linearize
     monkeypatch.setattr(
-        fflin, "linearize", lambda *a, **k: replace(lin := right(*a, **k), B=lin.B * 1.001)
+        fflin,
+        "linearize",
+        lambda *a, **k: replace(lin := right(*a, **k), B=lin.B * 1.001),
     )
     assert cli.main(["check", "ets_vii"]) == 1
     assert "FAILED" in capsys.readouterr().out
@@ -451,9 +534,14 @@ def test_info_shows_the_inputs_of_a_file_with_the_limits_of_the_urdf():
     rows = [line.split() for line in table.splitlines()[1:]]
     limits = {row[0]: (row[-2], row[-1]) for row in rows}
     model = fflin.load("servicer_7dof").model
-    effort = dict(zip(model.names.tolist()[2:], model.effortLimit[6:].tolist(), strict=True))
+    effort = dict(
+        zip(model.names.tolist()[2:], model.effortLimit[6:].tolist(), strict=True)
+    )
     for name in ("joint_1", "joint_7"):
-        assert tuple(map(float, limits[f"tau_m.{name}"])) == (-effort[name], effort[name])
+        assert tuple(map(float, limits[f"tau_m.{name}"])) == (
+            -effort[name],
+            effort[name],
+        )
     assert limits["F_b.x"] == ("-40", "40") and limits["back_left_top"] == ("0", "22")
     assert len(limits) == 17
     assert "\ninput " in run("info", "servicer_7dof")[1]
@@ -482,7 +570,9 @@ joints = { joint_2 = 0.6 }
 
 def test_info_shows_what_was_set_beside_the_urdf(tmp_path):
     (tmp_path / "sat.toml").write_text(SETTINGS)
-    code, out, err = run("info", "sat.toml", "--damping", "panel_left=0.4", cwd=tmp_path)
+    code, out, err = run(
+        "info", "sat.toml", "--damping", "panel_left=0.4", cwd=tmp_path
+    )
     lines = out.splitlines()
     assert code == 0 and not err and max(map(len, lines)) <= 80
     for line in (
@@ -511,7 +601,10 @@ def test_info_shows_what_was_set_beside_the_urdf(tmp_path):
         "orbit",
     ):
         assert word not in bare
-    assert "gravity [m/s^2]: 0, 0, -1.6" in run("info", "cubesat", "--gravity", 0, 0, -1.6)[1]
+    assert (
+        "gravity [m/s^2]: 0, 0, -1.6"
+        in run("info", "cubesat", "--gravity", 0, 0, -1.6)[1]
+    )
 
 
 def test_check_takes_a_tolerance(tmp_path):
@@ -524,7 +617,11 @@ def test_check_takes_a_tolerance(tmp_path):
 def test_check_shows_the_largest_error_of_each_comparison():
     code, out, _ = run("check", "ets_vii")
     assert code == 0
-    for row in (r"ABA derivatives +54 .* 1\.0e-09", r"differences +54 .* 1\.0e-08", "flow +1 "):
+    for row in (
+        r"ABA derivatives +54 .* 1\.0e-09",
+        r"differences +54 .* 1\.0e-08",
+        "flow +1 ",
+    ):
         assert len(re.findall(row, out)) == 1
 
 
@@ -553,7 +650,9 @@ def test_warnings_of_bundled_robots_fit_a_terminal(name, capfd):
         ("check", "cubesat"),
         ("analyze", "planar_detumble", "--stiffness", "3"),
         ("modes", "planar_detumble", "--stiffness", "3"),
-        *exhaustive((("lqr", "cubesat"),), (("validity", "cubesat", "--samples", "1"),)),
+        *exhaustive(
+            (("lqr", "cubesat"),), (("validity", "cubesat", "--samples", "1"),)
+        ),
     ],
 )
 def test_plot_draws_what_the_command_found(command, tmp_path, monkeypatch):
@@ -562,9 +661,9 @@ def test_plot_draws_what_the_command_found(command, tmp_path, monkeypatch):
     assert code == 0 and out.endswith(f"wrote {tmp_path / 'a.svg'}\n")
     assert (tmp_path / "a.svg").read_bytes().startswith(b"<?xml")
     assert "'.bmp'" in refused(*command, "--plot", tmp_path / "a.bmp")
-    assert "No such" in (said := refused(*command, "--plot", tmp_path / "no" / "a.png")) or (
-        "folder" in said
-    )
+    assert "No such" in (
+        said := refused(*command, "--plot", tmp_path / "no" / "a.png")
+    ) or ("folder" in said)
     assert [path.name for path in tmp_path.iterdir()] == ["a.svg"]
 
 
@@ -572,7 +671,11 @@ def test_help_lists_every_command_once_by_its_task():
     code, out, _ = run("--help")
     assert code == 0 and max(map(len, out.splitlines())) <= 80
     assert "other:" not in out  # a new command is to be put beside those of its task
-    listed = [line.split()[0] for line in out.splitlines() if line[:2] == "  " and line[2] > " "]
+    listed = [
+        line.split()[0]
+        for line in out.splitlines()
+        if line[:2] == "  " and line[2] > " "
+    ]
     names = [name for name in listed if not name.startswith("-")]
     assert sorted(names) == sorted({*names})
     assert {"robots", "check", "modes", "lqr", "simulate", "sweep", "view"} <= {*names}
@@ -594,14 +697,18 @@ def test_help_has_an_example_in_every_command():
 def test_short_help_fits_a_screen_and_full_help_has_every_option():
     (parsers,) = cli._parser("")._subparsers._group_actions
     for name, parser in parsers.choices.items():
-        options = [each.option_strings[-1] for each in parser._actions if each.option_strings]
+        options = [
+            each.option_strings[-1] for each in parser._actions if each.option_strings
+        ]
         _, short, _ = run(name, "--help")
         _, full, _ = run(name, "--help", "all")
         listed = [line for line in short.splitlines() if line.startswith("  -")]
         assert len(listed) <= 20 and len(short.splitlines()) <= 55, name
         assert max(map(len, (*short.splitlines(), *full.splitlines()))) <= 80
         assert f"example: fflin {name}" in " ".join(short.split())
-        assert all(re.search(rf"^  .*{option}\b", full, re.MULTILINE) for option in options), name
+        assert all(
+            re.search(rf"^  .*{option}\b", full, re.MULTILINE) for option in options
+        ), name
         if options[1:]:
             assert short.endswith(
                 f"help for all {len(options) - 1} options: fflin {name} --help all\n"
@@ -612,7 +719,15 @@ def test_options_that_repeat_a_robot_file_are_in_one_group():
     repeated = {"lock", "xacro", "orbit", "stiffness", "damping", "gravity", "passive"}
     repeated |= {"inputs", "output"}
     (parsers,) = cli._parser("")._subparsers._group_actions
-    for name in ("linearize", "check", "lqr", "simulate", "sweep", "montecarlo", "funnel"):
+    for name in (
+        "linearize",
+        "check",
+        "lqr",
+        "simulate",
+        "sweep",
+        "montecarlo",
+        "funnel",
+    ):
         (group,) = (x for x in parsers.choices[name]._action_groups if x.title == ROBOT)
         assert {each.dest for each in group._group_actions} == repeated, name
 
@@ -644,7 +759,9 @@ def test_wheels_from_a_file_at_speed(tmp_path):
     code, out, _ = run("check", *options)
     assert code == 0 and max(map(len, out.splitlines())) <= 80
     stored = tmp_path / "stored.toml"
-    stored.write_text('[[input]]\ntype = "reaction_wheel"\naxis = [0, 0, 1]\nmomentum = 0.1\n')
+    stored.write_text(
+        '[[input]]\ntype = "reaction_wheel"\naxis = [0, 0, 1]\nmomentum = 0.1\n'
+    )
     assert run("check", "cubesat", "--inputs", stored)[0] == 0
     err = refused("check", "cubesat", "--inputs", stored, "--velocity", "wheel_1=100")
     assert "'wheel_1'" in err
@@ -664,7 +781,9 @@ def test_equilibria_in_orbit_are_taken_as_panels_sag(tmp_path):
     soft = ["servicer_7dof", "--passive", "panel_*", "--stiffness", "panel_*=40"]
     soft += ["--orbit", "400e3"]
     code, out, err = run("linearize", *soft, "--rpy", 5, 0, 0, "--equilibrium")
-    assert (code, err) == (0, "") and "a fixed point" in out and "q_m.panel_left = " in out
+    assert (
+        (code, err) == (0, "") and "a fixed point" in out and "q_m.panel_left = " in out
+    )
     code, out, err = run("modes", *soft, "--relative-equilibrium")
     assert (code, err) == (0, "") and "not an equilibrium" not in out
     # A rigid body's libration, in closed form.

@@ -27,7 +27,9 @@ def pairs():
         reads = [each for each in actions if each.type in (input_file, input_name)]
         writes = [each for each in actions if isinstance(each.type, OutputFile)]
         for read, write in itertools.product(reads, writes):
-            yield pytest.param(name, actions, read, write, id=f"{name} {read.dest} {write.dest}")
+            yield pytest.param(
+                name, actions, read, write, id=f"{name} {read.dest} {write.dest}"
+            )
 
 
 def said(action, value):
@@ -53,8 +55,14 @@ def test_no_output_is_what_an_option_reads(
             words += said(action, NEEDED.get(action.dest, other))
     for target in ("precious.toml", "./precious.toml", "symbolic.npz", "hard.npz"):
         code, _, error = run(*words, *said(write, target))
-        assert code == 2 and f"is the input file {precious}" in error and error.count("\n") == 1
-    assert precious.read_text() == "precious.toml" and len(list(tmp_path.iterdir())) == 4
+        assert (
+            code == 2
+            and f"is the input file {precious}" in error
+            and error.count("\n") == 1
+        )
+    assert (
+        precious.read_text() == "precious.toml" and len(list(tmp_path.iterdir())) == 4
+    )
 
 
 def test_every_option_that_takes_a_file_says_whether_it_is_written():
@@ -62,12 +70,20 @@ def test_every_option_that_takes_a_file_says_whether_it_is_written():
     for name, actions in commands():
         for action in actions:
             metavar, words = str(action.metavar), action.help or ""
-            takes = any(word in metavar for word in ("FILE", "ROBOT", "URDF", "DISPERSIONS"))
+            takes = any(
+                word in metavar for word in ("FILE", "ROBOT", "URDF", "DISPERSIONS")
+            )
             reads = action.type in (input_file, input_name)
-            assert takes == (reads or isinstance(action.type, OutputFile)), (name, action.dest)
+            assert takes == (reads or isinstance(action.type, OutputFile)), (
+                name,
+                action.dest,
+            )
             if takes:
                 writes = words.startswith(("write", "save", "plot", "output file"))
-                assert writes == isinstance(action.type, OutputFile), (name, action.dest)
+                assert writes == isinstance(action.type, OutputFile), (
+                    name,
+                    action.dest,
+                )
                 count += 1
     assert count > 40
 
@@ -124,13 +140,21 @@ def test_a_command_replaces_files_of_its_own_kind_alone(name, tmp_path, monkeypa
         table.write_text("somebody's own\n")
         with any_wording():
             code, _, error = run(*command, tmp_path / "foreign.csv")
-        assert code == 2 and str(table) in error and table.read_text() == "somebody's own\n"
+        assert (
+            code == 2
+            and str(table) in error
+            and table.read_text() == "somebody's own\n"
+        )
         assert run(*command, tmp_path / "foreign.csv", "--force")[0] == 0
-    other = ("lqr", "cubesat", "-o") if name != "lqr" else ("linearize", "cubesat", "-o")
+    other = (
+        ("lqr", "cubesat", "-o") if name != "lqr" else ("linearize", "cubesat", "-o")
+    )
     path = tmp_path / "other.npz"
     assert run(*other, path)[0] == 0
     before = path.read_bytes()
     with any_wording():
         code, _, error = run(*command, path)
-    assert code == 2 and f"holds a {'LinearModel' if name == 'lqr' else 'Gain'}" in error
+    assert (
+        code == 2 and f"holds a {'LinearModel' if name == 'lqr' else 'Gain'}" in error
+    )
     assert path.read_bytes() == before

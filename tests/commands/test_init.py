@@ -18,11 +18,17 @@ BODY = (
     '<inertial><mass value="{mass}"/><inertia ixx="{xx}" iyy="0.4" izz="0.5" ixy="0" ixz="0" '
     'iyz="0"/></inertial>'
 )
-LINKS = {"base": (50, 0.3), "hinged panel": (4, 0.3), "rw_x": (1, 0.7), "RCS_1": (0.1, 0.3)}
+LINKS = {
+    "base": (50, 0.3),
+    "hinged panel": (4, 0.3),
+    "rw_x": (1, 0.7),
+    "RCS_1": (0.1, 0.3),
+}
 OWN = (
     '<robot name="own">'
     + "".join(
-        f'<link name="{name}">{BODY.format(mass=m, xx=x)}</link>' for name, (m, x) in LINKS.items()
+        f'<link name="{name}">{BODY.format(mass=m, xx=x)}</link>'
+        for name, (m, x) in LINKS.items()
     )
     + '<joint name="hinge 1" type="revolute"><parent link="base"/><child link="hinged panel"/>'
     '<origin xyz="0 1 0"/><axis xyz="0 1 0"/>'
@@ -54,7 +60,9 @@ def test_what_init_writes_of_a_bundled_robot_flies(tmp_path, name):
     assert list(robot.passive) == idle == list(robot.stiffness)
     damped = {joint: d for joint, d in plain.urdf_damping.items() if d}
     assert {joint: robot.damping[joint] for joint in damped} == pytest.approx(damped)
-    code, out, err = run("simulate", "own.toml", "--duration", 5, "-o", "m.npz", cwd=tmp_path)
+    code, out, err = run(
+        "simulate", "own.toml", "--duration", 5, "-o", "m.npz", cwd=tmp_path
+    )
     assert code in (0, 1) and err == "" and "own: 5 s" in out
     motion = fflin.Motion.load(tmp_path / "m.npz")
     assert motion.attitude_error[0] == pytest.approx(10.0)
@@ -63,13 +71,17 @@ def test_what_init_writes_of_a_bundled_robot_flies(tmp_path, name):
 
 @pytest.mark.process
 def test_init_warns_of_what_its_file_leaves_open_alone(tmp_path):
-    text = OWN.replace('damping="0.3"', 'damping="0.3" friction="0.1"').replace("RCS_1", "thr " * 9)
+    text = OWN.replace('damping="0.3"', 'damping="0.3" friction="0.1"').replace(
+        "RCS_1", "thr " * 9
+    )
     (tmp_path / "own.urdf").write_text(text.replace("thr thr", "thr-thr"))
     command = [sys.executable, "-m", "fflin", "init", "own.urdf"]
     done = finished(command, capture_output=True, text=True, cwd=tmp_path, check=True)
     assert says(done.stderr, "fflin: warning: own: ", "'hinge 1'")
     assert done.stderr.count("\n") == 1
-    comments = [x for x in (tmp_path / "own.toml").read_text().splitlines() if x.startswith("#")]
+    comments = [
+        x for x in (tmp_path / "own.toml").read_text().splitlines() if x.startswith("#")
+    ]
     assert max(map(len, comments)) <= 80 and "direction [1, 0, 0]" in " ".join(
         x[2:] for x in comments
     )
@@ -120,7 +132,9 @@ def test_inputs_come_in_the_order_of_their_numbers(tmp_path):
     )
     (tmp_path / "own.urdf").write_text(OWN.replace("</robot>", f"{nozzles}</robot>"))
     assert run("init", "own.urdf", cwd=tmp_path)[0] == 0
-    found = re.findall('# name = "thruster_([0-9]+)"', (tmp_path / "own.toml").read_text())
+    found = re.findall(
+        '# name = "thruster_([0-9]+)"', (tmp_path / "own.toml").read_text()
+    )
     assert found == [str(k) for k in range(1, 13)]
 
 
@@ -145,7 +159,11 @@ def test_a_bus_with_unactuated_wings_becomes_a_robot_by_uncommenting(tmp_path):
     assert re.search(r"\[stiffness\]\n(# .*\n)*" + wing, written)
     taken = re.sub(r"(?m)^# (passive = )", r"\1", written)
     springs, rest = taken.split("# [rest]")
-    taken = re.sub(r'(?m)^# (?="(hinge 1|spin)" = [0-9.]+$)', "", springs) + "# [rest]" + rest
+    taken = (
+        re.sub(r'(?m)^# (?="(hinge 1|spin)" = [0-9.]+$)', "", springs)
+        + "# [rest]"
+        + rest
+    )
     appendage = re.search(r"# \[\[flexible\]\]\n(#.*\n)*?(?=# \[\[slosh)", written)[0]
     taken = taken.replace(appendage, re.sub(r"(?m)^# ", "", appendage))
     (tmp_path / "taken.toml").write_text(taken)
@@ -159,10 +177,14 @@ def test_a_bus_with_unactuated_wings_becomes_a_robot_by_uncommenting(tmp_path):
 def test_a_file_names_its_urdf_from_where_it_lies(tmp_path):
     (tmp_path / "deep" / "er").mkdir(parents=True)
     (tmp_path / "a b.urdf").write_text(OWN)
-    code, out, _ = run("init", tmp_path / "a b.urdf", "-o", "deep/er/x.toml", cwd=tmp_path)
+    code, out, _ = run(
+        "init", tmp_path / "a b.urdf", "-o", "deep/er/x.toml", cwd=tmp_path
+    )
     assert code == 0 and says(out, "deep/er/x.toml")
     assert fflin.load(tmp_path / "deep" / "er" / "x.toml").name == "x"
-    assert 'urdf = "../../a b.urdf"\n' in (tmp_path / "deep" / "er" / "x.toml").read_text()
+    assert (
+        'urdf = "../../a b.urdf"\n' in (tmp_path / "deep" / "er" / "x.toml").read_text()
+    )
 
 
 def test_init_writes_over_nothing_unless_told(tmp_path):
@@ -238,8 +260,13 @@ def test_options_go_before_the_file(sat):
 
     assert saved().output_names[0] == "com.x" and not saved().q[:3].any()
     assert saved("--output", "base").output_names[0] == "q_b.x"
-    assert saved("--inputs", "joints").input_names == tuple(f"tau_m.joint_{k}" for k in range(1, 8))
-    assert saved("--inputs", "joints", "--passive", "joint_1").input_names[0] == "tau_m.joint_2"
+    assert saved("--inputs", "joints").input_names == tuple(
+        f"tau_m.joint_{k}" for k in range(1, 8)
+    )
+    assert (
+        saved("--inputs", "joints", "--passive", "joint_1").input_names[0]
+        == "tau_m.joint_2"
+    )
     assert "passive" in refused(
         "linearize", "sat.toml", "--inputs", "joints", "--passive", "joint_?", cwd=sat
     )
@@ -271,7 +298,9 @@ def test_simulate_begins_and_weighs_as_the_file_says(sat):
     again = fflin.simulate(robot, law, duration=1.0, limits="urdf")
     np.testing.assert_allclose(again.x, motion.x, atol=1e-9)
     assert says(fflin.lqr(lin).weights, "tau_b", "identity")
-    turned = simulated("--rpy", 0, 0, 5, "--joint", "joint_*=0.1", "--velocity", "joint_1=0.2")
+    turned = simulated(
+        "--rpy", 0, 0, 5, "--joint", "joint_*=0.1", "--velocity", "joint_1=0.2"
+    )
     x = dict(zip(turned.state_names, turned.x[0], strict=True))
     assert x["q_b.x"] == 0.0 and x["q_b.z"] == pytest.approx(np.sin(np.radians(2.5)))
     assert x["q_m.joint_2"] == x["q_m.joint_7"] == 0.1 and x["q_m.panel_left"] == 0.0
@@ -299,9 +328,15 @@ WHEEL = """<robot name="bus"><link name="bus"><inertial><mass value="50"/>
 
 @pytest.mark.parametrize(
     ("kind", "speed", "inertia", "most"),
-    [("fixed", 0, 0.001, 600.0), ("continuous", 0, 0.002, 600.0), ("continuous", 50, 0.002, 50.0)],
+    [
+        ("fixed", 0, 0.001, 600.0),
+        ("continuous", 0, 0.002, 600.0),
+        ("continuous", 50, 0.002, 50.0),
+    ],
 )
-def test_suggested_wheels_have_an_inertia_and_saturate(tmp_path, kind, speed, inertia, most):
+def test_suggested_wheels_have_an_inertia_and_saturate(
+    tmp_path, kind, speed, inertia, most
+):
     (tmp_path / "bus.urdf").write_text(WHEEL.format(kind=kind, speed=speed))
     assert run("init", tmp_path / "bus.urdf", cwd=tmp_path)[0] == 0
     text = (tmp_path / "bus.toml").read_text()
@@ -311,12 +346,21 @@ def test_suggested_wheels_have_an_inertia_and_saturate(tmp_path, kind, speed, in
     (tmp_path / "flown.toml").write_text(f'urdf = "bus.urdf"\n{lock}{table}\n')
     robot = fflin.load(tmp_path / "flown.toml")
     (wheel,) = robot.inputs
-    assert wheel.inertia == pytest.approx(inertia) and wheel.max and wheel.max_speed == most
+    assert (
+        wheel.inertia == pytest.approx(inertia)
+        and wheel.max
+        and wheel.max_speed == most
+    )
 
 
 def test_an_ideal_force_on_the_base_is_said_to_be_ideal(tmp_path):
     (tmp_path / "bus.urdf").write_text(WHEEL.format(kind="fixed", speed=0))
-    assert says(run("init", tmp_path / "bus.urdf", cwd=tmp_path)[1], "ideal torque and force")
-    assert says(run("info", tmp_path / "bus.toml")[1], "warning: an ideal torque and force without")
+    assert says(
+        run("init", tmp_path / "bus.urdf", cwd=tmp_path)[1], "ideal torque and force"
+    )
+    assert says(
+        run("info", tmp_path / "bus.toml")[1],
+        "warning: an ideal torque and force without",
+    )
     jets = run("info", "cubesat", "--inputs", "cubesat")[1]
     assert "ideal" not in jets

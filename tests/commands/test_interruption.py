@@ -125,7 +125,9 @@ def test_it_is_not_lost_in_callbacks_and_imports(where, tmp_path):
         "try:\n    import interrupted_module\nexcept BaseException:\n    pass\n"
     )
     (tmp_path / "program.py").write_text(LOSING.format(where=where))
-    done = finished([sys.executable, "program.py"], cwd=tmp_path, capture_output=True, text=True)
+    done = finished(
+        [sys.executable, "program.py"], cwd=tmp_path, capture_output=True, text=True
+    )
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "fflin: stopped\n")
 
 

@@ -36,7 +36,9 @@ class Python:
         turn = fflin.velocity(self.robot, {"omega_b.z": 0.01})
         self.motion = fflin.simulate(self.robot, self.loop, v0=turn, **self.short)
         spread = fflin.load_dispersions(folder / "u.toml")
-        self.campaign = fflin.monte_carlo(self.robot, self.loop, spread, runs=9, **self.short)
+        self.campaign = fflin.monte_carlo(
+            self.robot, self.loop, spread, runs=9, **self.short
+        )
         self.region = fflin.validity(self.robot, self.lin, self.gain, samples=3)
         ranges = {"base.mass": 0.2}
         self.lft = fflin.uncertain(self.robot, ranges).lft()
@@ -47,7 +49,10 @@ CASES = {
     "robots": ("", lambda x, py: [(x["robots"][ROBOT]["mass"], py.robot.mass)]),
     "info": (
         ROBOT,
-        lambda x, py: [(x["mass"], py.robot.mass), (len(x["state_names"]), len(py.lin.A))],
+        lambda x, py: [
+            (x["mass"], py.robot.mass),
+            (len(x["state_names"]), len(py.lin.A)),
+        ],
     ),
     "init": (f"{ROBOT} -o own.toml", lambda x, py: []),
     "linearize": (ROBOT, lambda x, py: [(x["A"], py.lin.A), (x["B"], py.lin.B)]),
@@ -55,19 +60,29 @@ CASES = {
     "analyze": (
         ROBOT,
         lambda x, py: [
-            (x["controllability"]["dimension"], fflin.controllability(py.lin).dimension),
+            (
+                x["controllability"]["dimension"],
+                fflin.controllability(py.lin).dimension,
+            ),
             (x["observability"]["dimension"], fflin.observability(py.lin).dimension),
         ],
     ),
     "modes": (
         f"{ROBOT} --stiffness joint_1=3",
         lambda x, py: [
-            (list(map(complex_of, (m["pole"] for m in x["modes"]["modes"]))), of_modes(py.sprung))
+            (
+                list(map(complex_of, (m["pole"] for m in x["modes"]["modes"]))),
+                of_modes(py.sprung),
+            )
         ],
     ),
     "equilibrium": (
         f"{ROBOT} --stiffness joint_1=3 --joint joint_1=0.2",
-        lambda x, py: [(x["u"], py.held.u), (x["q"], py.held.q), (x["largest_real_part"], 0.0)],
+        lambda x, py: [
+            (x["u"], py.held.u),
+            (x["q"], py.held.q),
+            (x["largest_real_part"], 0.0),
+        ],
     ),
     "plan": (
         f"{ROBOT} {LOCKED} --target-joint joint_1=0.3 --duration 20 --knots 5 -o slew.npz",
@@ -129,9 +144,13 @@ def python(tmp_path_factory, brief_validity):
     there.check = fflin.check(robot, there.lin)
     there.schedule = fflin.tvlqr(there.along)
     there.schedule.save(folder / "gains.npz")
-    there.sprung = fflin.modes(fflin.linearize(fflin.load(ROBOT, stiffness={"joint_1": 3.0})))
+    there.sprung = fflin.modes(
+        fflin.linearize(fflin.load(ROBOT, stiffness={"joint_1": 3.0}))
+    )
     sprung = fflin.load(ROBOT, stiffness={"joint_1": 3.0})
-    there.held = fflin.equilibrium(sprung, fflin.configuration(sprung, {"joint_1": 0.2}))
+    there.held = fflin.equilibrium(
+        sprung, fflin.configuration(sprung, {"joint_1": 0.2})
+    )
     locked = fflin.load(ROBOT, lock=["joint_2", "joint_3"])
     end = fflin.configuration(locked, {"joint_1": 0.3})
     there.slew = fflin.plan(locked, (end, None), 20.0, knots=5)
@@ -153,13 +172,17 @@ def test_json_has_one_schema_and_the_figures_of_python(command, python):
     for shown, there in figures(said, python):
         # Relative to the largest: two runs of an integrator differ by its rounding.
         assert np.shape(shown) == np.shape(there)
-        assert np.abs(np.subtract(shown, there)).max() <= 1e-9 * max(np.abs(there).max(), 1e-3)
+        assert np.abs(np.subtract(shown, there)).max() <= 1e-9 * max(
+            np.abs(there).max(), 1e-3
+        )
     for name in said["files"]:
         assert (python.folder / name).stat().st_size
 
 
 def test_every_command_but_view_is_tried():
-    assert {name for names in cli.TASKS.values() for name in names} - {"view"} == {*CASES}
+    assert {name for names in cli.TASKS.values() for name in names} - {"view"} == {
+        *CASES
+    }
 
 
 def test_the_first_paragraph_of_the_text_is_the_result(python):
@@ -182,7 +205,9 @@ def test_what_is_not_finite_is_null():
     assert plain(np.array([1.0 + 2.0j])) == [{"real": 1.0, "imag": 2.0}]
 
 
-def test_info_has_the_momentum_of_the_wheels_and_the_authority_of_the_thrusters(tmp_path):
+def test_info_has_the_momentum_of_the_wheels_and_the_authority_of_the_thrusters(
+    tmp_path,
+):
     wheels = "".join(
         f"[[input]]\ntype = 'reaction_wheel'\naxis = {axis}\ninertia = 1e-5\nmax_speed = 300.0\n"
         for axis in np.eye(3).tolist()
@@ -194,7 +219,9 @@ def test_info_has_the_momentum_of_the_wheels_and_the_authority_of_the_thrusters(
         for side in (1, -1)
         for way in (1, -1)
     )
-    text = f"urdf = 'cubesat.urdf'\n[point.velocity]\nwheel_1 = 100.0\n{wheels}{thrusters}"
+    text = (
+        f"urdf = 'cubesat.urdf'\n[point.velocity]\nwheel_1 = 100.0\n{wheels}{thrusters}"
+    )
     urdf = fflin.load("cubesat").urdf
     (tmp_path / "cubesat.urdf").write_bytes(urdf.read_bytes())
     (tmp_path / "sat.toml").write_text(text)
@@ -207,6 +234,6 @@ def test_info_has_the_momentum_of_the_wheels_and_the_authority_of_the_thrusters(
     assert momentum["least"] == pytest.approx(3e-3)
     reach = found["thruster_authority"]
     assert (reach["thrusters"], reach["every_way"]) == (12, True)
-    assert reach["least_force"] == pytest.approx(4.0) and reach["least_torque"] == pytest.approx(
-        2.0
-    )
+    assert reach["least_force"] == pytest.approx(4.0) and reach[
+        "least_torque"
+    ] == pytest.approx(2.0)

@@ -20,7 +20,9 @@ def test_what_matters_most_is_shown_and_saved(tmp_path):
     head, table = out.split("parameter ")
     _, *rows, more, said = table.splitlines()
     assert "most" in head and len(rows) == 4 and more.startswith("... and ")
-    assert all(len(line) <= 80 for line in out.splitlines()[:-1]) and said.startswith("wrote ")
+    assert all(len(line) <= 80 for line in out.splitlines()[:-1]) and said.startswith(
+        "wrote "
+    )
     robot = fflin.load("servicer_7dof")
     q = fflin.configuration(robot, {"joint_2": 0.6})
     lin = fflin.linearize(robot, q, fflin.velocity(robot, {"omega_b.z": 0.1}))
@@ -30,7 +32,9 @@ def test_what_matters_most_is_shown_and_saved(tmp_path):
     at = S.names.index("link_3.mass")
     assert file["units"][at] == "kg" and file["values"][at] == pytest.approx(9.5)
     for key in ("dA", "dB", "df0"):
-        assert np.array_equal(file[key][at], getattr(S["link_3.mass"], key)) or np.allclose(
+        assert np.array_equal(
+            file[key][at], getattr(S["link_3.mass"], key)
+        ) or np.allclose(
             file[key][at], getattr(S["link_3.mass"], key), rtol=1e-12, atol=1e-15
         )
     assert np.array_equal(file["A"], lin.A) and file["frame"] == "hybrid"
@@ -45,7 +49,9 @@ def test_some_alone_are_shown():
 
 def test_of_a_sampled_model_in_every_format(tmp_path):
     for ending in ("npz", "json"):
-        code, *_ = run("sensitivity", "cubesat", "--dt", 0.1, "-o", tmp_path / f"c.{ending}")
+        code, *_ = run(
+            "sensitivity", "cubesat", "--dt", 0.1, "-o", tmp_path / f"c.{ending}"
+        )
         assert code == 0
     text = json.loads((tmp_path / "c.json").read_text())
     with np.load(tmp_path / "c.npz") as file:
@@ -59,14 +65,22 @@ def test_the_fraction_is_saved(tmp_path):
     vary = ("--vary", "base.mass=0.2", "--vary", "panel_left.stiffness=80:120")
     vary += ("--vary", "panel_*.damping=0.1:0.3,tied")
     path = tmp_path / "u.mat"
-    code, out, err = run("uncertain", "servicer_7dof", "--joint", "joint_2=0.6", *vary, "-o", path)
+    code, out, err = run(
+        "uncertain", "servicer_7dof", "--joint", "joint_2=0.6", *vary, "-o", path
+    )
     assert code == 0 and not err and "Delta is 6 x 6" in out
     robot = fflin.load("servicer_7dof")
     ranges = {"base.mass": 0.2, "panel_left.stiffness": (80.0, 120.0)}
     ranges["panel_*.damping"] = {"range": (0.1, 0.3), "tied": True}
-    expected = fflin.uncertain(robot, ranges).lft(fflin.configuration(robot, {"joint_2": 0.6}))
+    expected = fflin.uncertain(robot, ranges).lft(
+        fflin.configuration(robot, {"joint_2": 0.6})
+    )
     saved = fflin.LFT.load(path)
-    assert np.array_equal(saved.D11, expected.D11) and saved.repeats.tolist() == [3.0, 1.0, 2.0]
+    assert np.array_equal(saved.D11, expected.D11) and saved.repeats.tolist() == [
+        3.0,
+        1.0,
+        2.0,
+    ]
 
 
 def test_what_is_wrong_is_one_line(tmp_path):
@@ -75,7 +89,9 @@ def test_what_is_wrong_is_one_line(tmp_path):
     assert "NAME=FRACTION" in refused(*vary, "base.mass")
     assert "NAME=FRACTION" in refused(*vary, "base.mass=1:2:3")
     assert "least < largest" in refused(*vary, "base.mass=3:2")
-    assert "more than once" in refused(*vary, "base.mass=0.1", "--vary", "base.mass=0.2")
+    assert "more than once" in refused(
+        *vary, "base.mass=0.1", "--vary", "base.mass=0.2"
+    )
     assert "--vary" in refused("uncertain", "cubesat")
     assert "base.mass" in refused(*vary, "base.mass=-3:1", "-o", tmp_path / "u.mat")
     assert "0.2 for 20 %" in refused(*vary, "base.mass=20", "-o", tmp_path / "u.mat")

@@ -27,7 +27,16 @@ def folder(tmp_path):
 
 def test_it_flies_what_python_flies_and_says_it_as_text_and_json(folder, robots):
     robot = robots["planar_detumble"]
-    options = ("--runs", 30, "--seed", 4, "--limit", "tau_b=2", "--goal", "attitude < 4 deg")
+    options = (
+        "--runs",
+        30,
+        "--seed",
+        4,
+        "--limit",
+        "tau_b=2",
+        "--goal",
+        "attitude < 4 deg",
+    )
     command = ("montecarlo", "planar_detumble", *SHORT, *options, "--rpy", 5, 0, 0)
     code, out, err = run(*command, "-o", "runs.npz", cwd=folder)
     assert code == 0 and not err
@@ -37,14 +46,20 @@ def test_it_flies_what_python_flies_and_says_it_as_text_and_json(folder, robots)
         robot,
         fflin.StateFeedback(lin, fflin.lqr(lin).K),
         fflin.load_dispersions(folder / "u.toml"),
-        **{"q0": fflin.configuration(robot, base=pin.SE3(turn, np.zeros(3))), "runs": 30},
+        **{
+            "q0": fflin.configuration(robot, base=pin.SE3(turn, np.zeros(3))),
+            "runs": 30,
+        },
         **{"seed": 4, "duration": 0.4, "dt": 0.02, "limits": ["urdf", {"tau_b": 2.0}]},
     )
     assert np.abs(there.x - campaign.x).max() < 1e-9
     assert campaign.input_limits[:3] == (2.0,) * 3
     assert campaign.values("worst attitude").mean() > 5.0
     share = campaign.fraction("attitude < 4 deg")
-    assert f"attitude < 4 deg: {100 * share.value:.4g} % (" in out and "wrote runs.npz" in out
+    assert (
+        f"attitude < 4 deg: {100 * share.value:.4g} % (" in out
+        and "wrote runs.npz" in out
+    )
     assert max(map(len, out.splitlines())) <= 80
     assert re.search(rf"^ *{campaign.worst(1)[0]} +[\d.]+ +deg", out, re.MULTILINE)
     code, out, _ = run(*command, "--worst", 2, "--json", cwd=folder)
@@ -53,7 +68,8 @@ def test_it_flies_what_python_flies_and_says_it_as_text_and_json(folder, robots)
     assert said["goals"] == {"attitude < 4 deg": list(share)}
     found = said["quantiles"]["worst attitude"]["0.5"]
     assert found == list(campaign.quantile("worst attitude", 0.5))
-    assert said["quantiles"]["attitude"]["0.99"][2] is None  # of 30 runs there is no bound
+    # of 30 runs there is no bound
+    assert said["quantiles"]["attitude"]["0.99"][2] is None
 
 
 def test_tables_are_those_of_the_campaign(folder):
@@ -61,7 +77,9 @@ def test_tables_are_those_of_the_campaign(folder):
     assert run(*command, "-o", "runs.npz", cwd=folder)[0] == 0
     fflin.Campaign.load(folder / "runs.npz").save(folder / "runs.csv")
     (folder / "u.csv").write_text("of another program")
-    assert says(refused(*command, "-o", "u.csv", cwd=folder), "u.csv already exists", "--force")
+    assert says(
+        refused(*command, "-o", "u.csv", cwd=folder), "u.csv already exists", "--force"
+    )
     assert (folder / "u.csv").read_text() == "of another program"
     code, out, _ = run(*command, "-o", "u.csv", "--force", cwd=folder)
     assert code == 0 and "wrote u.csv" in out
@@ -89,7 +107,9 @@ def test_bad_input_is_one_line_and_leaves_nothing(arguments, said, folder):
     assert {x.name for x in folder.iterdir()} == {"u.toml"}
 
 
-def test_noise_has_a_report_and_another_campaign_is_replaced_by_force(folder, monkeypatch):
+def test_noise_has_a_report_and_another_campaign_is_replaced_by_force(
+    folder, monkeypatch
+):
     monkeypatch.chdir(folder)
     (folder / "u.toml").write_text('[dispersions]\n"q_b.x.noise" = 1e-4\n')
     command = (
@@ -147,7 +167,15 @@ if __name__ == "__main__":
 @pytest.mark.parametrize("how", ["INT", "KILL"])
 def test_the_same_command_goes_on_after_ctrl_c_and_a_kill(folder, how):
     pytest.importorskip("h5py")
-    command = ["montecarlo", "planar_detumble", *SHORT, "--runs", "90", "--threads", "1"]
+    command = [
+        "montecarlo",
+        "planar_detumble",
+        *SHORT,
+        "--runs",
+        "90",
+        "--threads",
+        "1",
+    ]
     out, part = ["-o", "x.h5"], "x.h5.part"
     done = _interrupted([*command, *out], how, folder)
     assert {x.name for x in folder.iterdir()} == {"u.toml", part}
@@ -176,7 +204,9 @@ def _interrupted(command, how, folder):
 
 @pytest.mark.process
 def test_ctrl_c_without_a_file_says_that_nothing_is_kept(folder):
-    done = _interrupted(["montecarlo", "planar_detumble", *SHORT, "--runs", "90"], "INT", folder)
+    done = _interrupted(
+        ["montecarlo", "planar_detumble", *SHORT, "--runs", "90"], "INT", folder
+    )
     assert done.returncode == 130
     last = done.stderr.splitlines()[-1]
     assert re.fullmatch(r"fflin: stopped .*\b90 .*", last)
@@ -202,7 +232,15 @@ def test_the_same_command_goes_on_after_a_killed_worker(folder):
         "    sys.exit(main())\n"
     )
     (folder / "main.py").write_text(script)
-    command = ["montecarlo", "planar_detumble", *SHORT, "--runs", "90", "--workers", "2"]
+    command = [
+        "montecarlo",
+        "planar_detumble",
+        *SHORT,
+        "--runs",
+        "90",
+        "--workers",
+        "2",
+    ]
     done = finished(
         [sys.executable, "main.py", *command, "-o", "x.h5"],
         cwd=folder,
@@ -212,7 +250,9 @@ def test_the_same_command_goes_on_after_a_killed_worker(folder):
     )
     assert (done.returncode, (folder / "died").exists()) == (2, True), done.stderr
     last = done.stderr.splitlines()[-1]
-    assert re.fullmatch(r"fflin: error: .*chunks.* \d+ to \d+: .*died.*x\.h5\.part.*", last), last
+    assert re.fullmatch(
+        r"fflin: error: .*chunks.* \d+ to \d+: .*died.*x\.h5\.part.*", last
+    ), last
     assert run(*command[:-2], "-o", "x.h5", cwd=folder)[0] == 0
     assert run(*command[:-2], "-o", "y.h5", cwd=folder)[0] == 0
     one, two = (fflin.Campaign.load(folder / f"{name}.h5") for name in "xy")
@@ -232,9 +272,13 @@ def test_a_full_disk_is_said_and_leaves_nothing(folder):
         command = ["montecarlo", "planar_detumble", *SHORT]
         error = refused(*command, "--runs", "2000", "-o", small / "x.h5", cwd=folder)
         assert re.search(r"x\.h5 needs .*[1-9].* MB.*free", error)
-        code, _, err = run(*command, "--runs", "8", "--plot", small / "x.png", cwd=folder)
+        code, _, err = run(
+            *command, "--runs", "8", "--plot", small / "x.png", cwd=folder
+        )
         assert code in (0, 2) and ("No space left" in err) == (code == 2)
-        code, out, err = run(*command, "--runs", "8", "--html", small / "x.html", cwd=folder)
+        code, out, err = run(
+            *command, "--runs", "8", "--html", small / "x.html", cwd=folder
+        )
         assert code == 2 and says(out, "none")
         assert err.endswith("x.html: cannot be written: No space left on device\n")
         assert not {x.name for x in small.iterdir()} - {"x.png"}

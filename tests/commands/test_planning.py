@@ -25,7 +25,9 @@ def test_a_plan_is_followed(tmp_path):
     assert np.abs(motion.q[0] - robot.neutral()).max() < 1e-9
     assert np.abs(motion.q[-1] - end).max() < 1e-6
     assert motion.residual.max() < 1e-5 and np.abs(motion.u[:, 6:]).max() <= 0.5 + 1e-9
-    flown = run("simulate", ROBOT, *locked, "--trajectory", "p.npz", "-o", "m.npz", cwd=tmp_path)
+    flown = run(
+        "simulate", ROBOT, *locked, "--trajectory", "p.npz", "-o", "m.npz", cwd=tmp_path
+    )
     assert flown[0] == 0
     # One percent of the displacement.
     assert np.abs(fflin.Motion.load(tmp_path / "m.npz").q[-1] - end).max() < 0.003
@@ -47,7 +49,9 @@ def test_a_plan_begins_at_the_trajectory_of_a_file(tmp_path):
         iterations.append(int(found[2]))
         guess = ("--guess", "first.csv")
     assert iterations[1] < iterations[0] and efforts[1] <= efforts[0]
-    code, _, err = run(*command, "--guess", "first.csv", "-o", "first.csv", cwd=tmp_path)
+    code, _, err = run(
+        *command, "--guess", "first.csv", "-o", "first.csv", cwd=tmp_path
+    )
     assert code != 0 and "first.csv" in err
     assert "missing.csv" in refused(*command, "--guess", "missing.csv")
 
@@ -72,12 +76,23 @@ inertia = 2e-4
 @pytest.mark.parametrize("degrees", [1.0, 30.0])
 def test_wheels_alone_slew_a_body_at_rest(tmp_path, degrees):
     (tmp_path / "wheels.toml").write_text(WHEELS)
-    command = ["plan", "cubesat", "--inputs", "wheels.toml", "--target-rpy", degrees, 0, 0]
+    command = [
+        "plan",
+        "cubesat",
+        "--inputs",
+        "wheels.toml",
+        "--target-rpy",
+        degrees,
+        0,
+        0,
+    ]
     for name in ("r_b", "v_b", "omega_b"):
         command += ["--free-end", name]
     code, _, err = run(*command, "--duration", 60, "-o", "p.npz", cwd=tmp_path)
     assert code == 0, err
-    robot = fflin.load("cubesat", inputs=[fflin.ReactionWheel(a, inertia=2e-4) for a in np.eye(3)])
+    robot = fflin.load(
+        "cubesat", inputs=[fflin.ReactionWheel(a, inertia=2e-4) for a in np.eye(3)]
+    )
     motion = fflin.Trajectory.load(tmp_path / "p.npz", robot)
     roll = 2.0 * np.arctan2(motion.q[-1, 3], motion.q[-1, 6])
     assert np.degrees(roll) == pytest.approx(degrees, abs=1e-6)
@@ -91,14 +106,19 @@ def test_an_equilibrium_has_its_inputs_and_its_stability(tmp_path):
     saved = json.loads((tmp_path / "e.json").read_text())
     robot = fflin.load(ROBOT, stiffness={"joint_1": 3.0})
     held = fflin.equilibrium(robot, fflin.configuration(robot, {"joint_1": 0.2}))
-    assert np.abs(saved["u"] - held.u).max() < 1e-9 and np.abs(saved["q"] - held.q).max() < 1e-9
+    assert (
+        np.abs(saved["u"] - held.u).max() < 1e-9
+        and np.abs(saved["q"] - held.q).max() < 1e-9
+    )
     circle = fflin.load("cubesat", orbit=fflin.CircularOrbit(400e3))
     found = fflin.relative_equilibria(circle)
     k = next(k for k, each in enumerate(found) if each.stable is False)
     orbit = ("--orbit", 400e3, "--relative-equilibrium", k + 1)
     said = json.loads(run("equilibrium", "cubesat", *orbit, "--json")[1])
     assert said["stability"] == "unstable"
-    assert said["largest_real_part"] == pytest.approx(found[k].poles.real.max(), rel=1e-6)
+    assert said["largest_real_part"] == pytest.approx(
+        found[k].poles.real.max(), rel=1e-6
+    )
     assert "--effort" in refused("equilibrium", ROBOT, "--effort", "tau_m.joint_1=1")
 
 
@@ -118,7 +138,16 @@ def test_an_equilibrium_beyond_the_limits_is_told():
 
 
 def test_predictive_control_keeps_the_limits(tmp_path):
-    command = ("simulate", ROBOT, "--joint", "joint_1=0.3", "--duration", 4, "--dt", 0.05)
+    command = (
+        "simulate",
+        ROBOT,
+        "--joint",
+        "joint_1=0.3",
+        "--duration",
+        4,
+        "--dt",
+        0.05,
+    )
     mpc = ("--mpc", "--sample", 0.2, "--horizon", 10, "--limit", "tau_m=0.1")
     code, *_ = run(*command, *mpc, "-o", "m.npz", cwd=tmp_path)
     motion, robot = fflin.Motion.load(tmp_path / "m.npz"), fflin.load(ROBOT)
@@ -156,5 +185,8 @@ def test_the_former_names_of_the_time_steps_still_work(tmp_path, capsys):
     new, former = x("--sample", 0.1, "--dt", 0.02), x("--dt", 0.1, "--step", 0.02)
     assert np.array_equal(new, former) and not np.array_equal(new, x("--dt", 0.02))
     assert np.array_equal(x("--dt", 0.02), x("--step", 0.02))
-    gains = [json.loads(run("lqr", ROBOT, name, 0.1, "--json")[1]) for name in ("--dt", "--sample")]
+    gains = [
+        json.loads(run("lqr", ROBOT, name, 0.1, "--json")[1])
+        for name in ("--dt", "--sample")
+    ]
     assert gains[0] == gains[1] and gains[0]["dt"] == 0.1

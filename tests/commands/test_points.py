@@ -40,7 +40,9 @@ def test_a_file_gives_point_target_and_start_by_full_names(sat):
     robot = fflin.load(sat / "sat.toml")
     assert robot.point["joints"] == {"joint_2": 0.6, "joint_4": -0.8}
     assert robot.target == {"joints": {"joint_2": 0.9}}
-    moved = robot.replace(point={"velocity": {"joint_1": 0.1}}, target={"rpy": (1, 2, 3)})
+    moved = robot.replace(
+        point={"velocity": {"joint_1": 0.1}}, target={"rpy": (1, 2, 3)}
+    )
     assert moved.point == {"velocity": {"qdot_m.joint_1": 0.1}}
     assert moved.target == {"rpy": (1.0, 2.0, 3.0)} and moved.start == robot.start
     locked = fflin.load(sat / "sat.toml", lock=["joint_2"])
@@ -50,7 +52,8 @@ def test_a_file_gives_point_target_and_start_by_full_names(sat):
             robot.replace(**{field: {"rpy": [1, 2]}})
         with pytest.raises(fflin.UnknownNameError, match=f"part of {field}"):
             robot.replace(**{field: {"joint": {}}})
-    assert not fflin.linearize(robot).q[7:][::2][0]  # functions are about their arguments
+    # functions are about their arguments
+    assert not fflin.linearize(robot).q[7:][::2][0]
 
 
 @pytest.mark.parametrize("command", ["linearize", "lqr"])
@@ -61,13 +64,17 @@ def test_commands_are_about_the_point(sat, command):
     made, robot = kind.load(sat / "m.npz"), fflin.load(sat / "sat.toml")
     lin = fflin.linearize(robot, pose(robot, 30, joint_2=0.6, joint_4=-0.8))
     np.testing.assert_array_equal(made.A, lin.A)
-    code, _, err = run(command, "sat.toml", "--joint", "joint_2=0.1", "-o", "m.npz", cwd=sat)
+    code, _, err = run(
+        command, "sat.toml", "--joint", "joint_2=0.1", "-o", "m.npz", cwd=sat
+    )
     lin = fflin.linearize(robot, pose(robot, 30, joint_2=0.1, joint_4=-0.8))
     np.testing.assert_array_equal(kind.load(sat / "m.npz").A, lin.A)
 
 
 def simulated(folder, *options):
-    code, _, err = run("simulate", "sat.toml", "--duration", 1, "-o", "m.npz", *options, cwd=folder)
+    code, _, err = run(
+        "simulate", "sat.toml", "--duration", 1, "-o", "m.npz", *options, cwd=folder
+    )
     assert code in (0, 1), err
     return fflin.Motion.load(folder / "m.npz")
 
@@ -102,7 +109,9 @@ def test_target_options_override_the_file(sat):
         *("--target-rpy", 0, 0, 1),
         cwd=sat,
     )
-    assert "--target-rpy" in refused("simulate", "sat.toml", "--free", *options[:4], cwd=sat)
+    assert "--target-rpy" in refused(
+        "simulate", "sat.toml", "--free", *options[:4], cwd=sat
+    )
 
 
 def test_a_gain_holds_the_base_at_the_target(sat):
@@ -124,7 +133,9 @@ def test_sweep_is_about_the_point(sat):
         assert code == 0, err
         batch = fflin.LinearBatch.load(sat / "s.npz")
         robot = fflin.load(sat / "sat.toml")
-        np.testing.assert_allclose(batch.q[:, :7], [pose(robot, 30)[:7]] * 2, atol=1e-12)
+        np.testing.assert_allclose(
+            batch.q[:, :7], [pose(robot, 30)[:7]] * 2, atol=1e-12
+        )
         if points[0] == "--grid":
             ends = [pose(robot, 30, joint_2=x, joint_4=-0.8) for x in (0.0, 1.0)]
             np.testing.assert_allclose(batch.q, ends, atol=1e-12)
@@ -132,11 +143,17 @@ def test_sweep_is_about_the_point(sat):
 
 def test_uncertain_is_about_the_point_at_rest(sat):
     path = sat / "sat.toml"
-    path.write_text(path.read_text().replace("[target]", "velocity = { joint_1 = 0.1 }\n[target]"))
-    code, _, err = run("uncertain", "sat.toml", "--vary", "base.mass=0.1", "-o", "u.npz", cwd=sat)
+    path.write_text(
+        path.read_text().replace("[target]", "velocity = { joint_1 = 0.1 }\n[target]")
+    )
+    code, _, err = run(
+        "uncertain", "sat.toml", "--vary", "base.mass=0.1", "-o", "u.npz", cwd=sat
+    )
     assert code == 0, err
     robot = fflin.load(path)
-    lft = fflin.uncertain(robot, {"base.mass": 0.1}).lft(pose(robot, 30, joint_2=0.6, joint_4=-0.8))
+    lft = fflin.uncertain(robot, {"base.mass": 0.1}).lft(
+        pose(robot, 30, joint_2=0.6, joint_4=-0.8)
+    )
     np.testing.assert_allclose(fflin.LFT.load(sat / "u.npz").A, lft.A, atol=1e-14)
 
 

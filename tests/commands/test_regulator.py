@@ -42,20 +42,33 @@ def test_it_shows_and_saves_the_gain_that_the_library_gives(capsys, tmp_path):
         np.diag(R), rel=1e-12
     )
     assert says(saved.weights, "q_b, tau_b.x, tau_m, q_m.joint_1")
-    assert saved.K == pytest.approx(expected.K, rel=1e-9, abs=1e-9 * np.abs(expected.K).max())
+    assert saved.K == pytest.approx(
+        expected.K, rel=1e-9, abs=1e-9 * np.abs(expected.K).max()
+    )
     for words in ("every entry", "A - B K", "disk margin", "q_b, tau_b.x"):
         assert words in out
 
 
 def test_dt_keeps_the_continuous_cost(capsys, tmp_path):
     path = tmp_path / "gain.json"
-    options = ("--weights", "identity", "--r", "tau_m=2", "--sample", "0.2", "-o", str(path))
+    options = (
+        "--weights",
+        "identity",
+        "--r",
+        "tau_m=2",
+        "--sample",
+        "0.2",
+        "-o",
+        str(path),
+    )
     assert run(capsys, "planar_detumble", *options)[0] == 0
     lin = fflin.linearize(fflin.load("planar_detumble"))
     cost = fflin.sampled_cost(lin, 0.2, 1.0, {"tau_b": 1.0, "F_b": 1.0, "tau_m": 2.0})
     saved = fflin.Gain.load(path)
     assert saved.dt == 0.2
-    assert saved.K == pytest.approx(fflin.lqr(lin.discretize(0.2), *cost).K, rel=1e-6, abs=1e-6)
+    assert saved.K == pytest.approx(
+        fflin.lqr(lin.discretize(0.2), *cost).K, rel=1e-6, abs=1e-6
+    )
 
 
 @pytest.mark.parametrize("dt", [None, 0.2])
@@ -99,9 +112,13 @@ def test_bad_input_is_one_line_and_leaves_no_file(capsys, tmp_path):
         "cannot balance": ("--gravity", "0", "0", "-9.81", "--inputs", "joints"),
         "--q": ("--q", "q_b=1", "--q", "q_b=2"),
     }.items():
-        code, out, err = run(capsys, "ets_vii", *arguments, "-o", str(tmp_path / "k.npz"))
+        code, out, err = run(
+            capsys, "ets_vii", *arguments, "-o", str(tmp_path / "k.npz")
+        )
         assert (code, out) == (2, ""), words
-        assert err.count("\n") == 1 and err.startswith("fflin: error: ") and words in err, err
+        assert (
+            err.count("\n") == 1 and err.startswith("fflin: error: ") and words in err
+        ), err
     assert not list(tmp_path.iterdir())
     code, _, err = run(capsys, "ets_vii", "-o", str(tmp_path / "k.csv"))
     assert code == 2 and "'.csv'" in err
@@ -124,7 +141,9 @@ def test_three_wheels_hold_the_attitude_without_being_asked(capsys, tmp_path):
     assert says(out, "not regulated: r_b.x")
     saved = fflin.Gain.load(path)
     robot = fflin.load("cubesat", inputs=fflin.load_inputs(inputs))
-    assert (saved.K == fflin.lqr(fflin.linearize(robot)).K).all() and len(saved.regulated) == 6
+    assert (saved.K == fflin.lqr(fflin.linearize(robot)).K).all() and len(
+        saved.regulated
+    ) == 6
     inputs.write_text(WHEELS.rpartition("[[input]]")[0])
     code, out, err = run(capsys, "cubesat", "--inputs", str(inputs))
     assert (code, out) == (
@@ -136,11 +155,18 @@ def test_three_wheels_hold_the_attitude_without_being_asked(capsys, tmp_path):
 def test_the_speeds_of_wheels_are_chosen_and_weighed(capsys, tmp_path):
     path = tmp_path / "gain.npz"
     common = ("cubesat", "--inputs", "cubesat", "-o", str(path))
-    for options, speeds in (((), 3), (("--no-wheel-speeds",), 0), (("--wheel-speeds",), 3)):
+    for options, speeds in (
+        ((), 3),
+        (("--no-wheel-speeds",), 0),
+        (("--wheel-speeds",), 3),
+    ):
         assert run(capsys, *common, *options)[0] == 0
         kept = fflin.Gain.load(path).regulated
         assert sum(name.startswith("qdot_m.wheel_") for name in kept) == speeds
-    assert run(capsys, *common, "--sample", "0.1", "--bryson", "qdot_m.wheel_z=0.5")[0] == 0
+    assert (
+        run(capsys, *common, "--sample", "0.1", "--bryson", "qdot_m.wheel_z=0.5")[0]
+        == 0
+    )
     quick = fflin.Gain.load(path)
     assert run(capsys, *common, "--sample", "0.1")[0] == 0
     slow = fflin.Gain.load(path)
@@ -165,7 +191,9 @@ def test_the_loop_that_lqr_reports_is_the_loop_that_is_simulated(capsys, tmp_pat
     code, out, err = run(capsys, *robot, "-o", str(path))
     assert (code, err) == (0, "") and "--no-allocate" in out
     gain = fflin.Gain.load(path)
-    assert gain.input_names[:6] == tuple(f"{x}.{axis}" for x in ("tau_b", "F_b") for axis in "xyz")
+    assert gain.input_names[:6] == tuple(
+        f"{x}.{axis}" for x in ("tau_b", "F_b") for axis in "xyz"
+    )
     runs = []
     for options in ((), ("--gain", str(path))):
         told = ("simulate", *robot, "--rpy", "5", "0", "0", "--duration", "2", *options)
@@ -176,7 +204,10 @@ def test_the_loop_that_lqr_reports_is_the_loop_that_is_simulated(capsys, tmp_pat
     # The thrusters themselves are weighted only if they are to be commanded one by one.
     code, _, err = run(capsys, *robot, "--r", "thrust=1")
     assert code == 2 and says(err, "no input named 'thrust'", "--no-allocate")
-    assert run(capsys, *robot, "--r", "thrust=1", "--no-allocate", "-o", str(other))[0] == 0
+    assert (
+        run(capsys, *robot, "--r", "thrust=1", "--no-allocate", "-o", str(other))[0]
+        == 0
+    )
     assert fflin.Gain.load(other).input_names[0] == "x_plus_top"
 
 

@@ -56,7 +56,16 @@ CHAIN = {
     "check": (("--trajectory", "plan.npz"), "A and B are verified: largest error"),
     "tvlqr": (("--trajectory", "plan.npz", "-o", "gains.npz"), r"knots=\d+"),
     "funnel": (
-        ("--schedule", "gains.npz", "--goal", "attitude=5", "--knots", 2, "--samples", 2),
+        (
+            "--schedule",
+            "gains.npz",
+            "--goal",
+            "attitude=5",
+            "--knots",
+            2,
+            "--samples",
+            2,
+        ),
         "every run ends with attitude up to 5 deg",
     ),
     "sweep": (("--random", 3, "-o", "grid.npz"), "3 points"),
@@ -71,8 +80,12 @@ CHAIN = {
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_a_report_of_a_trajectory_and_of_many_runs_is_too(robot, tmp_path):
-    (tmp_path / "spread.toml").write_text('[dispersions]\n"base.mass" = 0.1\nq_b = 0.05\n')
-    fflin.simulate(fflin.load(robot), duration=0.5, dt=0.1).trajectory().save(tmp_path / "plan.npz")
+    (tmp_path / "spread.toml").write_text(
+        '[dispersions]\n"base.mass" = 0.1\nq_b = 0.05\n'
+    )
+    fflin.simulate(fflin.load(robot), duration=0.5, dt=0.1).trajectory().save(
+        tmp_path / "plan.npz"
+    )
     for command, (options, words) in CHAIN.items():
         code, out, err = run(command, robot, *options, cwd=tmp_path)
         assert code == 0, err
@@ -82,7 +95,9 @@ def test_a_report_of_a_trajectory_and_of_many_runs_is_too(robot, tmp_path):
 @pytest.mark.exhaustive
 def test_the_list_of_robots_begins_with_how_many_load():
     lines = run("robots")[1].splitlines()
-    assert re.fullmatch(r"robots: \d+ robots can be loaded by name; 1 cannot be loaded", lines[0])
+    assert re.fullmatch(
+        r"robots: \d+ robots can be loaded by name; 1 cannot be loaded", lines[0]
+    )
     assert len(set(lines) - {""}) == len([line for line in lines if line])
 
 

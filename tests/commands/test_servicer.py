@@ -9,7 +9,9 @@ import fflin
 from tests.support.commands import run
 
 HALF, LEVER = (0.6, 0.6, 0.8), (0.5, 0.5, 0.5)
-DISPERSIONS = '[dispersions]\n"base.mass" = 0.05\n"q_b" = 0.01\n"panel_*.stiffness" = 0.2\n'
+DISPERSIONS = (
+    '[dispersions]\n"base.mass" = 0.05\n"q_b" = 0.01\n"panel_*.stiffness" = 0.2\n'
+)
 COMMANDS = (
     "info servicer.toml",
     "check servicer.toml",
@@ -48,7 +50,9 @@ def urdf():
         parts.append(link(f"panel_{name}", 20.0, (1.0, 3.0, 0.03), (0, 1.6 * side, 0)))
         limits = (-0.3, 0.3, 0, 1)
         at = (0, 0.6 * side, 0)
-        parts.append(joint(f"panel_{name}", "base", f"panel_{name}", at, "1 0 0", limits))
+        parts.append(
+            joint(f"panel_{name}", "base", f"panel_{name}", at, "1 0 0", limits)
+        )
     parent, at = "base", (0.6, 0, 0.5)
     for k in range(7):
         axis = ("0 0 1", "0 1 0", "0 1 0", "1 0 0", "0 1 0", "0 0 1", "1 0 0")[k]
@@ -80,13 +84,17 @@ def robot_file():
         direction[k] = s
         where = f"position = {position.tolist()}\ndirection = {direction.tolist()}\nmax = 22.0"
         name = f"{'xyz'[k]}_{'pm'[s < 0]}{'pm'[t < 0]}"
-        lines.append(f'[[input]]\ntype = "thruster"\nname = "{name}"\nframe = "base"\n{where}')
+        lines.append(
+            f'[[input]]\ntype = "thruster"\nname = "{name}"\nframe = "base"\n{where}'
+        )
     lines.append('[[input]]\ntype = "joint_torque"\njoint = "joint_*"')
     return "\n".join(lines)
 
 
 @pytest.mark.compiled
-def test_a_servicer_goes_from_urdf_to_page_campaign_and_lft_with_eight_options(tmp_path):
+def test_a_servicer_goes_from_urdf_to_page_campaign_and_lft_with_eight_options(
+    tmp_path,
+):
     (tmp_path / "servicer.urdf").write_text(urdf())
     (tmp_path / "servicer.toml").write_text(robot_file())
     (tmp_path / "dispersions.toml").write_text(DISPERSIONS)
@@ -104,9 +112,13 @@ def test_a_servicer_goes_from_urdf_to_page_campaign_and_lft_with_eight_options(t
     motion = fflin.Motion.load(tmp_path / "motion.npz")
     # From 6, -4 and 8 deg to the point, without a command beyond its limit.
     assert motion.attitude_error[0] > 8.0 and motion.attitude_error[-1] < 0.05
-    arm = [i for i, name in enumerate(motion.state_names) if name.startswith("q_m.joint")]
+    arm = [
+        i for i, name in enumerate(motion.state_names) if name.startswith("q_m.joint")
+    ]
     assert np.abs((motion.x[-1] - motion.target)[arm]).max() < 1e-3
-    thrust = [i for i, name in enumerate(motion.input_names) if name[:2] in ("x_", "y_", "z_")]
+    thrust = [
+        i for i, name in enumerate(motion.input_names) if name[:2] in ("x_", "y_", "z_")
+    ]
     assert not motion.passed and 0.0 <= motion.u[:, thrust].min()
     # The campaign has left machine code for this run of more than 20,000 steps.
     assert motion.engine == "compiled"

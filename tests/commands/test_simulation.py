@@ -39,7 +39,16 @@ def test_a_loop_settles_is_saved_and_drawn(tmp_path):
 
 def test_an_arm_with_slow_joints_comes_back_within_its_limits(tmp_path):
     code, out, _ = run(
-        *("simulate", "canadarm2", "--joint", "joint_2=0.5", "--duration", 40, "--dt", 0.05),
+        *(
+            "simulate",
+            "canadarm2",
+            "--joint",
+            "joint_2=0.5",
+            "--duration",
+            40,
+            "--dt",
+            0.05,
+        ),
         *("-o", "m.npz"),
         cwd=tmp_path,
     )
@@ -51,7 +60,9 @@ def test_an_arm_with_slow_joints_comes_back_within_its_limits(tmp_path):
             if not name.startswith("q_m."):
                 assert np.abs(row).max() <= limits.get(name, np.inf), name
     joint = motion.x[:, motion.state_names.index("q_m.joint_2")]
-    assert joint[0] == 0.5 and abs(joint[-1]) < 0.4 * joint[0] and joint.max() == joint[0]
+    assert (
+        joint[0] == 0.5 and abs(joint[-1]) < 0.4 * joint[0] and joint.max() == joint[0]
+    )
 
 
 def test_target_sampling_limits_and_delay(tmp_path):
@@ -63,15 +74,30 @@ def test_target_sampling_limits_and_delay(tmp_path):
     )
     assert (code, err) == (0, "")
     motion = fflin.Motion.load(tmp_path / "m.json")
-    joints = [i for i, name in enumerate(motion.input_names) if name.startswith("tau_m")]
+    joints = [
+        i for i, name in enumerate(motion.input_names) if name.startswith("tau_m")
+    ]
     assert np.abs(motion.u[:, joints]).max() == 3.0
     assert not motion.u[:5].any()
-    assert motion.x[-1, motion.state_names.index("q_m.joint_1")] == pytest.approx(0.5, abs=0.02)
+    assert motion.x[-1, motion.state_names.index("q_m.joint_1")] == pytest.approx(
+        0.5, abs=0.02
+    )
 
 
 @pytest.mark.process
 def test_thrusts_are_allocated_or_their_cut_is_told(tmp_path):
-    command = ("simulate", "cubesat", "--inputs", "cubesat", "--rpy", 20, 0, 0, "--duration", 80)
+    command = (
+        "simulate",
+        "cubesat",
+        "--inputs",
+        "cubesat",
+        "--rpy",
+        20,
+        0,
+        0,
+        "--duration",
+        80,
+    )
     command = [sys.executable, "-m", "fflin", *map(str, command), "--sample", "0.1"]
     settled = []
     for option in (("--no-allocate",), ()):
@@ -87,15 +113,32 @@ def test_thrusts_are_allocated_or_their_cut_is_told(tmp_path):
         assert motion.attitude_error[0] == pytest.approx(20.0)
         assert motion.attitude_error[-1] < 0.1
         settled.append(motion.t[motion.attitude_error > 0.4].max())
-        assert says(done.stderr, "negative thrust", "cut at zero") if option else not done.stderr
+        assert (
+            says(done.stderr, "negative thrust", "cut at zero")
+            if option
+            else not done.stderr
+        )
     # Half of what the thrusters were to give was cut; the wheels gave their part.
     assert settled[1] < 0.85 * settled[0]
     assert "--allocate" in refused("simulate", "ets_vii", "--allocate")
 
 
-def test_the_linear_model_is_shown_between_samples_and_inputs_stay_with_their_units(tmp_path):
+def test_the_linear_model_is_shown_between_samples_and_inputs_stay_with_their_units(
+    tmp_path,
+):
     code, out, _ = run(
-        *("simulate", "cubesat", "--inputs", "cubesat", "--rpy", 5, 0, 0, "--sample", 0.5),
+        *(
+            "simulate",
+            "cubesat",
+            "--inputs",
+            "cubesat",
+            "--rpy",
+            5,
+            0,
+            0,
+            "--sample",
+            0.5,
+        ),
         *("--duration", 5, "-o", "m.npz", "--no-allocate"),
         cwd=tmp_path,
     )
@@ -103,7 +146,9 @@ def test_the_linear_model_is_shown_between_samples_and_inputs_stay_with_their_un
     motion = fflin.Motion.load(tmp_path / "m.npz")
     assert motion.linear.shape == motion.x.shape
     # The wheels make some turns, and are left where they are then.
-    base = [not name.partition(".")[2].startswith("wheel_") for name in motion.state_names]
+    base = [
+        not name.partition(".")[2].startswith("wheel_") for name in motion.state_names
+    ]
     assert np.abs(motion.linear - motion.x)[:, base].max() < 1e-4
     apart = np.abs(motion.linear - motion.x).max() / np.abs(motion.x).max()
     assert apart < 1e-3
@@ -121,7 +166,15 @@ def test_the_motion_is_kept_though_nobody_reads_the_table(tmp_path):
     pipe = os.pipe()
     os.close(pipe[0])
     with os.fdopen(pipe[1], "w") as closed:
-        command = [sys.executable, "-m", "fflin", "simulate", "cubesat", "--duration", "1"]
+        command = [
+            sys.executable,
+            "-m",
+            "fflin",
+            "simulate",
+            "cubesat",
+            "--duration",
+            "1",
+        ]
         done = finished(
             [*command, "-o", "m.npz"],
             cwd=tmp_path,
@@ -152,13 +205,24 @@ def interrupted(monkeypatch):
     )
 
 
-def test_a_run_that_is_interrupted_takes_no_earlier_files_place(tmp_path, interrupted, capsys):
+def test_a_run_that_is_interrupted_takes_no_earlier_files_place(
+    tmp_path, interrupted, capsys
+):
     from fflin.commands import cli
 
     path, page, new = tmp_path / "m.npz", tmp_path / "m.html", tmp_path / "m.png"
     fflin.simulate(fflin.load("cubesat"), duration=0.1).save(path)
     earlier = path.read_bytes()
-    command = ["simulate", "cubesat", "--duration", "1", "-o", str(path), "--plot", str(new)]
+    command = [
+        "simulate",
+        "cubesat",
+        "--duration",
+        "1",
+        "-o",
+        str(path),
+        "--plot",
+        str(new),
+    ]
     with pytest.raises(KeyboardInterrupt) as caught:
         cli.main(command)
     assert says(str(caught.value), "t = 0.5 s", str(path))
@@ -197,7 +261,15 @@ def test_joints_alone_cannot_hold_the_base_but_the_reduced_part():
     assert "angular momentum" in err
     assert "--reduce" in err
     code, out, _ = run(
-        *("simulate", "ets_vii", "--inputs", "joints", "--reduce", "--joint", "joint_1=0.3"),
+        *(
+            "simulate",
+            "ets_vii",
+            "--inputs",
+            "joints",
+            "--reduce",
+            "--joint",
+            "joint_1=0.3",
+        ),
         *("--duration", 50, "--dt", 0.05),
     )
     assert code == 0
@@ -219,7 +291,9 @@ def test_joints_alone_cannot_hold_the_base_but_the_reduced_part():
     ],
 )
 def test_bad_input_is_one_line_and_leaves_nothing(tmp_path, arguments, said):
-    assert said in refused("simulate", "ets_vii", "--duration", 20, *arguments, cwd=tmp_path)
+    assert said in refused(
+        "simulate", "ets_vii", "--duration", 20, *arguments, cwd=tmp_path
+    )
     assert not list(tmp_path.iterdir())
 
 
@@ -228,7 +302,19 @@ def test_inputs_are_cut_to_the_limits_of_the_robot_unless_told_otherwise(tmp_pat
         "[[input]]\ntype = 'base_torque'\nmax = 1e-3\n[[input]]\ntype = 'base_force'\n"
     )
     command = ("simulate", "cubesat", "--inputs", "weak.toml", "--weights", "identity")
-    command = (*command, "--rpy", 20, 0, 0, "--duration", 1, "--dt", 0.01, "-o", "m.npz")
+    command = (
+        *command,
+        "--rpy",
+        20,
+        0,
+        0,
+        "--duration",
+        1,
+        "--dt",
+        0.01,
+        "-o",
+        "m.npz",
+    )
 
     def largest(*options):
         code, out, _ = run(*command, *options, cwd=tmp_path)
@@ -260,7 +346,9 @@ def wheels_file(tmp_path, count=3):
     return path
 
 
-@pytest.mark.parametrize("options", [(), *exhaustive((("--reduce",),), (("--sample", 0.2),))])
+@pytest.mark.parametrize(
+    "options", [(), *exhaustive((("--reduce",),), (("--sample", 0.2),))]
+)
 def test_three_wheels_settle_the_attitude(tmp_path, options):
     code, _, err = run(
         *("simulate", "cubesat", "--inputs", wheels_file(tmp_path), "--rpy", 30, 0, 0),
@@ -269,7 +357,10 @@ def test_three_wheels_settle_the_attitude(tmp_path, options):
     )
     assert (code, err) == (0, "")
     motion = fflin.Motion.load(tmp_path / "m.npz")
-    assert motion.attitude_error[0] == pytest.approx(30.0) and motion.attitude_error[-1] < 0.01
+    assert (
+        motion.attitude_error[0] == pytest.approx(30.0)
+        and motion.attitude_error[-1] < 0.01
+    )
     assert np.abs(motion.u).max() > 1e-4 and np.abs(motion.momentum).max() < 1e-12
 
 
@@ -287,15 +378,26 @@ def test_a_target_velocity_is_the_points_and_is_held(tmp_path):
 
     options = ("--inputs", wheels_file(tmp_path), "--target-velocity", "wheel_z=500")
     speed, target, _ = speeds(*options, "--duration", 5)
-    assert target == 500.0 and speed == pytest.approx(np.full(len(speed), 500.0), abs=1e-9)
+    assert target == 500.0 and speed == pytest.approx(
+        np.full(len(speed), 500.0), abs=1e-9
+    )
     # With thrusters it comes back from another speed, and the body hardly notices.
-    options = ("--inputs", "cubesat", "--target-velocity", "wheel_z=500", "--duration", 300)
+    options = (
+        "--inputs",
+        "cubesat",
+        "--target-velocity",
+        "wheel_z=500",
+        "--duration",
+        300,
+    )
     speed, target, motion = speeds(
         *(*options, "--velocity", "wheel_z=450", "--dt", 0.05, "--engine", "compiled")
     )
     assert (speed[0], target) == (450.0, 500.0) and abs(speed[-1] - 500.0) < 1.0
     assert motion.attitude_error.max() < 2.0 and motion.attitude_error[-1] < 0.01
-    assert "--free" in refused("simulate", "cubesat", "--free", "--target-velocity", "omega_b.x=1")
+    assert "--free" in refused(
+        "simulate", "cubesat", "--free", "--target-velocity", "omega_b.x=1"
+    )
     assert "more than once for 'wheel_x'" in refused(
         *("simulate", "cubesat", "--inputs", wheels_file(tmp_path)),
         *("--target-velocity", "wheel_x=1", "--target-velocity", "wheel_x=2"),
@@ -324,7 +426,9 @@ def test_an_on_off_thruster_without_samples_is_told_of_dt(tmp_path):
         'urdf = "cubesat"\n[[input]]\ntype = "base_torque"\n[[input]]\ntype = "thruster"\n'
         'frame = "base"\nposition = [0, 0, 0]\ndirection = [1, 0, 0]\nmax = 1\non_off = true\n'
     )
-    said = refused("simulate", tmp_path / "t.toml", "--no-allocate", "--rpy", 9, 0, 0, "--reduce")
+    said = refused(
+        "simulate", tmp_path / "t.toml", "--no-allocate", "--rpy", 9, 0, 0, "--reduce"
+    )
     assert says(said, "(--sample)")
 
 
@@ -335,20 +439,50 @@ def test_a_controller_from_a_file_closes_the_loop(tmp_path, dt):
     lin = fflin.linearize(robot)
     lin = lin.discretize(dt) if dt else lin
     by = fflin.lqg(fflin.lqr(lin), fflin.kalman(lin, 1e-3, 1e-4))
-    turned = {"A": by.A, "B": by.B, "C": -by.C, "D": np.zeros((len(by.C), by.B.shape[1])), "Ts": dt}
+    turned = {
+        "A": by.A,
+        "B": by.B,
+        "C": -by.C,
+        "D": np.zeros((len(by.C), by.B.shape[1])),
+        "Ts": dt,
+    }
     scipy.io.savemat(tmp_path / "K.mat", turned)
-    options = ("simulate", "ets_vii", "--output", "base", "--output", "joints", "--dt", 0.02)
-    options = (*options, "--rpy", 10, 0, 0, "--controller", "K.mat", "--negative-feedback")
+    options = (
+        "simulate",
+        "ets_vii",
+        "--output",
+        "base",
+        "--output",
+        "joints",
+        "--dt",
+        0.02,
+    )
+    options = (
+        *options,
+        "--rpy",
+        10,
+        0,
+        0,
+        "--controller",
+        "K.mat",
+        "--negative-feedback",
+    )
     code, out, err = run(*options, "-o", "m.npz", cwd=tmp_path)
     assert (code, err) == (0, "") and "settled" in out
     motion = fflin.Motion.load(tmp_path / "m.npz")
-    assert motion.attitude_error[0] == pytest.approx(10.0) and motion.attitude_error[-1] < 0.05
+    assert (
+        motion.attitude_error[0] == pytest.approx(10.0)
+        and motion.attitude_error[-1] < 0.05
+    )
     policy = fflin.LinearController(by, lin)
-    again = fflin.simulate(robot, policy, q0=motion.q[0], duration=motion.t[-1], dt=0.02)
+    again = fflin.simulate(
+        robot, policy, q0=motion.q[0], duration=motion.t[-1], dt=0.02
+    )
     assert np.abs(again.x - motion.x).max() < 1e-9
     (tmp_path / "u.toml").write_text("[dispersions]\nq_b = 0.01\n'*.sensor' = 1e-4\n")
     code, out, err = run(
-        *("montecarlo", *options[1:], "u.toml", "--runs", 4, "--duration", 2), cwd=tmp_path
+        *("montecarlo", *options[1:], "u.toml", "--runs", 4, "--duration", 2),
+        cwd=tmp_path,
     )
     assert (code, err) == (0, "")
 

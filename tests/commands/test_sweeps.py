@@ -22,7 +22,9 @@ def test_grid_random_and_file_say_the_same(tmp_path, robots):
         *("--joint", "joint_1=0.2", "-o", tmp_path / "g.h5"),
     )
     assert code == 0 and says(out, "g.h5", "6 points, 24 states, 12 inputs")
-    assert re.match(r"fflin: linearising 'ets_vii' about 6 points; .*g\.h5 takes [\d.]+ kB\n", err)
+    assert re.match(
+        r"fflin: linearising 'ets_vii' about 6 points; .*g\.h5 takes [\d.]+ kB\n", err
+    )
     batch = fflin.LinearBatch.load(tmp_path / "g.h5", robot)
     assert batch.joint_positions[:, :4] == pytest.approx(
         np.array([[0.2, a, 0.0, b] for a in (-1.0, 0.0, 1.0) for b in (-2.0, 0.0)])
@@ -38,9 +40,13 @@ def test_grid_random_and_file_say_the_same(tmp_path, robots):
         *("--velocity", "joint_1=0.3", "--frame", "world", "-o", tmp_path / "r.npz"),
     )
     drawn = fflin.LinearBatch.load(tmp_path / "r.npz", robot)
-    expected = fflin.random_configurations(robot, 7, seed=5, ranges={"joint_3": (0.1, 0.2)})
+    expected = fflin.random_configurations(
+        robot, 7, seed=5, ranges={"joint_3": (0.1, 0.2)}
+    )
     assert code == 0 and np.array_equal(drawn.q, expected.rows(0, 7))
-    lin = fflin.linearize(robot, drawn.q[4], fflin.velocity(robot, {"joint_1": 0.3}), frame="world")
+    lin = fflin.linearize(
+        robot, drawn.q[4], fflin.velocity(robot, {"joint_1": 0.3}), frame="world"
+    )
     assert drawn[4].A == pytest.approx(lin.A, abs=1e-12)
 
 
@@ -50,7 +56,8 @@ def test_the_engine_can_be_chosen(tmp_path):
     for engine in ("compiled", "python"):
         assert run(*points, engine, "-o", tmp_path / f"{engine}.npz")[0] == 0
     one, other = (
-        fflin.LinearBatch.load(tmp_path / f"{engine}.npz") for engine in ("compiled", "python")
+        fflin.LinearBatch.load(tmp_path / f"{engine}.npz")
+        for engine in ("compiled", "python")
     )
     assert one.A == pytest.approx(other.A, abs=1e-12)
     with any_wording():
@@ -87,13 +94,17 @@ def test_more_points_than_fit_are_refused(tmp_path):
     many = ("--grid", "joint_2=0:1:100000", "--grid", "joint_3=0:1:100000")
     code, out, err = run("sweep", "ets_vii", *many, "-o", "out.npz", cwd=tmp_path)
     assert (code, out) == (2, "")
-    assert re.fullmatch(r"fflin: error: 10,000,000,000 .*memory.*", err.splitlines()[-1])
+    assert re.fullmatch(
+        r"fflin: error: 10,000,000,000 .*memory.*", err.splitlines()[-1]
+    )
     assert not list(tmp_path.iterdir())
 
 
 def test_a_missing_file_or_ending_is_one_line(tmp_path):
     assert "-o" in refused("sweep", "ets_vii", "--random", "3", cwd=tmp_path)
-    assert ".npz, .h5" in refused("sweep", "ets_vii", "--random", "3", "-o", "x.mat", cwd=tmp_path)
+    assert ".npz, .h5" in refused(
+        "sweep", "ets_vii", "--random", "3", "-o", "x.mat", cwd=tmp_path
+    )
 
 
 def test_the_reference_may_be_the_world(tmp_path, robots):
@@ -125,7 +136,15 @@ sys.exit(main())
 def test_ctrl_c_leaves_what_is_finished_and_no_process(workers, tmp_path):
     """The whole group is interrupted, as a terminal does it."""
     pytest.importorskip("h5py")
-    command = [sys.executable, "-c", INTERRUPTED, "sweep", "ets_vii", "--random", "100000"]
+    command = [
+        sys.executable,
+        "-c",
+        INTERRUPTED,
+        "sweep",
+        "ets_vii",
+        "--random",
+        "100000",
+    ]
     options = ["--velocity", "joint_1=0.3", "-o", "x.h5", *workers]
     with in_own_session([*command, *options], tmp_path) as process:
         # These end with the last process that has them.
@@ -133,7 +152,8 @@ def test_ctrl_c_leaves_what_is_finished_and_no_process(workers, tmp_path):
     assert process.returncode == 130
     *_, last = error.splitlines()
     going_on = (
-        r"fflin: stopped at [\d,]+ of 100,000 points; the same command resumes from x.h5.part"
+        r"fflin: stopped at [\d,]+ of 100,000 points; "
+        r"the same command resumes from x.h5.part"
     )
     assert re.fullmatch(going_on, last)
     assert "Traceback" not in error

@@ -17,7 +17,10 @@ def flown(tmp_path_factory):
     """A motion under held inputs on the base in world axes: as .csv, by hand, and as .mat."""
     folder = tmp_path_factory.mktemp("tracking")
     robot = fflin.load("planar_detumble")
-    u = np.random.default_rng(2).normal(size=(4, 9)) * np.r_[np.ones(6), 0.02 * np.ones(3)]
+    u = (
+        np.random.default_rng(2).normal(size=(4, 9))
+        * np.r_[np.ones(6), 0.02 * np.ones(3)]
+    )
     motion = fflin.simulate(
         *(robot, lambda t, q, v: u[min(int(t / 0.5 + 1e-9), 3)]),
         v0=fflin.velocity(robot, {"omega_b.z": 0.3, "joint_1": 0.2}),
@@ -27,14 +30,26 @@ def flown(tmp_path_factory):
     with (folder / "flown.csv").open("w", newline="") as file:
         rows = np.column_stack((motion.t, motion.x, motion.u)).tolist()
         csv.writer(file).writerows([names, *rows[:-1], [*rows[-1][:19], *[""] * 9]])
-    arrays = {"t": motion.t, "x": motion.x, "u": motion.u, "frame": "world", "hold": "previous"}
+    arrays = {
+        "t": motion.t,
+        "x": motion.x,
+        "u": motion.u,
+        "frame": "world",
+        "hold": "previous",
+    }
     savemat(folder / "flown.mat", arrays)
     return folder, robot, motion.trajectory()
 
 
 def test_the_chain_goes_from_a_file_to_gains(flown):
     folder, robot, motion = flown
-    given = ("planar_detumble", "--trajectory", folder / "flown.csv", "--frame", "world")
+    given = (
+        "planar_detumble",
+        "--trajectory",
+        folder / "flown.csv",
+        "--frame",
+        "world",
+    )
     code, out, err = run("linearize", *given, "-o", folder / "ltv.npz")
     assert (code, err) == (0, "")
     assert says(out, "21 knots, 0 to 2 s", "'world'")
@@ -54,7 +69,9 @@ def test_the_chain_goes_from_a_file_to_gains(flown):
     assert "A and B are verified" in out
 
     weights = ("--bryson", "q_b=0.05", "--bryson", "tau_m=0.5", "--qf", "q_b=9")
-    code, out, err = run("tvlqr", *given, *weights, "--sample", "0.1", "-o", folder / "gains.npz")
+    code, out, err = run(
+        "tvlqr", *given, *weights, "--sample", "0.1", "-o", folder / "gains.npz"
+    )
     assert (code, err) == (0, "")
     schedule = fflin.GainSchedule.load(folder / "gains.npz")
     assert schedule.dt == 0.1
@@ -77,13 +94,21 @@ def test_what_is_no_motion_is_said_and_what_is_no_trajectory_refused(flown):
     assert "--plot" in refused("linearize", *given, "--plot", folder / "none.png")
     assert not (folder / "none.png").exists()
     assert "--reduce" in refused("tvlqr", *given, "--reduce")
-    assert "'q_m.joint_4'" in refused("linearize", "ets_vii", "--trajectory", folder / "flown.csv")
-    assert "nosuch.csv" in refused("tvlqr", "planar_detumble", "--trajectory", "nosuch.csv")
+    assert "'q_m.joint_4'" in refused(
+        "linearize", "ets_vii", "--trajectory", folder / "flown.csv"
+    )
+    assert "nosuch.csv" in refused(
+        "tvlqr", "planar_detumble", "--trajectory", "nosuch.csv"
+    )
     assert "0.3 s" in refused("tvlqr", *given, "--frame", "world", "--sample", "0.3")
 
 
 def chain(folder, *options, file="flown.csv"):
-    given = ("--trajectory", folder / file, *(("--frame", "world") * (file == "flown.csv")))
+    given = (
+        "--trajectory",
+        folder / file,
+        *(("--frame", "world") * (file == "flown.csv")),
+    )
     return run("simulate", "planar_detumble", *given, *options, cwd=folder)
 
 
@@ -111,7 +136,9 @@ def test_a_trajectory_is_followed_from_beside_it_to_files(flown):
     )
     assert (code, err) == (0, "")
     assert says(out, "attitude")
-    assert all((folder / name).stat().st_size > 10_000 for name in ("a.html", "a.png", "a.npz"))
+    assert all(
+        (folder / name).stat().st_size > 10_000 for name in ("a.html", "a.png", "a.npz")
+    )
     run_ = fflin.Motion.load(folder / "a.npz")
     assert run_.tracked
     assert run_.t[-1] == 2.0
@@ -121,9 +148,13 @@ def test_a_trajectory_is_followed_from_beside_it_to_files(flown):
     assert run("tvlqr", "planar_detumble", *given, *weights, cwd=folder)[0] == 0
     alone = ("--schedule", "gains.npz", *OFFSET, "--limit", "tau_m=0.5", "-o", "c.npz")
     assert run("simulate", "planar_detumble", *alone, cwd=folder)[0] == 0
-    np.testing.assert_allclose(fflin.Motion.load(folder / "c.npz").x, run_.x, atol=1e-12)
+    np.testing.assert_allclose(
+        fflin.Motion.load(folder / "c.npz").x, run_.x, atol=1e-12
+    )
     # The start is where it was asked to be.
-    state = fflin.StateMap(robot, reference=pin.XYZQUATToSE3(motion.q[0, :7]), frame="local")
+    state = fflin.StateMap(
+        robot, reference=pin.XYZQUATToSE3(motion.q[0, :7]), frame="local"
+    )
     there, here = (state.to_state(each.q[0], each.v[0]) for each in (motion, run_))
     e = np.zeros(18)
     e[2], e[6:9], e[11] = np.sin(np.radians(0.5)), 0.05, 0.05
@@ -132,7 +163,10 @@ def test_a_trajectory_is_followed_from_beside_it_to_files(flown):
 
 def test_an_offset_may_be_more_than_half_a_turn(flown):
     folder, _, motion = flown
-    assert chain(folder, "--offset", "yaw=200", "--duration", 0.01, "-o", "turned.npz")[0] == 0
+    assert (
+        chain(folder, "--offset", "yaw=200", "--duration", 0.01, "-o", "turned.npz")[0]
+        == 0
+    )
     q = fflin.Motion.load(folder / "turned.npz").q[0], motion.q[0]
     here, there = (pin.XYZQUATToSE3(each[:7]).rotation for each in q)
     np.testing.assert_allclose(
@@ -202,7 +236,15 @@ def test_gains_of_another_robot_are_refused(flown):
 
 @pytest.mark.parametrize("options", [(), ("--sample", "0.1")])
 def test_a_gain_from_a_file_regulates_as_the_one_that_is_designed(tmp_path, options):
-    lqr = ("lqr", "ets_vii", "--joint", "joint_1=0.5", "--weights", "identity", *options)
+    lqr = (
+        "lqr",
+        "ets_vii",
+        "--joint",
+        "joint_1=0.5",
+        "--weights",
+        "identity",
+        *options,
+    )
     assert run(*lqr, "-o", "gain.npz", cwd=tmp_path)[0] == 0
     start = ("simulate", "ets_vii", "--rpy", 5, 0, 0, "--duration", 2, "-o")
     designed = ("--target-joint", "joint_1=0.5", "--weights", "identity", *options)
@@ -236,17 +278,25 @@ def test_a_gain_about_the_world_feeds_back_the_state_that_it_was_designed_for(tm
         "m.npz",
         cwd=tmp_path,
     )
-    gain, motion = fflin.Gain.load(tmp_path / "gain.npz"), fflin.Motion.load(tmp_path / "m.npz")
+    gain, motion = (
+        fflin.Gain.load(tmp_path / "gain.npz"),
+        fflin.Motion.load(tmp_path / "m.npz"),
+    )
     state = fflin.StateMap(fflin.load("cubesat"))
     x = state.to_state(motion.q[0], motion.v[0])
-    np.testing.assert_allclose(motion.u[0], gain.u0 - gain.K @ (x - gain.x0), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(
+        motion.u[0], gain.u0 - gain.K @ (x - gain.x0), rtol=1e-9, atol=1e-12
+    )
 
 
 def test_gains_of_thrusters_say_that_nothing_is_allocated(tmp_path):
     thruster = '[[input]]\ntype = "thruster"\nframe = "base"\nposition = [0.1, 0, 0]\n'
     base = '[[input]]\ntype = "base_torque"\n[[input]]\ntype = "base_force"\n'
     said = []
-    for name, text in (("with", base + thruster + "direction = [0, 1, 0]\n"), ("without", base)):
+    for name, text in (
+        ("with", base + thruster + "direction = [0, 1, 0]\n"),
+        ("without", base),
+    ):
         (tmp_path / f"{name}.toml").write_text(text)
         given = ("cubesat", "--inputs", f"{name}.toml")
         options = ("--duration", "5", "--knots", "6", "-o", f"{name}.npz")

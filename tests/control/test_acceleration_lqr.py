@@ -23,10 +23,16 @@ def yang(tmp_path):
 
 
 def test_yangs_attitude_regulator_by_both_routes(yang):
-    weights = ({"q_b": 5.0, "r_b": 1.0, "omega_b": 5.0, "v_b": 1.0}, {"tau_b": 8.0, "F_b": 1.0})
+    weights = (
+        {"q_b": 5.0, "r_b": 1.0, "omega_b": 5.0, "v_b": 1.0},
+        {"tau_b": 8.0, "F_b": 1.0},
+    )
     general = fflin.lqr(yang, *weights)
     closed = fflin.acceleration_lqr(
-        yang, {"q_b": 5.0, "r_b": 1.0}, {"omega_b": 5.0, "v_b": 1.0}, [*(8.0 * J**2), 1, 1, 1]
+        yang,
+        {"q_b": 5.0, "r_b": 1.0},
+        {"omega_b": 5.0, "v_b": 1.0},
+        [*(8.0 * J**2), 1, 1, 1],
     )
     for gain in (general, closed):
         assert gain.K[:3, 6:9] == pytest.approx(np.diag(YANG_KW), abs=5e-9)
@@ -53,7 +59,9 @@ def test_closed_form_solves_the_riccati_equation(robots, name):
     # P agrees to what M M^-1 rounds to, which the closed form does without.
     assert gain.P == pytest.approx(found.P, rel=1e-8, abs=1e-12 * np.abs(found.P).max())
     expected = lin.M @ found.K
-    assert gain.K == pytest.approx(expected, rel=1e-7, abs=1e-9 * np.abs(expected).max())
+    assert gain.K == pytest.approx(
+        expected, rel=1e-7, abs=1e-9 * np.abs(expected).max()
+    )
     # Its poles are those of the loop with the inertia divided out.
     loop = np.linalg.eigvals(lin.A - B @ found.K)
     for pole in gain.poles:
@@ -73,19 +81,25 @@ def test_its_cost_sampled_gives_a_regulator_that_tends_to_it(robots):
 
 
 def test_redundant_thrusters_share_the_least_forces():
-    thrusters = [x for x in fflin.load_inputs("cubesat") if isinstance(x, fflin.Thruster)]
+    thrusters = [
+        x for x in fflin.load_inputs("cubesat") if isinstance(x, fflin.Thruster)
+    ]
     robot = fflin.load("cubesat", inputs=thrusters)
     lin = fflin.linearize(robot)
     gain = fflin.acceleration_lqr(lin, 1.0, 1.0, 1.0)
     full = fflin.acceleration_lqr(fflin.linearize(fflin.load("cubesat")), 1.0, 1.0, 1.0)
-    assert lin.B @ gain.K == pytest.approx(np.vstack((np.zeros((6, 12)), full.B[6:] @ full.K)))
+    assert lin.B @ gain.K == pytest.approx(
+        np.vstack((np.zeros((6, 12)), full.B[6:] @ full.K))
+    )
     assert gain.K == pytest.approx(np.linalg.pinv(lin.B[6:]) @ lin.B[6:] @ gain.K)
 
 
 def test_what_has_no_closed_form_is_refused():
     robot = fflin.load("ets_vii")
     lin = fflin.linearize(robot)
-    joints = robot.replace(inputs=[fflin.JointTorque(name) for name in robot.joint_names])
+    joints = robot.replace(
+        inputs=[fflin.JointTorque(name) for name in robot.joint_names]
+    )
     for model in (joints, joints.replace(stiffness=0.0)):
         with pytest.raises(fflin.StabilizabilityError, match="angular momentum"):
             fflin.acceleration_lqr(fflin.linearize(model), 1, 1, 1)

@@ -32,10 +32,14 @@ def test_four_rotors_have_the_closed_form(tmp_path):
 OUT = {"shoulder": 1.2, "elbow": 0.3}
 
 
-@pytest.mark.parametrize("rpy", [(0.0, 0.0, 0.0), (0.3, -0.5, 1.0)], ids=["level", "inclined"])
+@pytest.mark.parametrize(
+    "rpy", [(0.0, 0.0, 0.0), (0.3, -0.5, 1.0)], ids=["level", "inclined"]
+)
 def test_the_base_tilts_until_the_rotors_carry_the_arm(tmp_path, rpy):
     robot = quadrotor(tmp_path).replace(inputs=canted(5.0))
-    given = fflin.configuration(robot, OUT, base=pin.SE3(pin.rpy.rpyToMatrix(*rpy), np.ones(3)))
+    given = fflin.configuration(
+        robot, OUT, base=pin.SE3(pin.rpy.rpyToMatrix(*rpy), np.ones(3))
+    )
     held = fflin.equilibrium(robot, given)
     lin = fflin.linearize(robot, held.q, u=held.u)
     assert lin.is_equilibrium() and "tilt of the base" in str(held)
@@ -53,7 +57,9 @@ def test_the_base_tilts_until_the_rotors_carry_the_arm(tmp_path, rpy):
     assert R @ moment == pytest.approx(np.cross(center, R @ force), abs=1e-8)
     # The tilt is the rotation from the given attitude, and has no part about the vertical.
     assert start @ pin.exp3(held.tilt) == pytest.approx(R, abs=1e-12)
-    assert np.array_equal(held.q[7:], given[7:]) and np.array_equal(held.q[:3], given[:3])
+    assert np.array_equal(held.q[7:], given[7:]) and np.array_equal(
+        held.q[:3], given[:3]
+    )
     with pytest.raises(fflin.EquilibriumError, match="F_b"):
         fflin.equilibrium(robot, given, tilt=False)
 

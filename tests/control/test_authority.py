@@ -30,7 +30,9 @@ def test_mass_properties_are_those_of_the_bodies_in_base_axes():
     pin.forwardKinematics(robot.model, data, q)
     base = data.oMi[1]
     total = pin.Inertia.Zero()
-    for place, body in zip(data.oMi.tolist()[1:], robot.model.inertias.tolist()[1:], strict=True):
+    for place, body in zip(
+        data.oMi.tolist()[1:], robot.model.inertias.tolist()[1:], strict=True
+    ):
         total += base.actInv(place).act(body)
     center, inertia, *_ = point_properties(robot, q, np.zeros(robot.nv))
     np.testing.assert_allclose(center, total.lever, atol=1e-12)
@@ -41,7 +43,8 @@ def test_mass_properties_are_those_of_the_bodies_in_base_axes():
 def test_the_least_reach_is_that_of_linear_programs(m):
     rng = np.random.default_rng(m)
     W = rng.normal(size=(m, 3 * m)) * np.logspace(-1, 2, m)[:, None]
-    W = np.hstack((W, -W.sum(axis=1, keepdims=True)))  # so that thrusts can cancel one another
+    # so that thrusts can cancel one another
+    W = np.hstack((W, -W.sum(axis=1, keepdims=True)))
     low, high = np.zeros(W.shape[1]), rng.uniform(0.5, 2.0, W.shape[1])
     kept = np.eye(m)[:, -3:]
     least = least_reach(W, low, high, kept)
@@ -73,7 +76,9 @@ def test_a_box_of_thrusters_has_the_force_and_torque_of_its_pairs():
     for axis in range(3):
         lever, along = np.eye(3)[(axis + 1) % 3], np.eye(3)[axis]
         nozzles += [
-            fflin.Thruster("base", tuple(side * 0.5 * lever), tuple(way * along), max=2.0)
+            fflin.Thruster(
+                "base", tuple(side * 0.5 * lever), tuple(way * along), max=2.0
+            )
             for side in (1, -1)
             for way in (1, -1)
         ]
@@ -95,7 +100,9 @@ def test_a_box_of_thrusters_has_the_force_and_torque_of_its_pairs():
     few = robot.replace(inputs=nozzles[:-1])
     said = thrusters_at(few, np.zeros(3))
     assert "cannot produce a force and a torque in every direction" in said
-    free = robot.replace(inputs=[fflin.Thruster("base", x.position, x.direction) for x in nozzles])
+    free = robot.replace(
+        inputs=[fflin.Thruster("base", x.position, x.direction) for x in nozzles]
+    )
     assert "limit" in thrusters_at(free, np.zeros(3))
 
 
@@ -114,7 +121,10 @@ def test_wheels_add_up_in_base_axes():
     np.testing.assert_allclose(found.total, expected, atol=1e-12)
     assert found.axes == 2 and found.least is None
     assert "only two" in str(found)
-    three = [fflin.ReactionWheel(x, inertia=1e-5, max_speed=300.0) for x in np.eye(3).tolist()]
+    three = [
+        fflin.ReactionWheel(x, inertia=1e-5, max_speed=300.0)
+        for x in np.eye(3).tolist()
+    ]
     cubesat = fflin.load("cubesat", inputs=three)
     report = str(wheels_at(cubesat, cubesat.neutral(), np.zeros(cubesat.nv)))
     assert "three axes" in report and "least 0.003 N m s" in report

@@ -53,7 +53,9 @@ def parts_of_inertia(robot):
     for index in range(1, robot.model.njoints):
         model = robot.model.copy()
         body = model.inertias[index]
-        model.inertias[index] = pin.Inertia(0.5 * body.mass, body.lever, 0.5 * body.inertia)
+        model.inertias[index] = pin.Inertia(
+            0.5 * body.mass, body.lever, 0.5 * body.inertia
+        )
         parts.append(2.0 * (whole - inertia(robot, model)))
     assert np.abs(sum(parts) - whole).max() <= 1e-9 * np.abs(whole).max()
     return np.array(parts)
@@ -66,7 +68,10 @@ def displaced(robot, lin, rng):
     turn = pin.exp3(np.radians(ANGLE) * axis / np.linalg.norm(axis))
     q[3:7] = pin.Quaternion(turn).coeffs()
     for joint in robot.joints:
-        size = min(0.1 if joint.prismatic else 0.3, lin.limits.get(f"q_m.{joint.name}", np.inf) / 4)
+        size = min(
+            0.1 if joint.prismatic else 0.3,
+            lin.limits.get(f"q_m.{joint.name}", np.inf) / 4,
+        )
         joint.place(q, joint.value(q) + rng.choice((-1.0, 1.0)) * size)
     robot.follow(q)
     return q
@@ -86,7 +91,9 @@ def test_every_input_has_the_margins_of_an_optimal_loop(loops, name):
     bandwidth = np.abs(poles).min()
     assert says(gain.weights, f"{bandwidth:.3g} rad/s")
     limited = "limited by" in gain.weights
-    assert bandwidth == pytest.approx(BANDWIDTH, rel=1e-6) or (limited and bandwidth < BANDWIDTH)
+    assert bandwidth == pytest.approx(BANDWIDTH, rel=1e-6) or (
+        limited and bandwidth < BANDWIDTH
+    )
 
 
 @pytest.mark.parametrize("name", (*BUNDLED, *OTHERS))
@@ -121,7 +128,9 @@ def test_slews_of_the_nonlinear_robot_settle_within_the_limits(loops, name):
     first, last = (np.abs(motion.x[row] - motion.target) for row in (0, -1))
     assert motion.attitude_error[0] == pytest.approx(ANGLE)
     assert motion.attitude_error[-1] < 0.01 * ANGLE
-    assert (last[6 : 6 + robot.n] < 0.01 * first[6 : 6 + robot.n].max(initial=0.0)).all()
+    assert (
+        last[6 : 6 + robot.n] < 0.01 * first[6 : 6 + robot.n].max(initial=0.0)
+    ).all()
     signals = {
         **dict(zip(motion.input_names, motion.u.T, strict=True)),
         **dict(zip(motion.state_names, motion.x.T, strict=True)),
@@ -146,7 +155,9 @@ def test_efforts_hold_for_every_displacement_and_one_limit_binds(loops, name):
     sizes = np.array(
         [
             min(0.1 if unit == "m" else 0.3, lin.limits.get(name, np.inf) / 4.0)
-            for name, unit in zip(lin.state_names[6:m], lin.state_units[6:m], strict=True)
+            for name, unit in zip(
+                lin.state_names[6:m], lin.state_units[6:m], strict=True
+            )
         ]
     )
     way = float(re.search(r"deg and ([\d.e-]+) m", gain.weights).group(1))
@@ -156,33 +167,44 @@ def test_efforts_hold_for_every_displacement_and_one_limit_binds(loops, name):
         + way * np.linalg.norm(gain.K[:, 3:6], axis=1)
         + np.abs(gain.K[:, 6:m]) @ sizes
     )
-    share = [largest[i] / lin.limits.get(name, np.inf) for i, name in enumerate(lin.input_names)]
+    share = [
+        largest[i] / lin.limits.get(name, np.inf)
+        for i, name in enumerate(lin.input_names)
+    ]
     # The way is shown to two digits.
     assert max(share) == pytest.approx(1.0, rel=5e-3)
 
 
 def test_a_limit_of_zero_or_beyond_all_use_is_none(loops):
     robot, lin, gain = loops("double_pendulum")
-    assert not robot.model.effortLimit[6:].any() and not lin.limits.keys() & set(lin.input_names)
+    assert not robot.model.effortLimit[6:].any() and not lin.limits.keys() & set(
+        lin.input_names
+    )
     assert says(fflin.lqr(fflin.linearize(fflin.load("ets_vii"))).weights, "URDF")
     _, lin, gain = loops("solo12")
     assert lin.limits["tau_m.FL_HAA"] == 1000.0 and "limited by" not in gain.weights
 
 
 @pytest.mark.parametrize("name", ["ets_vii", "double_pendulum", "planar_detumble"])
-def test_without_limits_the_loop_does_not_depend_on_units_of_mass_and_length(loops, name):
+def test_without_limits_the_loop_does_not_depend_on_units_of_mass_and_length(
+    loops, name
+):
     robot, _, gain = loops(name)
     model = robot.model.copy()
     for index in range(1, model.njoints):
         body = model.inertias[index]
-        model.inertias[index] = pin.Inertia(1e3 * body.mass, 10.0 * body.lever, 1e5 * body.inertia)
+        model.inertias[index] = pin.Inertia(
+            1e3 * body.mass, 10.0 * body.lever, 1e5 * body.inertia
+        )
         model.jointPlacements[index].translation *= 10.0
     scaled = fflin.lqr(fflin.linearize(fflin.from_model(model)))
     apart = np.abs(np.subtract.outer(scaled.poles, gain.poles)) / np.abs(gain.poles)
     assert max(apart.min(axis=0).max(), apart.min(axis=1).max()) < 1e-5
     joints = (slice(6, None), slice(6, len(gain.x0) // 2))
     expected = 1e5 * gain.K[joints]
-    assert scaled.K[joints] == pytest.approx(expected, rel=1e-5, abs=1e-6 * np.abs(expected).max())
+    assert scaled.K[joints] == pytest.approx(
+        expected, rel=1e-5, abs=1e-6 * np.abs(expected).max()
+    )
 
 
 def test_thrusters_springs_gravity_and_reduced_models_have_weights_too():
@@ -226,7 +248,8 @@ def test_a_point_that_asks_for_more_than_the_limits_is_told(loops):
     beyond = [name for name in asked if asked[name] > lin.limits.get(name, np.inf)]
     said = fflin.lqr(lin).weights
     words = (
-        f"; inputs already at or beyond the URDF limit at the operating point: {', '.join(beyond)}"
+        "; inputs already at or beyond the URDF limit at the operating point: "
+        f"{', '.join(beyond)}"
     )
     assert beyond and said.endswith(words)
 
@@ -239,7 +262,9 @@ def test_what_the_limits_leave_beside_gravity_is_what_the_loop_may_use(loops):
     gain = fflin.lqr(lin)
     assert gain.margin > 0.0 and gain.weights != ""
     m, size = len(lin.M), np.full(len(lin.M), 0.0)
-    size[6:] = [min(0.3, lin.limits.get(name, np.inf) / 4.0) for name in lin.state_names[6:m]]
+    size[6:] = [
+        min(0.3, lin.limits.get(name, np.inf) / 4.0) for name in lin.state_names[6:m]
+    ]
     used = np.abs(gain.K[:, :m]) @ size + np.abs(lin.u0)
     for index, name in enumerate(lin.input_names):
         assert used[index] <= lin.limits.get(name, np.inf), name
@@ -248,17 +273,24 @@ def test_what_the_limits_leave_beside_gravity_is_what_the_loop_may_use(loops):
 
 @pytest.mark.parametrize("name", ["canadarm2", "ets_vii"])
 @pytest.mark.parametrize("dt", [0.05, 0.5])
-def test_a_sampled_model_gets_the_same_cost_and_keeps_its_margins(loops, name, dt, tmp_path):
+def test_a_sampled_model_gets_the_same_cost_and_keeps_its_margins(
+    loops, name, dt, tmp_path
+):
     _, lin, gain = loops(name)
     sampled = fflin.lqr(lin.discretize(dt))
-    assert sampled.dt == dt and 52.6 < sampled.margins.phase < 60.0 < gain.margins.phase + 0.01
+    assert (
+        sampled.dt == dt
+        and 52.6 < sampled.margins.phase < 60.0 < gain.margins.phase + 0.01
+    )
     lin.discretize(dt).save(tmp_path / "m.npz")
     # Of a file it is not known what it was sampled from; the sum over samples is near the integral.
     loaded = fflin.lqr(fflin.LinearModel.load(tmp_path / "m.npz"))
     assert loaded.margins.disk > 0.6
     if dt < 0.1 and "sampling time" not in sampled.weights:
         assert sampled.weights == gain.weights
-        assert loaded.K == pytest.approx(sampled.K, rel=0.1, abs=0.05 * np.abs(sampled.K).max())
+        assert loaded.K == pytest.approx(
+            sampled.K, rel=0.1, abs=0.05 * np.abs(sampled.K).max()
+        )
 
 
 def test_identity_and_given_weights_are_said(loops):
@@ -270,7 +302,11 @@ def test_identity_and_given_weights_are_said(loops):
     assert says(str(plain), "identity")
     with pytest.raises(fflin.UnknownNameError, match="'bryson'"):
         fflin.lqr(lin, weights="bryson")
-    for arguments, options in (((1.0,), {}), ((None, 1.0), {}), ((1.0, 1.0), {"weights": "urdf"})):
+    for arguments, options in (
+        ((1.0,), {}),
+        ((None, 1.0), {}),
+        ((1.0, 1.0), {"weights": "urdf"}),
+    ):
         with pytest.raises(fflin.InputError, match="both Q and R"):
             fflin.lqr(lin, *arguments, **options)
 
@@ -291,8 +327,26 @@ def test_a_gain_that_bears_little_is_warned_of_wherever_it_is_shown():
     shown = str(fragile)
     assert says(shown, "warning: ") and says(shown, "diagonal R")
     assert "warning" not in str(fflin.lqr(lin))
-    options = ("--weights", "identity", "--r", "tau_b=1e-9", "--r", "F_b=1e-9", "--r", "tau_m=1e-9")
-    command = [sys.executable, "-m", "fflin", "lqr", "ets_vii", "--sample", "0.5", *options]
+    options = (
+        "--weights",
+        "identity",
+        "--r",
+        "tau_b=1e-9",
+        "--r",
+        "F_b=1e-9",
+        "--r",
+        "tau_m=1e-9",
+    )
+    command = [
+        sys.executable,
+        "-m",
+        "fflin",
+        "lqr",
+        "ets_vii",
+        "--sample",
+        "0.5",
+        *options,
+    ]
     done = finished(command, capture_output=True, text=True, check=True)
     out, err = done.stdout, done.stderr
     told = [line for line in err.splitlines() if "disk margin" in line]
@@ -320,8 +374,12 @@ def test_displacements_that_ask_for_more_than_the_limits_are_warned_of(loops):
         gain = fflin.lqr(lin)
     assert says(gain.weights, "too small")
     (said,) = (str(each.message) for each in told)
-    start = "the input limits are too small for 'talos' to return from the displacements"
-    asked = re.findall(r"(tau_m\.\w+) requires ([\d.]+) N m, its limit is ([\d.]+)", said)
+    start = (
+        "the input limits are too small for 'talos' to return from the displacements"
+    )
+    asked = re.findall(
+        r"(tau_m\.\w+) requires ([\d.]+) N m, its limit is ([\d.]+)", said
+    )
     assert said.startswith(start) and asked
     for name, value, limit in asked:
         assert float(limit) == pytest.approx(lin.limits[name], rel=1e-3)
@@ -347,7 +405,9 @@ def test_bundled_inputs_fly_within_what_they_say_they_give(name, fields):
     gain = fflin.lqr(lin)
     motors = [f"joint_{k}" for k in range(1, 8)] if name == "servicer_7dof" else []
     turn = pin.exp3(np.radians(ANGLE) * np.array([2.0, -1.0, 2.0]) / 3.0)
-    q0 = fflin.configuration(robot, dict.fromkeys(motors, 0.3), pin.SE3(turn, np.zeros(3)))
+    q0 = fflin.configuration(
+        robot, dict.fromkeys(motors, 0.3), pin.SE3(turn, np.zeros(3))
+    )
     policy = fflin.StateFeedback(lin, gain.K)
     options = {"limits": "urdf", "every": 10, "engine": "compiled"}
     motion = fflin.simulate(robot, policy, q0=q0, duration=60.0, **options)
@@ -375,13 +435,17 @@ def test_damped_joints_come_back_as_soon_as_it_is_said(damping):
     arm = [f"joint_{k}" for k in range(1, 8)]
     rng = np.random.default_rng(7)
     for _ in range(2):
-        turn = pin.exp3(np.radians(ANGLE) * (axis := rng.normal(size=3)) / np.linalg.norm(axis))
+        turn = pin.exp3(
+            np.radians(ANGLE) * (axis := rng.normal(size=3)) / np.linalg.norm(axis)
+        )
         places = dict(zip(arm, 0.3 * rng.choice((-1.0, 1.0), size=7), strict=True))
         q0 = fflin.configuration(robot, places, pin.SE3(turn, np.zeros(3)))
         policy = fflin.StateFeedback(lin, gain.K)
         duration, dt = 10.0 / bandwidth, min(0.01, 2.5 / np.abs(gain.poles).max())
         options = {"every": 5, "linear": False, "engine": "compiled"}
-        motion = fflin.simulate(robot, policy, q0=q0, duration=duration, dt=dt, **options)
+        motion = fflin.simulate(
+            robot, policy, q0=q0, duration=duration, dt=dt, **options
+        )
         assert not motion.stopped
         signals = {
             **dict(zip(motion.input_names, motion.u.T, strict=True)),
@@ -390,7 +454,9 @@ def test_damped_joints_come_back_as_soon_as_it_is_said(damping):
         for name in arm:
             assert abs(signals[f"q_m.{name}"][-1]) < 0.02 * 0.3, name
             for signal in (f"qdot_m.{name}", f"tau_m.{name}"):
-                assert np.abs(signals[signal]).max() <= 1.01 * lin.limits[signal], signal
+                assert np.abs(signals[signal]).max() <= 1.01 * lin.limits[signal], (
+                    signal
+                )
 
 
 def sprung(lin, stiffness):
@@ -409,7 +475,8 @@ def test_a_spring_of_any_stiffness_keeps_the_decay_of_rest(loops, stiffness):
     slowest = gain.poles[gain.poles.real.argmax()]
     assert abs(slowest) ** 4 == pytest.approx(stiffness**2 + BANDWIDTH**4, rel=1e-5)
     shown = re.search(
-        r"decay rate at least ([\d.]+) 1/s, damping ratio at least ([\d.e-]+)", gain.weights
+        r"decay rate at least ([\d.]+) 1/s, damping ratio at least ([\d.e-]+)",
+        gain.weights,
     )
     damping = (-gain.poles.real / np.abs(gain.poles)).min()
     assert shown.groups() == (f"{gain.margin:.3g}", f"{damping:.2g}")
@@ -432,8 +499,12 @@ def test_without_springs_velocities_cost_nothing_and_weak_ones_change_little(loo
 def test_panels_on_springs_come_to_rest_as_the_base_does(stiffness, inputs):
     """With motors of their own, and without, by what the base can do."""
     panels = dict.fromkeys(("panel_left", "panel_right"), stiffness)
-    options = {"inputs": fflin.load_inputs("servicer_7dof")} if inputs == "bundled" else {}
-    gain = fflin.lqr(fflin.linearize(fflin.load("servicer_7dof", stiffness=panels, **options)))
+    options = (
+        {"inputs": fflin.load_inputs("servicer_7dof")} if inputs == "bundled" else {}
+    )
+    gain = fflin.lqr(
+        fflin.linearize(fflin.load("servicer_7dof", stiffness=panels, **options))
+    )
     decay = float(re.search(r"decay rate at least ([\d.]+) 1/s", gain.weights)[1])
     assert decay == pytest.approx(gain.margin, rel=5e-3)
     least = 0.95 if inputs == "motors" or stiffness > 1.0 else 0.3
@@ -442,9 +513,26 @@ def test_panels_on_springs_come_to_rest_as_the_base_does(stiffness, inputs):
 
 
 LEGGED = (
-    *("solo8", "solo12", "hyq", "a1", "b1", "go1", "go2", "laikago", "anymal", "anymal_c"),
+    *(
+        "solo8",
+        "solo12",
+        "hyq",
+        "a1",
+        "b1",
+        "go1",
+        "go2",
+        "laikago",
+        "anymal",
+        "anymal_c",
+    ),
     *("anymal_kinova", "quadruped", "talos_full", "simple_humanoid"),
-    *("simple_humanoid_classical", "g1_with_hands", "icub_reduced", "human", "alexander"),
+    *(
+        "simple_humanoid_classical",
+        "g1_with_hands",
+        "icub_reduced",
+        "human",
+        "alexander",
+    ),
     *("alex_nub_hands", "centauro", "canadarm2", "servicer_7dof"),
 )
 
@@ -463,7 +551,8 @@ def test_a_robot_that_is_held_in_gravity_comes_back_from_five_degrees(name):
     robot = fflin.load(name, gravity=(0.0, 0.0, -9.81))
     lin = fflin.linearize(robot, u=fflin.equilibrium(robot).u)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", fflin.FflinWarning)  # of 30 deg, with all joints at once
+        # of 30 deg, with all joints at once
+        warnings.simplefilter("ignore", fflin.FflinWarning)
         gain = fflin.lqr(lin)
     bandwidth = float(re.search(r"bandwidth at least ([\d.]+) rad/s", gain.weights)[1])
     assert bandwidth == pytest.approx(np.abs(gain.poles).min(), rel=5e-3)
@@ -488,7 +577,10 @@ def test_a_robot_that_is_held_in_gravity_comes_back_from_five_degrees(name):
 
 @pytest.mark.parametrize(
     ("name", "mode", "effort"),
-    [("canadarm2", "q_m.joint_7", "joint_2"), ("servicer_7dof", "q_m.joint_2", "joint_2")],
+    [
+        ("canadarm2", "q_m.joint_7", "joint_2"),
+        ("servicer_7dof", "q_m.joint_2", "joint_2"),
+    ],
 )
 def test_a_robot_that_cannot_hold_its_weight_names_what_grows(name, mode, effort):
     robot = fflin.load(name, gravity=(0.0, 0.0, -9.81))
@@ -497,12 +589,21 @@ def test_a_robot_that_cannot_hold_its_weight_names_what_grows(name, mode, effort
     with pytest.warns(fflin.FflinWarning, match="too small"):
         gain = fflin.lqr(lin)
     assert says(gain.weights, f"unstable mode that grows by {growth:.3g} 1/s", mode)
-    assert says(gain.weights, f"effort of {effort}", "too small", "at or beyond the URDF limit")
+    assert says(
+        gain.weights, f"effort of {effort}", "too small", "at or beyond the URDF limit"
+    )
 
 
 def test_largest_values_of_all_are_brysons_rule_and_of_some_are_on_its_scale(loops):
     _, lin, gain = loops("ets_vii")
-    sizes = {"q_b": 0.05, "r_b": 0.1, "q_m": 0.1, "omega_b": 0.1, "v_b": 0.1, "qdot_m": 0.1}
+    sizes = {
+        "q_b": 0.05,
+        "r_b": 0.1,
+        "q_m": 0.1,
+        "omega_b": 0.1,
+        "v_b": 0.1,
+        "qdot_m": 0.1,
+    }
     efforts = {"tau_b": 100.0, "F_b": 100.0, "tau_m": 20.0}
     found = fflin.lqr(lin, weights={"bryson": sizes | efforts})
     Q, R = found.Q, found.R
@@ -514,8 +615,12 @@ def test_largest_values_of_all_are_brysons_rule_and_of_some_are_on_its_scale(loo
     found = fflin.lqr(lin, weights={"bryson": {"q_b": own}})
     R, rule = found.R, found.weights
     scale = R[0, 0] / gain.R[0, 0]
-    assert scale * np.exp(np.log(gain.Q.diagonal()[:3]).mean()) == pytest.approx(own**-2, rel=1e-9)
-    assert R == pytest.approx(scale * gain.R, rel=1e-12) and rule.endswith("for this rule alone)")
+    assert scale * np.exp(np.log(gain.Q.diagonal()[:3]).mean()) == pytest.approx(
+        own**-2, rel=1e-9
+    )
+    assert R == pytest.approx(scale * gain.R, rel=1e-12) and rule.endswith(
+        "for this rule alone)"
+    )
     # The tighter one is held, the more of every input it takes.
     norms = []
     for size in (own, 0.1 * own, 0.01 * own):
@@ -531,13 +636,23 @@ def test_a_given_weight_replaces_the_weight_of_the_rule(loops):
     assert found.Q[0, 0] == 2.0 * gain.Q[0, 0] and (gain.R == found.R).all()
     assert found.weights.startswith("q_b.x as given; all other weights: from")
     # As the robot's own weights, over which given ones take precedence, and which a rule replaces.
-    robot = fflin.load("ets_vii").replace(weights={"q": {"q_b": 7.0}, "r": {"tau_b": 3.0}})
+    robot = fflin.load("ets_vii").replace(
+        weights={"q": {"q_b": 7.0}, "r": {"tau_b": 3.0}}
+    )
     model = fflin.linearize(robot)
     both = fflin.lqr(model, weights=own)
-    assert both.Q[0, 0] == own["q"]["q_b.x"] and both.Q[1, 1] == 7.0 and both.R[0, 0] == 3.0
+    assert (
+        both.Q[0, 0] == own["q"]["q_b.x"]
+        and both.Q[1, 1] == 7.0
+        and both.R[0, 0] == 3.0
+    )
     alone = fflin.lqr(model, weights={"rule": "identity"} | own)
     assert alone.Q.diagonal().tolist() == [own["q"]["q_b.x"], *[1.0] * (len(lin.A) - 1)]
-    for wrong, said in (({"Q": 1.0}, "'Q'"), ({"q": 1.0}, "q "), ({"rule": "none"}, "'none'")):
+    for wrong, said in (
+        ({"Q": 1.0}, "'Q'"),
+        ({"q": 1.0}, "q "),
+        ({"rule": "none"}, "'none'"),
+    ):
         with pytest.raises(fflin.FflinError, match=said):
             fflin.lqr(lin, weights=wrong)
 

@@ -52,11 +52,15 @@ def to_floating(own):
     return T
 
 
-@pytest.mark.parametrize("sample", [pytest.param(None, marks=pytest.mark.exhaustive), 0.04])
+@pytest.mark.parametrize(
+    "sample", [pytest.param(None, marks=pytest.mark.exhaustive), 0.04]
+)
 @pytest.mark.parametrize("inputs", [INPUTS, MOTORS], ids=["thrusters", "motors"])
 def test_gains_in_free_fall_are_the_gains_without_gravity(inputs, sample):
     along, floating, own = flights(inputs)
-    schedule, expected = (fflin.tvlqr(each, sample=sample) for each in (along, floating))
+    schedule, expected = (
+        fflin.tvlqr(each, sample=sample) for each in (along, floating)
+    )
     assert schedule.weights == expected.weights
     T = to_floating(own)
     for k, t in enumerate(along.t[:-1:2]):
@@ -95,7 +99,14 @@ def test_a_filter_starts_in_free_fall():
     # These outputs are the same in falling axes.
     outputs = [fflin.BasePose(), fflin.JointPositions()]
     along, floating, own = flights(MOTORS, outputs=outputs)
-    noise = {"q_b": 0.0, "r_b": 0.0, "q_m": 0.0, "omega_b": 1e-4, "v_b": 1e-4, "qdot_m": 1e-4}
+    noise = {
+        "q_b": 0.0,
+        "r_b": 0.0,
+        "q_m": 0.0,
+        "omega_b": 1e-4,
+        "v_b": 1e-4,
+        "qdot_m": 1e-4,
+    }
     filtered, expected = (
         fflin.tvkalman(each, noise, 1e-6, sample=0.04) for each in (along, floating)
     )

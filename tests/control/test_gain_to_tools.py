@@ -55,7 +55,9 @@ def test_the_inputs_are_those_of_the_law_in_pinocchios_coordinates():
         return actuation.in_base_axes(state.chart(q), law(0.0, q, v))[order]
 
     h = 1e-6
-    differences = np.array([(inputs(h * e) - inputs(-h * e)) / (2.0 * h) for e in np.eye(18)]).T
+    differences = np.array(
+        [(inputs(h * e) - inputs(-h * e)) / (2.0 * h) for e in np.eye(18)]
+    ).T
     assert np.abs(differences + by.K).max() < 1e-8
     # The formula of the message itself, near the reference.
     m, dx = by.model, 1e-4 * np.random.default_rng(2).normal(size=18)

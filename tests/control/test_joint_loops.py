@@ -20,7 +20,8 @@ from fflin.control.optimal.shooting import Shooting
 from tests.support.mechanisms import motors
 from tests.support.robots import random_tree
 
-HUB, INERTIA, POINT = 5.0, 0.8, 1.5  # mass [kg] and inertia [kg m^2] of the hub, mass [kg]
+# mass [kg] and inertia [kg m^2] of the hub, mass [kg]
+HUB, INERTIA, POINT = 5.0, 0.8, 1.5
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +40,9 @@ def polar():
 
 def base_at_rest(robot, q=None):
     state = fflin.StateMap(robot, frame="local")
-    return FloatingBase(state, (robot.neutral() if q is None else q, np.zeros(robot.nv)))
+    return FloatingBase(
+        state, (robot.neutral() if q is None else q, np.zeros(robot.nv))
+    )
 
 
 def rotation_vector(base, joints):
@@ -57,7 +60,9 @@ def fraction(r):
 def test_a_loop_of_a_turn_and_a_slide_has_the_closed_form(polar):
     """Out at the angle 0, turn by alpha, in, turn back: -alpha (f(r_2) - f(r_1)), of any size."""
     alpha, inner, outer = 2.0, 0.4, 1.1
-    corners = np.array([(0, inner), (0, outer), (alpha, outer), (alpha, inner), (0, inner)])
+    corners = np.array(
+        [(0, inner), (0, outer), (alpha, outer), (alpha, inner), (0, inner)]
+    )
     joints = np.vstack([np.linspace(a, b, 9) for a, b in pairwise(corners)])
     turned = rotation_vector(base_at_rest(polar), joints)
     # The midpoint rule is exact here, because each leg changes one coordinate only.
@@ -104,7 +109,9 @@ def test_the_best_plane_rotates_more_than_any_other():
     assert about == pytest.approx(most, rel=1e-12)
     assert np.array((a @ a, b @ b, a @ b)) == pytest.approx([1.0, 1.0, 0.0], abs=1e-12)
     pairs = np.linalg.qr(rng.normal(size=(1000, 5, 2)))[0] * scale[:, None]
-    others = np.einsum("nia,ijk,njb,k->nab", pairs, F, pairs, turn / np.linalg.norm(turn))
+    others = np.einsum(
+        "nia,ijk,njb,k->nab", pairs, F, pairs, turn / np.linalg.norm(turn)
+    )
     assert np.abs(others).max() < most
 
 
@@ -186,7 +193,9 @@ def test_many_knots_allow_no_more_circles_than_the_path_has_steps_for(monkeypatc
     for knots, most in ((20, 2), (150, MOST_CIRCLES)):
         shooting = Shooting(robot, np.linspace(0.0, 10.0, knots), held=True)
         bounds = np.full((2, nx), np.inf) * [[-1.0], [1.0]]
-        initial_guess(shooting, None, start, end, np.full(nx, True), bounds, np.ones(robot.n))
+        initial_guess(
+            shooting, None, start, end, np.full(nx, True), bounds, np.ones(robot.n)
+        )
         assert allowed.pop() == most
 
 

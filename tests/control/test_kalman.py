@@ -14,14 +14,19 @@ import fflin
 def lin():
     robot = fflin.load("ets_vii")
     return fflin.linearize(
-        robot.replace(outputs=[fflin.BasePose(), fflin.JointPositions(), fflin.Gyroscope("base")])
+        robot.replace(
+            outputs=[fflin.BasePose(), fflin.JointPositions(), fflin.Gyroscope("base")]
+        )
     )
 
 
 @pytest.mark.parametrize("dt", [0.0, 0.1])
 def test_filter_solves_its_riccati_equation(lin, dt):
     model = lin.discretize(dt) if dt else lin
-    W, V = np.diag(np.linspace(1, 2, 24)) * 1e-3, np.diag(np.linspace(1, 3, len(lin.C))) * 1e-4
+    W, V = (
+        np.diag(np.linspace(1, 2, 24)) * 1e-3,
+        np.diag(np.linspace(1, 3, len(lin.C))) * 1e-4,
+    )
     found = fflin.kalman(model, W, V)
     assert found.residual < 1e-14 and found.margin > 0.0
     A, C, P = model.A, model.C, found.P
@@ -34,7 +39,9 @@ def test_filter_solves_its_riccati_equation(lin, dt):
     else:
         assert found.L == pytest.approx(np.linalg.solve(V, C @ P).T)
         expected, _, _ = control.lqe(A, np.eye(24), C, W, V)
-    assert found.L == pytest.approx(expected, rel=1e-6, abs=1e-8 * np.abs(expected).max())
+    assert found.L == pytest.approx(
+        expected, rel=1e-6, abs=1e-8 * np.abs(expected).max()
+    )
     poles = np.linalg.eigvals(A - found.L @ C)
     edge = 1.0 - np.abs(poles).max() if dt else -poles.real.max()
     assert found.margin == pytest.approx(edge)
@@ -43,7 +50,9 @@ def test_filter_solves_its_riccati_equation(lin, dt):
 def test_P_is_the_covariance_of_the_error(lin):
     """In the steady state the error e obeys de = (A - L C) e + w - L n."""
     found = fflin.kalman(lin, {"tau_b": 1.0, "F_b": 4.0, "tau_m": 0.1}, 1e-3, G=lin.B)
-    assert found.W == pytest.approx(lin.B @ np.diag([1] * 3 + [4] * 3 + [0.1] * 6) @ lin.B.T)
+    assert found.W == pytest.approx(
+        lin.B @ np.diag([1] * 3 + [4] * 3 + [0.1] * 6) @ lin.B.T
+    )
     F = lin.A - found.L @ lin.C
     noise = found.W + found.L @ found.V @ found.L.T
     covariance = sl.solve_continuous_lyapunov(F, -noise)
@@ -59,7 +68,9 @@ def test_compensator_gives_the_poles_of_both(lin, dt):
     estimator = fflin.kalman(model, 1e-2, 1e-2)
     compensator = fflin.lqg(gain, estimator)
     plant, feedback = model.to_control(), compensator.to_control()
-    loop = np.block([[plant.A, plant.B @ feedback.C], [feedback.B @ plant.C, feedback.A]])
+    loop = np.block(
+        [[plant.A, plant.B @ feedback.C], [feedback.B @ plant.C, feedback.A]]
+    )
     poles = np.linalg.eigvals(loop)
     for pole in compensator.poles:
         assert np.abs(poles - pole).min() < 1e-6 * abs(pole - bool(dt)) + 1e-10
@@ -86,7 +97,9 @@ def test_what_is_not_seen_or_not_disturbed_is_named(lin):
     robot = fflin.load("ets_vii")
     joints = fflin.linearize(robot.replace(outputs=[fflin.JointPositions()]))
     for model in (joints, joints.discretize(0.1)):
-        words = r"do not observe q_b\.x, q_b\.y, q_b\.z, r_b\.x, r_b\.y, r_b\.z and 6 more"
+        words = (
+            r"do not observe q_b\.x, q_b\.y, q_b\.z, r_b\.x, r_b\.y, r_b\.z and 6 more"
+        )
         with pytest.raises(fflin.DetectabilityError, match=words):
             fflin.kalman(model, 1, 1)
     for words, arguments in {
@@ -124,7 +137,9 @@ def test_a_position_that_no_input_pushes_is_estimated_if_it_can_be():
 def test_all_momenta_that_no_noise_excites_are_named(name):
     """Noise of the joint torques alone changes none of the six momenta of the robot."""
     lin = fflin.linearize(fflin.load(name))
-    base = ", ".join(f"{group}.{axis}" for group in ("omega_b", "v_b") for axis in "xyz")
+    base = ", ".join(
+        f"{group}.{axis}" for group in ("omega_b", "v_b") for axis in "xyz"
+    )
     with pytest.raises(fflin.InputError, match=f"W does not excite {base}, whose"):
         fflin.kalman(lin, {"tau_m": 1e-6}, 1e-4, G=lin.B)
 
@@ -145,7 +160,9 @@ def test_files_keep_every_bit(lin, tmp_path, ending):
         design.save(path)
         back = type(design).load(path)
         for item in fields(design):
-            assert np.array_equal(getattr(design, item.name), getattr(back, item.name)), item.name
+            assert np.array_equal(
+                getattr(design, item.name), getattr(back, item.name)
+            ), item.name
         with pytest.raises(fflin.FileError, match=f"Gain.*{type(design).__name__}"):
             fflin.Gain.load(path)
 
@@ -153,7 +170,10 @@ def test_files_keep_every_bit(lin, tmp_path, ending):
 @pytest.mark.parametrize("name", ["planar_detumble", "servicer_7dof"])
 def test_an_intensity_that_overflows_is_refused(name, robots):
     lin = fflin.linearize(robots[name])
-    with np.errstate(all="ignore"), pytest.raises(fflin.DetectabilityError, match="scale"):
+    with (
+        np.errstate(all="ignore"),
+        pytest.raises(fflin.DetectabilityError, match="scale"),
+    ):
         fflin.kalman(lin, 1e308, 1e-4, G=lin.B)
 
 
@@ -169,6 +189,8 @@ def test_reports_show_the_slowest_pole_and_the_states_that_are_not_estimated(dt)
     for design in (estimator, compensator):
         rates = np.log(design.poles).real / dt if dt else design.poles.real
         first, *others = str(design).splitlines()
-        assert first.startswith(f"{len(design.poles)} poles, slowest decay {-rates.max():.3g} 1/s")
+        assert first.startswith(
+            f"{len(design.poles)} poles, slowest decay {-rates.max():.3g} 1/s"
+        )
         assert time in " ".join(" ".join(others).split())
     assert "not estimated: q_m.wheel_1, which" in " ".join(str(estimator).split())

@@ -25,7 +25,9 @@ def lin():
 
 @pytest.fixture(scope="module")
 def arm():
-    robot = fflin.load("planar_detumble", outputs=[fflin.BasePose(), fflin.JointPositions()])
+    robot = fflin.load(
+        "planar_detumble", outputs=[fflin.BasePose(), fflin.JointPositions()]
+    )
     lin = fflin.linearize(robot)
     return robot, lin, fflin.lqr(lin), fflin.kalman(lin, 1e-2, 1e-3)
 
@@ -69,7 +71,10 @@ def test_every_tools_system_is_read_as_it_is(lin, tmp_path, dt):
         assert apart(fflin.LinearController(tmp_path / "K.mat", lin), *own, dt) == 0.0
         if "K" not in given:
             np.savez(tmp_path / "K.npz", **given)
-            assert apart(fflin.LinearController(str(tmp_path / "K.npz"), lin), *own, dt) == 0.0
+            assert (
+                apart(fflin.LinearController(str(tmp_path / "K.npz"), lin), *own, dt)
+                == 0.0
+            )
 
 
 def test_names_put_signals_where_they_belong(lin, tmp_path):
@@ -86,7 +91,10 @@ def test_names_put_signals_where_they_belong(lin, tmp_path):
     plain = [[name.replace(".", "_") for name in names] for names in (inputs, outputs)]
     given = control.ss(*part, inputs=plain[0], outputs=plain[1])
     assert apart(fflin.LinearController(given, lin), *expected) == 0.0
-    cells = {"InputName": np.array(inputs, object), "OutputName": np.array(outputs, object)}
+    cells = {
+        "InputName": np.array(inputs, object),
+        "OutputName": np.array(outputs, object),
+    }
     savemat(tmp_path / "K.mat", dict(zip("ABCD", part, strict=True)) | cells)
     assert apart(fflin.LinearController(tmp_path / "K.mat", lin), *expected) == 0.0
 
@@ -99,7 +107,9 @@ def test_octave_writes_one(lin, tmp_path):
     script = "load given.mat; Ts = 0.1; save('-v7', 'K.mat', 'A', 'B', 'C', 'D', 'Ts');"
     command = ["octave", "--no-gui", "--quiet", "--eval", script]
     finished(command, cwd=tmp_path, check=True, capture_output=True)
-    assert apart(fflin.LinearController(tmp_path / "K.mat", lin), A, B, C, D, 0.1) == 0.0
+    assert (
+        apart(fflin.LinearController(tmp_path / "K.mat", lin), A, B, C, D, 0.1) == 0.0
+    )
 
 
 def test_transfer_functions_are_realised():
@@ -107,7 +117,10 @@ def test_transfer_functions_are_realised():
     names = {"inputs": ["r_b_x"], "outputs": ["tau_b_x"]}
     notch = control.tf([1, 0.2, 4], [1, 2, 4], **names)
     w = 2.7
-    for given, z in ((notch, 1j * w), (control.c2d(notch, 0.1, "tustin"), np.exp(0.1j * w))):
+    for given, z in (
+        (notch, 1j * w),
+        (control.c2d(notch, 0.1, "tustin"), np.exp(0.1j * w)),
+    ):
         own = fflin.LinearController(given, lin).system
         found = own.C @ np.linalg.solve(z * np.eye(2) - own.A, own.B) + own.D
         assert found[0, 3] == pytest.approx(given(z), rel=1e-10)
@@ -118,10 +131,19 @@ def test_a_gain_comes_back_as_the_state_feedback_it_was():
     robot = fflin.load("ets_vii")
     lin = fflin.linearize(robot, fflin.configuration(robot, {"joint_2": 0.4}))
     gain, x0 = fflin.lqr(lin), lin.x0 + 0.05
-    expected = fflin.simulate(robot, fflin.StateFeedback(lin, gain.K), x0=x0, duration=2.0)
+    expected = fflin.simulate(
+        robot, fflin.StateFeedback(lin, gain.K), x0=x0, duration=2.0
+    )
     nothing = ((), (), ())
-    for system in (gain.to_control(), -gain.K, (*nothing, -gain.K, True), (*nothing, -gain.K, 0)):
-        found = fflin.simulate(robot, fflin.LinearController(system, lin), x0=x0, duration=2.0)
+    for system in (
+        gain.to_control(),
+        -gain.K,
+        (*nothing, -gain.K, True),
+        (*nothing, -gain.K, 0),
+    ):
+        found = fflin.simulate(
+            robot, fflin.LinearController(system, lin), x0=x0, duration=2.0
+        )
         assert np.abs(found.x - expected.x).max() < 1e-13
         assert np.abs(found.prediction - expected.prediction).max() < 1e-12
     turned = fflin.LinearController(gain.K, lin, sign=-1)
@@ -150,7 +172,9 @@ def test_estimator_and_gain_make_the_compensator(arm, dt):
     nu = len(lin.u0)
     K = gain.to_control()
     assert [*filtered.state_labels] == [*filtered.output_labels] == [*K.input_labels]
-    assert filtered.A + filtered.B[:, :nu] @ K.D @ filtered.C == pytest.approx(by.A, abs=1e-12)
+    assert filtered.A + filtered.B[:, :nu] @ K.D @ filtered.C == pytest.approx(
+        by.A, abs=1e-12
+    )
     assert np.array_equal(filtered.B[:, nu:], by.B) and np.array_equal(K.D, by.C)
 
 
@@ -179,7 +203,10 @@ def test_the_loop_of_a_free_body_is_the_linear_one_to_order_four():
     step = lin.discretize(0.2)
     for _ in range(20):
         force.append((C[:, 0] * z + D @ (lin.C @ e))[3])
-        z = np.exp(A[0, 0] * 0.2) * z + (np.exp(A[0, 0] * 0.2) - 1.0) / A[0, 0] * (B @ lin.C @ e)[0]
+        z = (
+            np.exp(A[0, 0] * 0.2) * z
+            + (np.exp(A[0, 0] * 0.2) - 1.0) / A[0, 0] * (B @ lin.C @ e)[0]
+        )
         e = step.A @ e + step.B[:, 3] * force[-1]
     assert held.u[:-1:4, 3] == pytest.approx(np.array(force), abs=1e-12)
     assert np.abs(held.prediction - held.x).max() < 1e-12
@@ -187,7 +214,12 @@ def test_the_loop_of_a_free_body_is_the_linear_one_to_order_four():
 
 def test_the_fastest_pole_of_a_controller_chooses_the_step(arm):
     robot, lin, *_ = arm
-    fast = (-400.0 * np.eye(1), np.zeros((1, len(lin.y0))), np.zeros((len(lin.u0), 1)), 0.0)
+    fast = (
+        -400.0 * np.eye(1),
+        np.zeros((1, len(lin.y0))),
+        np.zeros((len(lin.u0), 1)),
+        0.0,
+    )
     motion = fflin.simulate(robot, fflin.LinearController(fast, lin), duration=0.1)
     assert motion.t[1] <= 1.0 / 400.0
     with pytest.raises(fflin.InputError, match="400"):
@@ -205,7 +237,9 @@ def test_poles_that_grow_are_told(arm):
     (note,) = fflin.simulate(own, wrong, **run).notes
     assert says(note, "unstable") and "1/s" in note
     assert says(note, "sign=-1 (--negative-feedback)")
-    drifting = fflin.LinearController(np.zeros((len(lin.u0), len(state.y0))) + 1e-3, state)
+    drifting = fflin.LinearController(
+        np.zeros((len(lin.u0), len(state.y0))) + 1e-3, state
+    )
     (note,) = fflin.simulate(own, drifting, **run).notes
     assert "unstable" in note
     zero = np.zeros((1, len(lin.y0))), np.zeros((len(lin.u0), 1)), 0.0, 0.1
@@ -215,7 +249,9 @@ def test_poles_that_grow_are_told(arm):
 
 
 def test_accelerometers_are_fed_back_without_a_loop_in_themselves():
-    felt = fflin.load("planar_detumble", outputs=[fflin.BasePose(), fflin.Accelerometer("base")])
+    felt = fflin.load(
+        "planar_detumble", outputs=[fflin.BasePose(), fflin.Accelerometer("base")]
+    )
     lin = fflin.linearize(felt)
     D = np.zeros((len(lin.u0), len(lin.y0)))
     D[3, 3] = -1.0
@@ -223,7 +259,9 @@ def test_accelerometers_are_fed_back_without_a_loop_in_themselves():
     policy, x0 = fflin.LinearController(low_pass, lin), lin.x0 + 1e-4
     motion = fflin.simulate(felt, policy, x0=x0, duration=2.0)
     assert motion.engine == "python"
-    assert np.abs(motion.prediction - motion.x).max() < 1e-6 < np.abs(motion.x - x0).max()
+    assert (
+        np.abs(motion.prediction - motion.x).max() < 1e-6 < np.abs(motion.x - x0).max()
+    )
     D[0, 7] = 1.0
     with pytest.raises(fflin.InputError, match=r"base\.acceleration\.y"):
         fflin.LinearController(D, lin)
@@ -241,7 +279,9 @@ def test_it_may_ask_for_wrenches_that_thrusters_give(arm):
     policy = fflin.LinearController(fflin.lqg(gain, seen), lin)
     run = {"x0": lin.x0 + 0.01, "duration": 1.0, "dt": 0.05}
     alone = fflin.simulate(design, policy, **run)
-    shared = fflin.simulate(design, fflin.Allocation(policy, design), **run, engine="python")
+    shared = fflin.simulate(
+        design, fflin.Allocation(policy, design), **run, engine="python"
+    )
     assert np.abs(alone.x - shared.x).max() < 1e-6
 
 
@@ -260,7 +300,11 @@ def test_it_may_ask_for_wrenches_that_thrusters_give(arm):
     }.items(),
 )
 def test_sizes_and_figures_that_do_not_fit_are_refused(lin, words, change):
-    parts = dict(zip(("A", "B", "C", "D"), matrices(lin), strict=True)) | {"dt": 0.0} | change
+    parts = (
+        dict(zip(("A", "B", "C", "D"), matrices(lin), strict=True))
+        | {"dt": 0.0}
+        | change
+    )
     with pytest.raises(fflin.InputError, match=words):
         fflin.LinearController(tuple(parts.values()), lin)
 
@@ -268,7 +312,10 @@ def test_sizes_and_figures_that_do_not_fit_are_refused(lin, words, change):
 def test_what_is_no_controller_of_the_model_is_refused(lin, arm):
     robot, _, gain, seen = arm
     A, B, C, D = matrices(lin)
-    improper, tall = control.tf([1, 0, 0], [1, 1]), scipy.signal.TransferFunction([1, 0, 0], [1, 1])
+    improper, tall = (
+        control.tf([1, 0, 0], [1, 1]),
+        scipy.signal.TransferFunction([1, 0, 0], [1, 1]),
+    )
     named = control.ss(A, B[:, :1], C, D[:, :1], inputs=["q_b_w"])
     twice = control.ss(A, B[:, :2], C, D[:, :2], inputs=["q_b_x", "q_b.x"[:3] + "_x_"])
     for words, given, sign in (
@@ -300,7 +347,9 @@ def test_what_is_no_controller_of_the_model_is_refused(lin, arm):
     with pytest.raises(fflin.InputError, match=r"tau_m\.joint_1"):
         fflin.simulate(robot, policy, duration=1.0)
     with pytest.raises(fflin.InputError, match="base"):
-        fflin.simulate(cubesat.replace(outputs=[fflin.BasePose()]), policy, duration=1.0)
+        fflin.simulate(
+            cubesat.replace(outputs=[fflin.BasePose()]), policy, duration=1.0
+        )
 
 
 def test_files_that_hold_none_are_refused(lin, tmp_path):
@@ -326,7 +375,12 @@ def test_files_that_hold_none_are_refused(lin, tmp_path):
 
 
 def test_outputs_are_those_of_the_model_everywhere():
-    kinds = (*SEEN, fflin.FramePose("hand"), fflin.Accelerometer("hand"), fflin.CenterOfMass())
+    kinds = (
+        *SEEN,
+        fflin.FramePose("hand"),
+        fflin.Accelerometer("hand"),
+        fflin.CenterOfMass(),
+    )
     robot = fflin.load("planar_detumble", outputs=[*kinds, fflin.JointPositions()])
     q, v, u = random_point(robot, RNG, degrees=60.0)
     lin = fflin.linearize(robot, q, v, u)
@@ -335,8 +389,13 @@ def test_outputs_are_those_of_the_model_everywhere():
     h = 1e-6
     for k in range(len(lin.x0)):
         e = h * np.eye(len(lin.x0))[k]
-        ends = [fflin.outputs(robot, lin, *state.to_pinocchio(lin.x0 + s * e), u) for s in (1, -1)]
-        assert (ends[0] - ends[1]) / (2 * h) == pytest.approx(lin.C[:, k], rel=1e-6, abs=1e-6)
+        ends = [
+            fflin.outputs(robot, lin, *state.to_pinocchio(lin.x0 + s * e), u)
+            for s in (1, -1)
+        ]
+        assert (ends[0] - ends[1]) / (2 * h) == pytest.approx(
+            lin.C[:, k], rel=1e-6, abs=1e-6
+        )
     turned = q.copy()
     turned[3:7] *= -1.0  # the same attitude
     assert fflin.outputs(robot, lin, turned, v, u) == pytest.approx(lin.y0, abs=1e-12)

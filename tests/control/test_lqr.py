@@ -22,7 +22,9 @@ def lin():
 
 @pytest.fixture(scope="module")
 def gain(lin):
-    Q = fflin.bryson(lin, {"q_b": 0.05, "r_b": 0.1, "q_m": 0.1, "omega_b": 0.1, "v_b": 0.1})
+    Q = fflin.bryson(
+        lin, {"q_b": 0.05, "r_b": 0.1, "q_m": 0.1, "omega_b": 0.1, "v_b": 0.1}
+    )
     return fflin.lqr(lin, Q, fflin.bryson(lin, {"tau_b": 100, "F_b": 100, "tau_m": 20}))
 
 
@@ -38,9 +40,9 @@ def test_cost_to_go_is_the_integral_of_the_cost(lin, gain):
         cost = y[:-1] @ gain.Q @ y[:-1] + u @ gain.R @ u
         return np.append(lin.A @ y[:-1] + lin.B @ u, cost)
 
-    end = solve_ivp(rate, (0, 80), np.append(x, 0.0), method="LSODA", rtol=1e-9, atol=1e-10).y[
-        :, -1
-    ]
+    end = solve_ivp(
+        rate, (0, 80), np.append(x, 0.0), method="LSODA", rtol=1e-9, atol=1e-10
+    ).y[:, -1]
     assert end[-1] == pytest.approx(x @ gain.P @ x, rel=1e-6)
     assert gain.margin == pytest.approx(-np.linalg.eigvals(gain.closed_loop).real.max())
     assert (gain.x0 == lin.x0).all() and gain.input_names == lin.input_names
@@ -53,12 +55,17 @@ def test_weights_by_matrix_diagonal_number_and_name_are_one(lin):
     by_name = {"q_b": 4.0, "r_b": 1.0, "q_m": 2.0, "q_m.joint_2": 7.0, "omega_b": 0.5}
     groups = [name.partition(".")[0] for name in names]
     diagonal = np.array(
-        [by_name.get(n, by_name.get(g, 0.0)) for n, g in zip(names, groups, strict=True)]
+        [
+            by_name.get(n, by_name.get(g, 0.0))
+            for n, g in zip(names, groups, strict=True)
+        ]
     )
     expected = fflin.lqr(lin, np.diag(diagonal), 3.0 * np.eye(12)).K
     for Q in (by_name, dict(reversed(by_name.items())), diagonal, diagonal.tolist()):
         assert (fflin.lqr(lin, Q, 3.0).K == expected).all()
-    assert (fflin.lqr(lin, diagonal, {"tau_b": 3, "F_b": 3, "tau_m": 3}).K == expected).all()
+    assert (
+        fflin.lqr(lin, diagonal, {"tau_b": 3, "F_b": 3, "tau_m": 3}).K == expected
+    ).all()
     # Round-off asymmetry is no error.
     noisy = np.diag(diagonal) + 1e-14 * np.triu(np.ones((24, 24)), 1)
     assert fflin.lqr(lin, noisy, 3.0).K == pytest.approx(expected, rel=1e-8, abs=1e-9)
@@ -153,7 +160,10 @@ def test_weights_of_any_size_give_a_gain_or_one_clear_line(lin, dt):
 def test_what_is_no_fixed_point_is_refused_with_its_rows():
     robot = fflin.load("ets_vii")
     v = fflin.velocity(robot, {"omega_b.z": 0.1, "joint_1": 0.2})
-    for point in (fflin.linearize(robot, None, v), fflin.linearize(robot, None, v).discretize(0.1)):
+    for point in (
+        fflin.linearize(robot, None, v),
+        fflin.linearize(robot, None, v).discretize(0.1),
+    ):
         with pytest.raises(fflin.EquilibriumError, match=r"q_m\.joint_1.* 0\.2"):
             fflin.lqr(point, 1, 1)
     with pytest.raises(fflin.EquilibriumError, match=r"qdot_m\.joint_2"):
@@ -180,14 +190,24 @@ def test_what_the_inputs_cannot_hold_is_named(robots, name, dt):
     refused(joints, f"stabilise {angular}; add inputs, or design on .*_reduction")
     refused([fflin.BaseForce(), *joints], f"stabilise {angular}; add inputs, or design")
     oblique = fflin.Thruster(robot.model.frames[2].name, (0.0, 0.0, 0.0), (1, 1, 0))
-    refused([fflin.BaseTorque(), oblique, *joints], "stabilise linear momentum .*; add inputs, or")
+    refused(
+        [fflin.BaseTorque(), oblique, *joints],
+        "stabilise linear momentum .*; add inputs, or",
+    )
     plane = [
-        fflin.Thruster(robot.model.frames[2].name, position=(0.1, y, 0.0), direction=direction)
+        fflin.Thruster(
+            robot.model.frames[2].name, position=(0.1, y, 0.0), direction=direction
+        )
         for y, direction in ((0.1, (1, 0, 0)), (-0.1, (-1, 0, 0)), (0.1, (0, 1, 0)))
     ]
-    refused([*plane, *joints], "stabilise angular momentum x/y.*; add inputs, or design")
+    refused(
+        [*plane, *joints], "stabilise angular momentum x/y.*; add inputs, or design"
+    )
     base = [fflin.BaseTorque(), fflin.BaseForce()]
-    refused([*base, *joints[1:]], f"stabilise momentum of {robot.joint_names[0]}; .*--stiffness")
+    refused(
+        [*base, *joints[1:]],
+        f"stabilise momentum of {robot.joint_names[0]}; .*--stiffness",
+    )
 
 
 @pytest.mark.parametrize("name", BUNDLED)
@@ -203,7 +223,9 @@ def test_a_base_that_no_input_pushes_is_regulated_without_its_position(robots, n
         unpushed = {f"{group}.{axis}" for group in ("r_b", "v_b") for axis in "xyz"}
         assert set(gain.state_names) - set(gain.regulated) == unpushed
         expected = fflin.lqr(reduced, 1.0, 1.0).K @ part.S
-        assert gain.K == pytest.approx(expected, rel=1e-7, abs=1e-9 * np.abs(expected).max())
+        assert gain.K == pytest.approx(
+            expected, rel=1e-7, abs=1e-9 * np.abs(expected).max()
+        )
         assert says(str(gain), "v_b.z (no input pushes the base there)")
         assert not says(str(gain), "wheel")
 
@@ -235,7 +257,9 @@ def test_modes_that_decay_by_themselves_are_not_blamed(dt):
     pushed = about(fflin.BaseTorque(), fflin.BaseForce())
     unseen = fflin.observability(pushed).unobservable
     assert any("q_m.h1" in name for name in unseen)
-    with pytest.raises(fflin.DetectabilityError, match=r"observe q_b\.x, .* r_b\.x") as told:
+    with pytest.raises(
+        fflin.DetectabilityError, match=r"observe q_b\.x, .* r_b\.x"
+    ) as told:
         fflin.kalman(pushed, 1.0, 1.0)
     assert "q_m" not in str(told.value)
     # Without dampers the modes last, and they are blamed.
@@ -248,7 +272,9 @@ def test_a_spring_is_advised_only_where_it_changes_a_momentum():
     """A spring between links changes the momentum of a joint, but not of the whole robot."""
     base = [fflin.BaseTorque(), fflin.BaseForce()]
     loose = panels(damping=0.0).replace(stiffness={})
-    with pytest.raises(fflin.StabilizabilityError, match=r"momentum of h1.*--stiffness.*--reduce"):
+    with pytest.raises(
+        fflin.StabilizabilityError, match=r"momentum of h1.*--stiffness.*--reduce"
+    ):
         fflin.lqr(fflin.linearize(loose.replace(inputs=base)), 1.0, 1.0)
     with pytest.raises(fflin.StabilizabilityError, match=r'lock = \["h\*"\], --lock'):
         fflin.lqr(fflin.linearize(loose.replace(inputs=base)), 1.0, 1.0)
@@ -256,7 +282,9 @@ def test_a_spring_is_advised_only_where_it_changes_a_momentum():
     with pytest.raises(fflin.StabilizabilityError, match=r'lock = \["h1"\], --lock'):
         fflin.lqr(fflin.linearize(loose.replace(inputs=one)), 1.0, 1.0)
     hub = fflin.load("cubesat", inputs=[fflin.BaseForce()])
-    with pytest.raises(fflin.StabilizabilityError, match=r"angular momentum.*--reduce") as told:
+    with pytest.raises(
+        fflin.StabilizabilityError, match=r"angular momentum.*--reduce"
+    ) as told:
         fflin.lqr(fflin.linearize(hub))
     assert "spring" not in str(told.value)
 
@@ -294,7 +322,9 @@ def test_limits_may_be_lists_of_mappings_and_open_on_one_side(lin, gain):
 
 
 def test_springs_do_not_hide_that_momentum_is_conserved():
-    robot = joints_only(fflin.load("servicer_7dof").replace(stiffness=20.0, damping=1.0))
+    robot = joints_only(
+        fflin.load("servicer_7dof").replace(stiffness=20.0, damping=1.0)
+    )
     with pytest.raises(fflin.StabilizabilityError, match="angular momentum"):
         fflin.lqr(fflin.linearize(robot), 1, 1)
     # Without what is conserved it can be held, and so can all with the base's inputs.
@@ -312,7 +342,9 @@ def disk_on_a_grid(gain):
         s = np.exp(1j * w * gain.dt) if gain.dt else 1j * w
         if gain.dt and w * gain.dt > np.pi:
             continue
-        S = np.eye(len(scale)) - gain.K @ np.linalg.solve(s * np.eye(len(loop)) - loop, gain.B)
+        S = np.eye(len(scale)) - gain.K @ np.linalg.solve(
+            s * np.eye(len(loop)) - loop, gain.B
+        )
         T = np.eye(len(scale)) - S
         scaled = scale[:, None] * (0.5 * (S - T)) / scale
         worst = max(worst, np.linalg.norm(scaled, 2))
@@ -341,13 +373,18 @@ def test_the_largest_gain_of_a_resonance_is_found_between_the_poles():
         A = np.array([[0.0, 1.0], [-9.0, -6.0 * z]])
         B, C = np.array([[0.0], [9.0]]), np.array([[1.0, 0.0]])
         exact = 1.0 / (2.0 * z * np.sqrt(1.0 - z**2))
-        assert largest_gain(A, B, C, np.zeros((1, 1)))[0] == pytest.approx(exact, rel=2e-5)
+        assert largest_gain(A, B, C, np.zeros((1, 1)))[0] == pytest.approx(
+            exact, rel=2e-5
+        )
         # With a direct term, on a dense grid.
         D = np.array([[0.7]])
         response = D + [
-            C @ np.linalg.solve(1j * w * np.eye(2) - A, B) for w in np.linspace(0, 9, 9001)
+            C @ np.linalg.solve(1j * w * np.eye(2) - A, B)
+            for w in np.linspace(0, 9, 9001)
         ]
-        assert largest_gain(A, B, C, D)[0] == pytest.approx(np.abs(response).max(), rel=3e-5)
+        assert largest_gain(A, B, C, D)[0] == pytest.approx(
+            np.abs(response).max(), rel=3e-5
+        )
 
 
 def test_a_cross_weight_that_takes_a_spring_away_leaves_its_joint_unweighed():
@@ -368,9 +405,13 @@ def test_a_cross_weight_is_sampled_with_the_rest(fields):
     W = V @ V.T
     Q, R, N = fflin.sampled_cost(model, h, W[:nx, :nx], W[nx:, nx:], W[:nx, nx:])
     F = np.vstack((np.hstack((model.A, model.B)), np.zeros((nu, nx + nu))))
-    integral = quad_vec(lambda t: expm(F * t).T @ W @ expm(F * t), 0.0, h, epsrel=1e-11)[0]
+    integral = quad_vec(
+        lambda t: expm(F * t).T @ W @ expm(F * t), 0.0, h, epsrel=1e-11
+    )[0]
     scale = np.abs(integral).max()
-    assert np.block([[Q, N], [N.T, R]]) == pytest.approx(integral, rel=1e-9, abs=1e-11 * scale)
+    assert np.block([[Q, N], [N.T, R]]) == pytest.approx(
+        integral, rel=1e-9, abs=1e-11 * scale
+    )
 
 
 def test_sampled_cost_is_the_integral_under_held_inputs(lin):
@@ -381,7 +422,9 @@ def test_sampled_cost_is_the_integral_under_held_inputs(lin):
     # The specification's polynomials.
     AQ, AQA = A.T @ Q + Q @ A, A.T @ Q @ A
     Qd = Q * h + AQ * h**2 / 2 + AQA * h**3 / 3
-    Nd = Q @ B * h**2 / 2 + (Q @ A @ B / 2 + A.T @ Q @ B) * h**3 / 3 + AQA @ B * h**4 / 8
+    Nd = (
+        Q @ B * h**2 / 2 + (Q @ A @ B / 2 + A.T @ Q @ B) * h**3 / 3 + AQA @ B * h**4 / 8
+    )
     cross = B.T @ Q @ A @ B
     Rd = R * h + B.T @ Q @ B * h**3 / 3 + (cross + cross.T) * h**4 / 8
     Rd += B.T @ AQA @ B * h**5 / 20
@@ -406,7 +449,9 @@ def test_held_cost_away_from_rest():
     F, W = rng.normal(size=(7, 7)), rng.normal(size=(7, 7))
     W = W @ W.T
     for h in (0.01, 3.0):
-        exact = quad_vec(lambda t: expm(F.T * t) @ W @ expm(F * t), 0, h, epsrel=1e-12)[0]
+        exact = quad_vec(lambda t: expm(F.T * t) @ W @ expm(F * t), 0, h, epsrel=1e-12)[
+            0
+        ]
         assert held_cost(F, W, h) == pytest.approx(exact, rel=1e-9)
 
 
@@ -427,7 +472,11 @@ def test_files_keep_every_bit(gain, tmp_path, ending):
         if item.name == "_lin":
             continue
         before, after = getattr(gain, item.name), getattr(back, item.name)
-        same = np.array_equal(before, after) if isinstance(before, np.ndarray) else before == after
+        same = (
+            np.array_equal(before, after)
+            if isinstance(before, np.ndarray)
+            else before == after
+        )
         assert same and np.shape(before) == np.shape(after), item.name
     for words, name in (("Gain", "else"), ("No such file", "missing")):
         if name == "else":
@@ -452,7 +501,10 @@ def test_a_gain_prints_in_80_columns(gain, lin):
         text = str(each)
         assert max(map(len, text.splitlines())) <= 80
         rates = np.log(each.poles) / each.dt if each.dt else each.poles
-        assert f"{each.residual:.1e}" in text and f"decay {-rates.real.max():.3g} 1/s" in text
+        assert (
+            f"{each.residual:.1e}" in text
+            and f"decay {-rates.real.max():.3g} 1/s" in text
+        )
     assert "writes every entry" in str(gain) and "qdot_m.joint_3" in str(small)
 
 
@@ -505,12 +557,16 @@ def test_a_sampled_point_at_rest_has_no_rates_of_positions(tmp_path):
 
 def test_an_equilibrium_does_not_depend_on_the_sampling_time(tmp_path):
     robot = fflin.load("planar_detumble")
-    pushed = fflin.effort(robot, {"F_b.z": 5e-9 * robot.mass})  # 5e-9 m/s^2; the limit is 1e-9
+    # 5e-9 m/s^2; the limit is 1e-9
+    pushed = fflin.effort(robot, {"F_b.z": 5e-9 * robot.mass})
     lin = fflin.linearize(robot, u=pushed)
     assert not lin.is_equilibrium()
     for dt in (1e-3, 0.1):
         lin.discretize(dt).save(tmp_path / "sampled.npz")
-        for sampled in (lin.discretize(dt), fflin.LinearModel.load(tmp_path / "sampled.npz")):
+        for sampled in (
+            lin.discretize(dt),
+            fflin.LinearModel.load(tmp_path / "sampled.npz"),
+        ):
             assert not sampled.is_equilibrium()
             assert sampled.is_equilibrium(6e-9)
 

@@ -20,7 +20,9 @@ def test_a_mass_with_position_and_rate_feedback_has_the_margin_of_the_textbook()
     k, c = gain.K[row, 3] / mass, gain.K[row, 9] / mass
     # L = (k + c s)/s^2 is one where w^4 = k^2 + c^2 w^2.
     crossing = math.sqrt((c**2 + math.sqrt(c**4 + 4.0 * k**2)) / 2.0)
-    assert loops[row].phase == pytest.approx(math.degrees(math.atan2(c * crossing, k)), rel=1e-9)
+    assert loops[row].phase == pytest.approx(
+        math.degrees(math.atan2(c * crossing, k)), rel=1e-9
+    )
     assert loops[row].gain == (0.0, math.inf)
     expected = (k + 1j * c * w) / (1j * w) ** 2
     np.testing.assert_allclose(response[:, row], expected, rtol=1e-6)
@@ -69,7 +71,11 @@ def test_a_loop_is_unstable_just_beyond_its_margins_and_no_sooner(lin):
         low, high = loop.gain
         for limit, beyond in ((high, 1.001), (low, 1.0 / 1.001)):
             if 0.0 < limit < math.inf:
-                assert growth(gain, i, limit * beyond) > 0.0 > growth(gain, i, limit / beyond)
+                assert (
+                    growth(gain, i, limit * beyond)
+                    > 0.0
+                    > growth(gain, i, limit / beyond)
+                )
                 held += 1
         # A phase turns the loops of both signs of the frequency, one of which gets unstable.
         for sign in (1.0, -1.0):
@@ -78,7 +84,8 @@ def test_a_loop_is_unstable_just_beyond_its_margins_and_no_sooner(lin):
                     assert growth(gain, i, np.exp(1j * sign * angle)) < 0.0
                 continue
             inside, outside = (
-                np.exp(1j * sign * math.radians(share * loop.phase)) for share in (0.999, 1.001)
+                np.exp(1j * sign * math.radians(share * loop.phase))
+                for share in (0.999, 1.001)
             )
             assert growth(gain, i, inside) < 0.0 < growth(gain, i, outside)
     assert held
@@ -95,7 +102,9 @@ def test_what_is_not_regulated_has_no_part_in_the_loops():
     for k in (0, 100, len(grid) - 1):
         for i in (0, 13):
             others = [j for j in range(len(K)) if j != i]
-            closed = np.linalg.inv(1j * grid[k] * np.eye(len(fed)) - A + B[:, others] @ K[others])
+            closed = np.linalg.inv(
+                1j * grid[k] * np.eye(len(fed)) - A + B[:, others] @ K[others]
+            )
             assert values[k, i] == pytest.approx((K[i] @ closed @ B[:, i]), rel=1e-6)
     assert all(loop.phase > 59.9 for loop in loops)
 
@@ -104,7 +113,11 @@ def loop_of(gain):
     """The regulated states' A, B and K, with inputs scaled by sqrt(R_ii)."""
     fed = [gain.state_names.index(name) for name in gain.regulated]
     scale = np.sqrt(gain.R.diagonal())
-    return gain.A[np.ix_(fed, fed)], gain.B[fed] / scale, scale[:, None] * gain.K[:, fed]
+    return (
+        gain.A[np.ix_(fed, fed)],
+        gain.B[fed] / scale,
+        scale[:, None] * gain.K[:, fed],
+    )
 
 
 def balance(gain, frequencies):
@@ -186,10 +199,16 @@ def test_the_disk_margin_is_the_least_over_a_sweep_and_exact_on_both_sides(case)
             assert beyond(gain, factors_of(delta)) < 0.0
             gains = np.exp(rng.uniform(np.log(low), np.log(high), len(u)))
             turns = np.radians(rng.choice([-0.999, 0.999], len(u)) * phase)
-            assert beyond(gain, np.diag(gains)) < 0.0 > beyond(gain, np.diag(np.exp(1j * turns)))
+            assert (
+                beyond(gain, np.diag(gains))
+                < 0.0
+                > beyond(gain, np.diag(np.exp(1j * turns)))
+            )
         # The limits of gain and phase are on the edge of the disk.
         for factor in (low, high, np.exp(1j * math.radians(phase))):
-            assert abs(2.0 * (factor - 1.0) / (factor + 1.0)) == pytest.approx(disk, rel=1e-12)
+            assert abs(2.0 * (factor - 1.0) / (factor + 1.0)) == pytest.approx(
+                disk, rel=1e-12
+            )
 
 
 def test_margins_are_computed_for_the_warning_only_if_the_weights_do_not_guarantee_them():
@@ -223,7 +242,9 @@ def test_the_largest_gain_of_many_poles_is_found_from_few_of_them():
         C[i, 2 * i] = 1.0
     largest, frequency = largest_gain(A, B, C, np.zeros((60, 60)))
     # The gain of a resonance is 1 / (2 zeta sqrt(1 - zeta^2)).
-    assert largest == pytest.approx(1.0 / (0.016 * math.sqrt(1.0 - 0.008**2)), rel=ACCURACY)
+    assert largest == pytest.approx(
+        1.0 / (0.016 * math.sqrt(1.0 - 0.008**2)), rel=ACCURACY
+    )
     assert frequency == pytest.approx(frequencies[37], rel=1e-3)
 
 

@@ -24,7 +24,9 @@ pytest.importorskip("matplotlib")
 )
 def test_the_pattern_is_that_of_a_and_b_by_groups(name, inputs):
     robot = fflin.load(name)
-    lin = fflin.linearize(robot.replace(inputs=fflin.load_inputs(inputs)) if inputs else robot)
+    lin = fflin.linearize(
+        robot.replace(inputs=fflin.load_inputs(inputs)) if inputs else robot
+    )
     figure = fflin.plot_matrices(lin)
     assert_legible(figure)
     for axes, values, names in zip(
@@ -42,17 +44,23 @@ def test_the_pattern_is_that_of_a_and_b_by_groups(name, inputs):
     assert any("SI units" in text for text in written)
 
 
-@pytest.mark.parametrize("name", mostly(["planar_detumble", "talos"], "planar_detumble"))
+@pytest.mark.parametrize(
+    "name", mostly(["planar_detumble", "talos"], "planar_detumble")
+)
 def test_patterns_of_sampled_robots_can_be_read(name):
     sampled = fflin.linearize(fflin.load(name)).discretize(0.1)
     figure = fflin.plot_matrices(sampled)
     assert_legible(figure)
-    assert f"{name}, frame hybrid, sampled every 0.1 s" in [text for text, _ in texts(figure)]
+    assert f"{name}, frame hybrid, sampled every 0.1 s" in [
+        text for text, _ in texts(figure)
+    ]
 
 
 def test_patterns_of_none_can_be_read():
     empty = replace(
-        fflin.linearize(fflin.load("cubesat")), B=np.zeros((12, 6)), A=np.zeros((12, 12))
+        fflin.linearize(fflin.load("cubesat")),
+        B=np.zeros((12, 6)),
+        A=np.zeros((12, 12)),
     )
     assert_legible(fflin.plot_matrices(empty))
 
@@ -75,7 +83,9 @@ def test_bars_are_the_shapes_of_the_modes(name):
     filled, outlined = bars(figure)
     half = len(found.state_names) // 2
     shapes = np.array([mode.shape[:half] for mode in found.modes])
-    drawn = np.array([[filled[line, i] for i in range(half)] for line in range(len(shapes))])
+    drawn = np.array(
+        [[filled[line, i] for i in range(half)] for line in range(len(shapes))]
+    )
     # The axis points down, and a bar of 1 leaves room for that of the next line.
     np.testing.assert_allclose(-drawn / 0.45, shapes.real, atol=1e-12)
     late = np.abs(shapes.imag) > 0.02 * np.abs(shapes)
@@ -178,7 +188,8 @@ def test_validity_says_the_slope_that_is_drawn(reach):
 
 @pytest.mark.compiled
 @pytest.mark.parametrize(
-    ("name", "unit"), [("ets_vii", "rad"), ("cubesat", "rad|m"), ("tiago_no_hand", "rad|m")]
+    ("name", "unit"),
+    [("ets_vii", "rad"), ("cubesat", "rad|m"), ("tiago_no_hand", "rad|m")],
 )
 def test_joints_that_all_turn_are_displaced_by_radians(reach, name, unit):
     from fflin.campaign.validity import joint_unit
@@ -199,7 +210,9 @@ def test_validity_of_what_leaves_the_chart_can_be_drawn(tmp_path):
     assert_legible(figure)
     known = np.isfinite(found.prediction_error)
     curve = figure.axes[0].get_lines()[0]
-    np.testing.assert_allclose(curve.get_ydata()[known], 100.0 * found.prediction_error[known])
+    np.testing.assert_allclose(
+        curve.get_ydata()[known], 100.0 * found.prediction_error[known]
+    )
     assert (tmp_path / "validity.png").read_bytes().startswith(b"\x89PNG")
 
 

@@ -16,7 +16,10 @@ from tests.support.messages import says
 pytest.importorskip("daqp")
 piqp = pytest.importorskip("piqp")
 
-WEIGHTS = ({"q_b": 0.05, "r_b": 0.1, "q_m": 0.1}, {"tau_b": 20.0, "F_b": 20.0, "tau_m": 5.0})
+WEIGHTS = (
+    {"q_b": 0.05, "r_b": 0.1, "q_m": 0.1},
+    {"tau_b": 20.0, "F_b": 20.0, "tau_m": 5.0},
+)
 # The base may be turned harder than the joints can bear.
 WEAK = {"tau_b": 60.0, "F_b": 20.0, "tau_m": 1.0}
 
@@ -42,7 +45,9 @@ def planned():
     robot = fflin.load("planar_detumble", damping="urdf", stiffness={"joint_1": 0.5})
     v0 = fflin.velocity(robot, {"omega_b.y": 0.1, "joint_1": -0.05})
     goal = fflin.configuration(robot, {"joint_2": 0.5})
-    motion = fflin.plan(robot, (goal, None), 20.0, v0=v0, knots=21, limits={"qdot_m": 0.3})
+    motion = fflin.plan(
+        robot, (goal, None), 20.0, v0=v0, knots=21, limits={"qdot_m": 0.3}
+    )
     return robot, fflin.linearize_trajectory(robot, motion)
 
 
@@ -73,7 +78,9 @@ def planned_by(policy, e, t=0.0):
     _, to_d, _ = condensed(stages, planned=False)
     size = len(z)
     d = np.linalg.solve(to_d[:, :size], z - to_d[:, size:] @ e)
-    assert flag > 0 and d[: len(first)] == pytest.approx(first, abs=1e-9 * np.abs(d).max())
+    assert flag > 0 and d[: len(first)] == pytest.approx(
+        first, abs=1e-9 * np.abs(d).max()
+    )
     return d
 
 
@@ -90,7 +97,9 @@ def test_without_limits_it_is_the_regulator(name, given):
     m = policy.matrices(e)
     first = np.linalg.solve(m.H, -m.g)[: len(lin.u0)]
     assert first == pytest.approx(-gain.K @ e, abs=1e-10 * np.abs(gain.K @ e).max())
-    assert Receding(policy.horizon, None).step(0.0, e) == pytest.approx(-gain.K @ e, rel=1e-10)
+    assert Receding(policy.horizon, None).step(0.0, e) == pytest.approx(
+        -gain.K @ e, rel=1e-10
+    )
 
 
 @pytest.mark.parametrize("Qf", ["steady", 30.0])
@@ -98,7 +107,9 @@ def test_the_matrices_are_cost_and_prediction(servicer, Qf):
     """Of any inputs: the sum over the samples of the model, term by term."""
     _, lin = servicer
     Q, R = weights(lin)
-    policy = fflin.mpc(lin, Q, R, horizon=5, dt=0.2, limits={"tau_m": 9.0, "q_m": 0.3}, Qf=Qf)
+    policy = fflin.mpc(
+        lin, Q, R, horizon=5, dt=0.2, limits={"tau_m": 9.0, "q_m": 0.3}, Qf=Qf
+    )
     rng, sampled = np.random.default_rng(2), lin.discretize(0.2)
     start, (Qd, Rd, Nd) = rng.normal(size=30), fflin.sampled_cost(lin, 0.2, Q, R)
     end = fflin.lqr(sampled, Qd, Rd, Nd).P if Qf == "steady" else Qf * np.eye(30)
@@ -110,9 +121,9 @@ def test_the_matrices_are_cost_and_prediction(servicer, Qf):
             total += e @ Qd @ e + 2.0 * e @ Nd @ u + u @ Rd @ u
             e = sampled.A @ e + sampled.B @ u
             rows = (m.G @ d).reshape(5, -1)[k]
-            assert rows[:9] == pytest.approx(u[6:]) and rows[9:] + (m.Phi[k + 1] @ start)[
-                6:15
-            ] == pytest.approx(e[6:15])
+            assert rows[:9] == pytest.approx(u[6:]) and rows[9:] + (
+                m.Phi[k + 1] @ start
+            )[6:15] == pytest.approx(e[6:15])
             assert m.Phi[k + 1] @ start + m.Gamma[k + 1] @ d == pytest.approx(e)
         return total + e @ end @ e
 
@@ -131,7 +142,11 @@ def test_within_limits_it_is_the_best(servicer, size):
     push back with, all outwards, balances the slope of the cost."""
     _, lin = servicer
     policy = fflin.mpc(
-        lin, *weights(lin), horizon=15, dt=0.2, limits=["urdf", {"tau_b": 40.0, "tau_m": 9.0}]
+        lin,
+        *weights(lin),
+        horizon=15,
+        dt=0.2,
+        limits=["urdf", {"tau_b": 40.0, "tau_m": 9.0}],
     )
     e = np.zeros(30)
     e[:3], e[6:13] = (
@@ -147,7 +162,9 @@ def test_within_limits_it_is_the_best(servicer, size):
     assert outwards.shape[1] > (0 if size > 0.1 else -1)
     slope, scale = m.H @ d + m.g, m.H.diagonal() ** -0.5
     left = (
-        nnls(scale[:, None] * outwards, -scale * slope)[1] if outwards.size else np.abs(slope).max()
+        nnls(scale[:, None] * outwards, -scale * slope)[1]
+        if outwards.size
+        else np.abs(slope).max()
     )
     assert left <= 1e-6 * np.abs(scale * m.g).max()
 
@@ -209,10 +226,20 @@ def test_slews_that_break_the_regulator_are_held(servicer):
     limits = ["urdf", WEAK]
     policy = fflin.mpc(lin, *weights(lin), horizon=20, dt=0.25, limits=limits)
     regulator = fflin.StateFeedback(policy.lin, policy.gain.K)
-    options = {"q0": turned(robot, 90.0), "duration": 60.0, "dt": 0.05, "limits": limits}
-    flown, swung = (fflin.simulate(robot, each, **options) for each in (policy, regulator))
+    options = {
+        "q0": turned(robot, 90.0),
+        "duration": 60.0,
+        "dt": 0.05,
+        "limits": limits,
+    }
+    flown, swung = (
+        fflin.simulate(robot, each, **options) for each in (policy, regulator)
+    )
     beyond = {each.name for each in swung.passed}
-    assert beyond > {"q_m.panel_left", "q_m.panel_right", "q_m.joint_3"} and not flown.passed
+    assert (
+        beyond > {"q_m.panel_left", "q_m.panel_right", "q_m.joint_3"}
+        and not flown.passed
+    )
     assert flown.attitude_error[-1] < 2.0 and swung.attitude_error[-1] > 10.0
     joints = [np.abs(each.error[:, 6:15]).max(axis=0) for each in (flown, swung)]
     assert joints[0].max() < 0.5 and joints[1].max() > 3.0 and flown.saturated
@@ -230,7 +257,9 @@ def test_where_it_begins_the_search_changes_nothing(servicer):
     e[:3] = 0.3, -0.24, 0.32
     for k in range(40):
         d = warm.step(0.25 * k, e)
-        assert d == pytest.approx(Receding(policy.horizon, None).step(0.25 * k, e), abs=1e-6)
+        assert d == pytest.approx(
+            Receding(policy.horizon, None).step(0.25 * k, e), abs=1e-6
+        )
         e = policy.lin.A @ e + policy.lin.B @ d
 
 
@@ -257,14 +286,21 @@ def test_along_a_trajectory_it_keeps_within_limits(planned):
     """Of the values themselves: of u = u* + d, of joints and rates about those that are planned."""
     robot, along = planned
     state = fflin.StateMap(robot, frame="local")
-    q_m, most = state.joint_positions(along.q)[:, 1], np.abs(along.u_base).reshape(-1, 3, 3)
-    limits = dict(zip(("tau_b", "F_b", "tau_m"), 1.1 * most.max(axis=(0, 2)), strict=True))
+    q_m, most = (
+        state.joint_positions(along.q)[:, 1],
+        np.abs(along.u_base).reshape(-1, 3, 3),
+    )
+    limits = dict(
+        zip(("tau_b", "F_b", "tau_m"), 1.1 * most.max(axis=(0, 2)), strict=True)
+    )
     limits |= {"q_m.joint_2": (q_m.min() - 0.02, q_m.max() + 0.02)}
     limits |= {"qdot_m": 1.1 * np.abs(along.v[:, 6:]).max()}
     policy = fflin.mpc(along, horizon=8, dt=0.5, limits=limits)
     q0, v0 = policy.beside({"pitch": 6.0, "q_m.joint_2": 0.01, "r_b.x": 0.1})
     options = {"q0": q0, "v0": v0, "duration": 30.0, "limits": limits, "dt": 0.05}
-    flown, cut = (fflin.simulate(robot, each, **options) for each in (policy, policy.schedule))
+    flown, cut = (
+        fflin.simulate(robot, each, **options) for each in (policy, policy.schedule)
+    )
     assert not flown.passed and flown.saturated and flown.attitude_error[-1] < 0.2
     assert "qdot_m.joint_2" in {each.name for each in cut.passed}
     joint = robot.joint_names.index("joint_2")
@@ -272,9 +308,13 @@ def test_along_a_trajectory_it_keeps_within_limits(planned):
         e = np.zeros(18)
         e[1], e[7] = 0.03, 0.01
         d = planned_by(policy, e, t)
-        assert d == pytest.approx(exactly(policy.matrices(e, t)), abs=1e-6 * np.abs(d).max())
+        assert d == pytest.approx(
+            exactly(policy.matrices(e, t)), abs=1e-6 * np.abs(d).max()
+        )
         m, reference = policy.matrices(np.zeros(18), t), along.point(t)
-        assert m.high[:9] + reference[2] == pytest.approx(np.repeat(list(limits.values())[:3], 3))
+        assert m.high[:9] + reference[2] == pytest.approx(
+            np.repeat(list(limits.values())[:3], 3)
+        )
         later = along.point(min(t + 0.5, 20.0))
         row = m.limits.index("q_m.joint_2[0]")
         at = state.joint_positions(later[0])[joint]
@@ -286,10 +326,14 @@ def test_outputs_have_limits_by_name(servicer):
     robot, _ = servicer
     seen = robot.replace(outputs=[fflin.FramePose("tool"), fflin.FullState()])
     lin = fflin.linearize(seen)
-    name = next(x for x in lin.output_names if x.endswith("position.x") or x.endswith("r.x"))
+    name = next(
+        x for x in lin.output_names if x.endswith("position.x") or x.endswith("r.x")
+    )
     row = lin.output_names.index(name)
     low = lin.y0[row] - 0.01
-    policy = fflin.mpc(lin, *weights(lin), dt=0.25, limits=["urdf", {name: (low, 1e3), "q_m": 1.0}])
+    policy = fflin.mpc(
+        lin, *weights(lin), dt=0.25, limits=["urdf", {name: (low, 1e3), "q_m": 1.0}]
+    )
     m = policy.matrices()
     assert f"{name}[0]" in m.limits and "q_m.joint_1[0]" in m.limits
     first = m.limits.index(f"{name}[0]")
@@ -298,9 +342,14 @@ def test_outputs_have_limits_by_name(servicer):
     e = np.zeros(30)
     e[6:13] = 0.1
     d, m = planned_by(policy, e), policy.matrices(e)
-    tool = np.array([lin.C[row] @ (m.Phi[k] @ e + m.Gamma[k] @ d) for k in range(1, 21)])
+    tool = np.array(
+        [lin.C[row] @ (m.Phi[k] @ e + m.Gamma[k] @ d) for k in range(1, 21)]
+    )
     free = np.array(
-        [lin.C[row] @ np.linalg.matrix_power(policy.gain.closed_loop, k) @ e for k in range(1, 21)]
+        [
+            lin.C[row] @ np.linalg.matrix_power(policy.gain.closed_loop, k) @ e
+            for k in range(1, 21)
+        ]
     )
     assert tool.min() >= -0.01 - 1e-9 or free.min() >= -0.01
 
@@ -314,7 +363,9 @@ def test_thrusters_do_not_pull_and_motors_may_have_failed():
     thrust = [i for i, unit in enumerate(lin.input_units) if unit == "N"]
     d = Receding(policy.horizon, None).step(0.0, e)
     assert (d[thrust] >= 0.0).all() and (d[thrust] > 0.0).any()
-    wheels = fflin.mpc(lin, 1.0, 1.0, horizon=10, dt=0.5, limits={"thrust": 0.01, "wheel_x": 0.0})
+    wheels = fflin.mpc(
+        lin, 1.0, 1.0, horizon=10, dt=0.5, limits={"thrust": 0.01, "wheel_x": 0.0}
+    )
     u = planned_by(wheels, e).reshape(10, -1)
     assert np.abs(u[:, lin.input_names.index("wheel_x")]).max() < 1e-12
     assert u[:, thrust].min() > -1e-9 and u[:, thrust].max() == pytest.approx(0.01)
@@ -341,7 +392,9 @@ def test_campaigns_fly_it_and_the_compiled_loop_says_why_not(servicer):
     robot, lin = servicer
     policy = fflin.mpc(lin, *weights(lin), horizon=8, dt=0.25, limits=["urdf", WEAK])
     options = {"duration": 2.0, "dt": 0.05, "limits": ["urdf", WEAK]}
-    campaign = fflin.monte_carlo(robot, policy, {"q_b": 0.05, "*.mass": 0.05}, runs=3, **options)
+    campaign = fflin.monte_carlo(
+        robot, policy, {"q_b": 0.05, "*.mass": 0.05}, runs=3, **options
+    )
     again = campaign.replay(1)
     assert len(campaign) == 3 and "each of 8 samples of 0.25 s: 8" in again.notes[-1]
     with pytest.raises(fflin.InputError, match="Mpc"):
@@ -379,7 +432,9 @@ def test_what_it_cannot_do_is_said_in_a_line(servicer, planned, monkeypatch, tmp
         "horizon is 1000000 samples": {"horizon": 1_000_000},
         "sample is missing": {"dt": None},
         "dt is -1 s": {"dt": -1.0},
-        "the point exceeds the limits of q_m.joint_1": {"limits": {"q_m.joint_1": (0.1, 0.2)}},
+        "the point exceeds the limits of q_m.joint_1": {
+            "limits": {"q_m.joint_1": (0.1, 0.2)}
+        },
         "the point exceeds the limits of tau_b.x": {"limits": {"tau_b": (0.1, 0.2)}},
         "Qf is 'nosuch'": {"Qf": "nosuch"},
         "limits is 'nosuch'": {"limits": "nosuch"},
@@ -430,5 +485,9 @@ def test_it_prints_how_much_is_limited_along_a_trajectory(planned):
 
 def test_a_joint_that_has_a_torque_means_that(servicer):
     _, lin = servicer
-    assert fflin.mpc(lin, dt=0.25, limits={"joint_2": 0.7}).horizon.limited == ("tau_m.joint_2",)
-    assert fflin.mpc(lin, dt=0.25, limits={"q_m.joint_2": 0.7}).horizon.limited == ("q_m.joint_2",)
+    assert fflin.mpc(lin, dt=0.25, limits={"joint_2": 0.7}).horizon.limited == (
+        "tau_m.joint_2",
+    )
+    assert fflin.mpc(lin, dt=0.25, limits={"q_m.joint_2": 0.7}).horizon.limited == (
+        "q_m.joint_2",
+    )

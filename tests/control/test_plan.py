@@ -30,7 +30,9 @@ def missed(robot, motion, q, v=None):
 
 @pytest.fixture(scope="module")
 def cube():
-    robot = fflin.load("cubesat", inputs=[fflin.BaseTorque(max=1e-3), fflin.BaseForce()])
+    robot = fflin.load(
+        "cubesat", inputs=[fflin.BaseTorque(max=1e-3), fflin.BaseForce()]
+    )
     return robot, fflin.linearize(robot).M[2, 2]
 
 
@@ -44,7 +46,9 @@ def test_least_effort_about_an_axis_has_the_closed_form(cube, angle):
     motion = fflin.plan(robot, (goal, None), T, knots=count + 1)
     k = np.arange(count)
     h = T / count
-    exact = 6.0 * inertia * angle * (count - 1 - 2 * k) / (h**2 * count * (count**2 - 1))
+    exact = (
+        6.0 * inertia * angle * (count - 1 - 2 * k) / (h**2 * count * (count**2 - 1))
+    )
     # A goal of pi may be reached either way round.
     u = motion.u[:-1, 2] * np.sign(motion.u[0, 2] * angle)
     size = np.abs(exact).max()
@@ -60,7 +64,9 @@ def test_least_effort_of_linear_inputs_has_the_closed_form(cube):
     """Of inputs linear in between, u = c (s - T / 2), with s the time to go from where what an
     input adds has its centre: at its knot, or a third of a step inside at both ends."""
     robot, inertia = cube
-    motion = fflin.plan(robot, (turned(robot, 1.0), None), 30.0, knots=31, hold="linear")
+    motion = fflin.plan(
+        robot, (turned(robot, 1.0), None), 30.0, knots=31, hold="linear"
+    )
     share, left = np.ones(31), 30.0 - motion.t
     share[[0, -1]] = 0.5
     left[[0, -1]] += (-1.0 / 3.0, 1.0 / 3.0)
@@ -78,12 +84,17 @@ def test_a_turn_in_the_least_time_takes_all_there_is(cube):
     motion = fflin.plan(robot, (goal, None), 1.001 * least, knots=101)
     u = motion.u[:-1, 2]
     assert np.abs(u).max() <= 1e-3
-    assert (np.abs(u) >= 1e-3 * (1 - 1e-6)).sum() >= 90 and (np.diff(np.sign(u)) != 0).sum() == 1
+    assert (np.abs(u) >= 1e-3 * (1 - 1e-6)).sum() >= 90 and (
+        np.diff(np.sign(u)) != 0
+    ).sum() == 1
     assert missed(robot, motion, goal) < 1e-6
     with any_wording(), pytest.raises(fflin.InputError, match=r"omega_b.z .*0\.00\d+"):
         fflin.plan(robot, (goal, None), 0.99 * least)
     # At half the time the turn that is reached is a quarter or less.
-    with any_wording(), pytest.raises(fflin.InputError, match=r"attitude about z .*0\.\d+"):
+    with (
+        any_wording(),
+        pytest.raises(fflin.InputError, match=r"attitude about z .*0\.\d+"),
+    ):
         fflin.plan(robot, (goal, None), 0.5 * least, knots=21)
 
 
@@ -94,9 +105,16 @@ DETUMBLE = {"omega_b.y": 0.1, "joint_1": -0.05, "joint_2": 0.08}
 def servicer():
     """A tumbling chain with damping, springs and gravity, and where it is to end."""
     robot = fflin.load(
-        *("planar_detumble",), damping="urdf", stiffness={"joint_1": 0.5}, gravity=(0.01, 0, 0.02)
+        *("planar_detumble",),
+        damping="urdf",
+        stiffness={"joint_1": 0.5},
+        gravity=(0.01, 0, 0.02),
     )
-    return robot, fflin.velocity(robot, DETUMBLE), turned(robot, 0.4, (0, 1, 0), {"joint_2": 0.9})
+    return (
+        robot,
+        fflin.velocity(robot, DETUMBLE),
+        turned(robot, 0.4, (0, 1, 0), {"joint_2": 0.9}),
+    )
 
 
 @pytest.mark.exhaustive
@@ -109,7 +127,10 @@ def test_a_tumble_ends_within_limits(hold):
         stiffness={"joint_1": 0.5},
         gravity=(0.01, 0, 0.02),
     )
-    v, goal = fflin.velocity(robot, DETUMBLE), turned(robot, 0.4, (0, 1, 0), {"joint_2": 0.9})
+    v, goal = (
+        fflin.velocity(robot, DETUMBLE),
+        turned(robot, 0.4, (0, 1, 0), {"joint_2": 0.9}),
+    )
     limits = {"tau_b": 5.0, "F_b": 3.5, "tau_m": 2.5}
     options = {"v0": v, "knots": 21, "hold": hold, "limits": limits}
     motion = fflin.plan(robot, (goal, None), 20.0, **options)
@@ -118,7 +139,9 @@ def test_a_tumble_ends_within_limits(hold):
     assert motion.residual.max() < 1e-6
     size = np.repeat([5.0, 3.5, 2.5], [3, 3, 2])
     assert (np.abs(motion.u) <= size).all() and (np.abs(motion.u) >= 0.999 * size).any()
-    loose = fflin.plan(robot, (goal, None), 20.0, **options | {"limits": None, "R": size**-2.0})
+    loose = fflin.plan(
+        robot, (goal, None), 20.0, **options | {"limits": None, "R": size**-2.0}
+    )
     assert (np.abs(loose.u) > 1.01 * size).any()
     effort = (np.square(motion.u / size).sum(), np.square(loose.u / size).sum())
     assert effort[0] >= 0.99 * effort[1]
@@ -134,13 +157,21 @@ def test_what_is_planned_is_flown(servicer, tmp_path):
     def policy(t, q, v):
         return motion.u[min(int(t / dt + 1e-9), 39)]
 
-    run = fflin.simulate(robot, policy, v0=v, duration=20.0, dt=dt / 20, sample=dt, frame="local")
+    run = fflin.simulate(
+        robot, policy, v0=v, duration=20.0, dt=dt / 20, sample=dt, frame="local"
+    )
     assert missed(robot, motion, run.q[-1], run.v[-1]) < 1e-5
     motion.save(tmp_path / "plan.csv")
     header, first, *_ = (tmp_path / "plan.csv").read_text().splitlines()
-    assert header.endswith("hold,frame,sha256") and first.split(",")[-3:-1] == ["previous", "local"]
+    assert header.endswith("hold,frame,sha256") and first.split(",")[-3:-1] == [
+        "previous",
+        "local",
+    ]
     read = fflin.Trajectory.load(tmp_path / "plan.csv", robot)
-    assert (read.u == motion.u).all() and (read.hold, read.frame) == ("previous", "local")
+    assert (read.u == motion.u).all() and (read.hold, read.frame) == (
+        "previous",
+        "local",
+    )
 
 
 @pytest.mark.exhaustive
@@ -196,14 +227,17 @@ def test_a_violation_that_is_left_is_printed_as_it_was_computed(one_joint, monke
     monkeypatch.setattr("fflin.control.plan._BETWEEN", 0.1)
     motion = fflin.plan(robot, (goal, None), 10.0, **options)
     found = re.search(
-        r"exceeds the limit of qdot_m\.joint_1 by (\S+) %", " ".join(str(motion).split())
+        r"exceeds the limit of qdot_m\.joint_1 by (\S+) %",
+        " ".join(str(motion).split()),
     )
     ends = [[v[6] for _, v in between_knots(motion, k, 128)] for k in range(5)]
     fine = np.ravel(ends)[7::8]
     assert found and float(found[1]) > 3.0
     assert max(fine) / 0.13 - 1.0 == pytest.approx(0.01 * float(found[1]), rel=0.02)
     monkeypatch.setattr("fflin.control.plan._BETWEEN", 0.01)
-    with pytest.warns(fflin.FflinWarning, match=r"qdot_m\.joint_1 by \S+ % at t = \S+ s"):
+    with pytest.warns(
+        fflin.FflinWarning, match=r"qdot_m\.joint_1 by \S+ % at t = \S+ s"
+    ):
         left = fflin.plan(robot, (goal, None), 10.0, **options)
     assert str(left) == str(motion)
 
@@ -212,8 +246,13 @@ def test_limits_that_cannot_hold_between_knots_hold_at_knots(one_joint):
     """Torques linear over 3.3 s cannot move the joint within 1.15 of its mean speed."""
     robot, goal = one_joint
     limits = SPEEDS | {"qdot_m": 0.115}
-    with any_wording(), pytest.warns(fflin.FflinWarning, match=r"qdot_m\.joint_1 by \S+ % at"):
-        motion = fflin.plan(robot, (goal, None), 10.0, knots=4, hold="linear", limits=limits)
+    with (
+        any_wording(),
+        pytest.warns(fflin.FflinWarning, match=r"qdot_m\.joint_1 by \S+ % at"),
+    ):
+        motion = fflin.plan(
+            robot, (goal, None), 10.0, knots=4, hold="linear", limits=limits
+        )
     assert np.abs(motion.v[:, 6]).max() <= 0.115 + 1e-6 < largest_speeds(motion).max()
     assert missed(robot, motion, goal) < 1e-6
 
@@ -229,7 +268,9 @@ def test_few_knots_keep_limits_between_them(one_joint, knots):
 
 
 @pytest.mark.parametrize("duration", [5.0, *exhaustive(3.0)])
-def test_an_infeasible_plan_gives_up_and_names_the_limit(one_joint, monkeypatch, duration):
+def test_an_infeasible_plan_gives_up_and_names_the_limit(
+    one_joint, monkeypatch, duration
+):
     """A joint needs 1 rad / (0.13 rad/s) = 7.7 s; the search stops after ten iterations in vain."""
     jacobians, iterations = Shooting.jacobians, []
 
@@ -239,7 +280,10 @@ def test_an_infeasible_plan_gives_up_and_names_the_limit(one_joint, monkeypatch,
 
     monkeypatch.setattr(Shooting, "jacobians", counted)
     robot, goal = one_joint
-    with any_wording(), pytest.raises(fflin.InputError, match=r"joint_1.*longer duration"):
+    with (
+        any_wording(),
+        pytest.raises(fflin.InputError, match=r"joint_1.*longer duration"),
+    ):
         fflin.plan(robot, (goal, None), duration, knots=21, limits=SPEEDS)
     assert len(iterations) <= 24  # with and without the points between knots
 
@@ -248,7 +292,9 @@ def test_the_values_nearest_to_their_limits_are_printed(one_joint):
     robot, goal = one_joint
     limits = {"qdot_m": 0.2, "tau_b": [-30.0, 20.0], "tau_m": 25.0}
     motion = fflin.plan(robot, (goal, None), 10.0, knots=5, limits=limits)
-    *_, said = " ".join(str(motion).split()).partition("nearest to their limits at the knots: ")
+    *_, said = " ".join(str(motion).split()).partition(
+        "nearest to their limits at the knots: "
+    )
     names = fflin.linearize(robot).input_names
     u = dict(zip(names, motion.u.T, strict=True))
     torque = np.array([u[f"tau_b.{axis}"] for axis in "xyz"])
@@ -261,7 +307,9 @@ def test_the_values_nearest_to_their_limits_are_printed(one_joint):
         f"tau_m.joint_1 {np.abs(u['tau_m.joint_1']).max():.3g} of 25 N m",
     ]
     assert max(map(len, str(motion).splitlines())) <= 80
-    assert "nearest" not in str(fflin.plan(robot, (goal, None), 10.0, knots=4, limits=None))
+    assert "nearest" not in str(
+        fflin.plan(robot, (goal, None), 10.0, knots=4, limits=None)
+    )
 
 
 @pytest.mark.exhaustive
@@ -281,7 +329,10 @@ def test_a_light_arm_keeps_its_speeds_between_knots():
     ("end", "words"),
     [
         ({"q_m.joint_1": 1.2}, ("goal", "q_m.joint_1", "1.2 rad", "1 rad")),
-        ({"qdot_m.joint_1": -0.3}, ("goal", "qdot_m.joint_1", "-0.3 rad/s", "-0.2 rad/s")),
+        (
+            {"qdot_m.joint_1": -0.3},
+            ("goal", "qdot_m.joint_1", "-0.3 rad/s", "-0.2 rad/s"),
+        ),
     ],
 )
 def test_a_start_or_goal_outside_a_limit_is_refused_before_planning(
@@ -296,7 +347,9 @@ def test_a_start_or_goal_outside_a_limit_is_refused_before_planning(
     limits = {"q_m": 1.0, "qdot_m": 0.2}
     with pytest.raises(fflin.InputError, match="limit") as told:
         fflin.plan(robot, x, 10.0, limits=limits)
-    assert all(word in str(told.value) for word in words) and "\n" not in str(told.value)
+    assert all(word in str(told.value) for word in words) and "\n" not in str(
+        told.value
+    )
     with pytest.raises(fflin.InputError, match="start"):
         fflin.plan(robot, (None, None), 10.0, x0=x, limits=limits)
 
@@ -317,7 +370,9 @@ def test_wheels_turn_a_body_and_may_keep_what_they_took(tmp_path):
 
 
 CUBE_AXES = np.eye(3)
-PYRAMID_AXES = np.array([[1.0, 1.0, 1.0], [-1.0, 1.0, 1.0], [-1.0, -1.0, 1.0], [1.0, -1.0, 1.0]])
+PYRAMID_AXES = np.array(
+    [[1.0, 1.0, 1.0], [-1.0, 1.0, 1.0], [-1.0, -1.0, 1.0], [1.0, -1.0, 1.0]]
+)
 FREE_OF_WHEELS = ["r_b", "v_b", "omega_b"]
 
 
@@ -329,7 +384,10 @@ def with_wheels(axes, inertia=2e-4, **options):
 
 @pytest.mark.parametrize(
     ("axes", "degrees"),
-    [(PYRAMID_AXES, 30.0), *exhaustive((CUBE_AXES, 1.0), (CUBE_AXES, 30.0), (PYRAMID_AXES, 1.0))],
+    [
+        (PYRAMID_AXES, 30.0),
+        *exhaustive((CUBE_AXES, 1.0), (CUBE_AXES, 30.0), (PYRAMID_AXES, 1.0)),
+    ],
 )
 def test_a_slew_from_rest_with_wheels_alone_has_the_closed_form(axes, degrees):
     """About a principal axis, the motion is that of a double integrator. Its torque is that of the
@@ -397,7 +455,9 @@ def test_starts_and_goals_are_given_in_every_form():
 def test_slopes_of_intervals_are_those_of_the_flow(servicer, held):
     robot, v, goal = servicer
     t = np.linspace(0.0, 8.0, 41)
-    q, v, u = Shooting(robot, t, held).guess((robot.neutral(), v), (goal, np.zeros(robot.nv)))
+    q, v, u = Shooting(robot, t, held).guess(
+        (robot.neutral(), v), (goal, np.zeros(robot.nv))
+    )
     u = u[:4]  # the start of the motion
     shooting = Shooting(robot, t[:4], held)
     shooting.steps = 64
@@ -412,7 +472,9 @@ def test_slopes_of_intervals_are_those_of_the_flow(servicer, held):
 
     def third(z):
         """Return the third quarter's end of the second interval."""
-        return tuple(each[1, 48] for each in shooting.motions(*shooting.moved(q, v, z), u)[:2])
+        return tuple(
+            each[1, 48] for each in shooting.motions(*shooting.moved(q, v, z), u)[:2]
+        )
 
     for i in range(nx):
         z = np.zeros((4, nx))
@@ -425,7 +487,9 @@ def test_slopes_of_intervals_are_those_of_the_flow(servicer, held):
         for row, maps in ((1, B), (2, D)):
             du = np.zeros_like(u)
             du[row, i] = 1e-3
-            slope = (ends(np.zeros((4, nx)), du) - ends(np.zeros((4, nx)), -du))[1] / 2e-3
+            slope = (ends(np.zeros((4, nx)), du) - ends(np.zeros((4, nx)), -du))[
+                1
+            ] / 2e-3
             assert slope == pytest.approx(maps[1][:, i], abs=1e-8)
 
 
@@ -436,13 +500,18 @@ def test_limited_values_between_knots_are_those_of_finer_motions(servicer, held)
     t = np.linspace(0.0, 4.0, 5)
     shooting = Shooting(robot, t, held)
     q, v, u = shooting.guess((robot.neutral(), v), (goal, np.zeros(robot.nv)))
-    exact = shooting.limited_values(*(x[:, 16::16] for x in shooting.motions(q, v, u, 256)))
+    exact = shooting.limited_values(
+        *(x[:, 16::16] for x in shooting.motions(q, v, u, 256))
+    )
     size = np.abs(exact).max()
     errors = [
-        np.abs(shooting.inside(shooting.motions(q, v, u, steps), 16) - exact).max() / size
+        np.abs(shooting.inside(shooting.motions(q, v, u, steps), 16) - exact).max()
+        / size
         for steps in (16, 32, 64)
     ]
-    assert errors[0] < 1e-5 and errors[1] < errors[0] / 8.0 and errors[2] < errors[1] / 8.0
+    assert (
+        errors[0] < 1e-5 and errors[1] < errors[0] / 8.0 and errors[2] < errors[1] / 8.0
+    )
 
 
 def test_rows_of_motions_are_those_of_single_motions(servicer):
@@ -467,12 +536,17 @@ def test_a_plan_meets_the_conditions_of_optimality(cube):
     shooting = Shooting(robot, motion.t, True)
     shooting.steps = 16
     nx = shooting.state.nx
-    A, B, _ = np.split(shooting.jacobians(motion.q, motion.v, motion.u)[0], (nx, nx + 6), axis=2)
+    A, B, _ = np.split(
+        shooting.jacobians(motion.q, motion.v, motion.u)[0], (nx, nx + 6), axis=2
+    )
     size, reach, maps = np.repeat([1e-3, 1.0], 3), np.eye(nx), []
     for k in range(19, -1, -1):
         maps.append((reach @ B[k] * size).T)
         reach = reach @ A[k]
-    slopes, u = np.array(maps[::-1]).reshape(-1, A.shape[1]), (motion.u[:-1] / size).ravel()
+    slopes, u = (
+        np.array(maps[::-1]).reshape(-1, A.shape[1]),
+        (motion.u[:-1] / size).ravel(),
+    )
     free = np.abs(u) < 1.0 - 1e-5
     y = np.linalg.lstsq(slopes[free], u[free], rcond=1e-12)[0]
     left = u - slopes @ y
@@ -488,7 +562,9 @@ def reduced_gradient(robot, motion, held):
     nx, nu = shooting.state.nx, motion.u.shape[1]
     ends = shooting.jacobians(motion.q, motion.v, motion.u)[0]
     reach = np.zeros((nx, len(motion.t), nu))
-    for k, (A, B, D) in enumerate(np.split(each, (nx, nx + nu), axis=1) for each in ends):
+    for k, (A, B, D) in enumerate(
+        np.split(each, (nx, nx + nu), axis=1) for each in ends
+    ):
         reach = np.tensordot(A, reach, 1)
         reach[:, k] += B
         reach[:, k + 1] += D
@@ -501,7 +577,9 @@ def reduced_gradient(robot, motion, held):
     return np.linalg.norm(left) / np.linalg.norm(u)
 
 
-def test_a_plan_whose_quadratic_programs_are_not_solved_is_refused(one_joint, monkeypatch):
+def test_a_plan_whose_quadratic_programs_are_not_solved_is_refused(
+    one_joint, monkeypatch
+):
     monkeypatch.setattr(plan_search.Search, "_step", lambda *_, **__: None)
     robot, goal = one_joint
     with pytest.raises(fflin.InputError, match="no motion"):
@@ -513,15 +591,22 @@ def test_a_search_that_stops_early_states_its_gradient(one_joint, monkeypatch, h
     robot, goal = one_joint
     options = {"knots": 11, "limits": None, "hold": hold}
     monkeypatch.setattr(plan_search, "_MOST", 1)
-    with any_wording(), pytest.warns(fflin.FflinWarning, match="not a minimum of the effort"):
+    with (
+        any_wording(),
+        pytest.warns(fflin.FflinWarning, match="not a minimum of the effort"),
+    ):
         motion = fflin.plan(robot, (goal, None), 10.0, **options)
     found = motion.optimality
     left = reduced_gradient(robot, motion, hold == "previous")
     assert left > 0.02 and found.stationarity == pytest.approx(left, rel=1e-4)
-    assert not found.stationary and found.iterations == 1 and found.complementarity < 1e-9
+    assert (
+        not found.stationary and found.iterations == 1 and found.complementarity < 1e-9
+    )
     share = np.ones(11)
     share[[0, -1]] = (1.0, 0.0) if hold == "previous" else (0.5, 0.5)
-    assert found.effort == pytest.approx(share @ np.square(motion.u).sum(axis=1), rel=1e-9)
+    assert found.effort == pytest.approx(
+        share @ np.square(motion.u).sum(axis=1), rel=1e-9
+    )
     assert f"stationarity {found.stationarity:.1e}" in " ".join(str(motion).split())
     assert motion.resampled(0.5).optimality is None
 
@@ -563,7 +648,9 @@ def test_a_guess_of_joints_that_move_in_loops_rotates_the_base(loop):
     with any_wording():
         motion = fflin.plan(robot, goal, 10.0, guess=known, **options)
     assert np.abs(pin.difference(robot.model, goal[0], motion.q[-1])[3:]).max() < 1e-6
-    assert np.abs(motion.v[-1] - goal[1])[6:].max() < 1e-6 and motion.residual.max() < 1e-6
+    assert (
+        np.abs(motion.v[-1] - goal[1])[6:].max() < 1e-6 and motion.residual.max() < 1e-6
+    )
     assert motion.optimality.effort < 0.9 * 0.5 * np.square(known.u[:-1]).sum()
     other = fflin.load("planar_detumble")
     with any_wording(), pytest.raises(fflin.InputError, match="other joints or inputs"):
@@ -572,7 +659,9 @@ def test_a_guess_of_joints_that_move_in_loops_rotates_the_base(loop):
         fflin.plan(robot, goal, 10.0, guess=known.q, knots=21)
 
 
-def test_a_failed_plan_of_joint_torques_advises_to_move_joints_in_loops(loop, monkeypatch):
+def test_a_failed_plan_of_joint_torques_advises_to_move_joints_in_loops(
+    loop, monkeypatch
+):
     robot, _ = loop
     monkeypatch.setattr(plan_search, "_MOST", 3)
     goal = turned(robot, 0.5, (0.0, 1.0, 0.0))
@@ -611,9 +700,13 @@ def largest_change_of_momentum(robot, motion):
 def test_a_plan_of_joint_torques_finds_loops_that_rotate_the_base(loop, pitched, free):
     robot, _ = loop
     with any_wording():
-        motion = fflin.plan(robot, (pitched, None), 10.0, knots=11, free=free, limits=None)
+        motion = fflin.plan(
+            robot, (pitched, None), 10.0, knots=11, free=free, limits=None
+        )
     assert missed(robot, motion, pitched) < 1e-6 and motion.residual.max() < 1e-6
-    momenta = [momentum_of(robot, q, v) for q, v in zip(motion.q, motion.v, strict=True)]
+    momenta = [
+        momentum_of(robot, q, v) for q, v in zip(motion.q, motion.v, strict=True)
+    ]
     assert np.abs(momenta).max() < largest_change_of_momentum(robot, motion)
 
 
@@ -627,18 +720,27 @@ def test_loops_add_to_the_rotation_by_the_conserved_momentum(loop):
         motion = fflin.plan(robot, (goal, None), 10.0, **options)
     assert np.abs(pin.difference(robot.model, goal, motion.q[-1])[3:]).max() < 1e-6
     assert motion.residual.max() < 1e-6
-    momenta = [momentum_of(robot, q, v) for q, v in zip(motion.q, motion.v, strict=True)]
+    momenta = [
+        momentum_of(robot, q, v) for q, v in zip(motion.q, motion.v, strict=True)
+    ]
     change = np.abs(np.subtract(momenta, momenta[0])).max()
-    assert np.abs(momenta[0]).max() > 1.0 and change < largest_change_of_momentum(robot, motion)
+    assert np.abs(momenta[0]).max() > 1.0 and change < largest_change_of_momentum(
+        robot, motion
+    )
 
 
 @pytest.mark.exhaustive
 def test_joints_reorient_a_legged_robot_in_flight():
     robot = fflin.load("solo12", lock=["*_HAA"], inputs=[fflin.JointTorque("*")])
     legs = {"*_HFE": 0.8, "*_KFE": -1.6}
-    start, goal = fflin.configuration(robot, legs), turned(robot, 0.17, (0.0, 1.0, 0.0), legs)
+    start, goal = (
+        fflin.configuration(robot, legs),
+        turned(robot, 0.17, (0.0, 1.0, 0.0), legs),
+    )
     with any_wording():
-        motion = fflin.plan(robot, (goal, None), 1.0, q0=start, knots=11, free=FREE_OF_JOINTS)
+        motion = fflin.plan(
+            robot, (goal, None), 1.0, q0=start, knots=11, free=FREE_OF_JOINTS
+        )
     assert np.abs(pin.difference(robot.model, goal, motion.q[-1])[3:]).max() < 1e-6
     assert np.abs(motion.v[-1][6:]).max() < 1e-6 and motion.residual.max() < 1e-6
 
@@ -662,7 +764,9 @@ def first_guess(monkeypatch):
     return guessed
 
 
-def test_a_function_is_a_guess_whose_base_conserves_momentum(loop, pitched, first_guess):
+def test_a_function_is_a_guess_whose_base_conserves_momentum(
+    loop, pitched, first_guess
+):
     robot, _ = loop
     options = {"knots": 21, "free": FREE_OF_JOINTS, "limits": None, "hold": "linear"}
     q, v, u = first_guess(robot, (pitched, None), 10.0, guess=circle, **options)
@@ -675,7 +779,9 @@ def test_a_function_is_a_guess_whose_base_conserves_momentum(loop, pitched, firs
     assert np.abs(momenta).max() < 1e-9
     # The inputs are from differences of the rates and linear between knots, so that the gaps are of
     # the order h^3.
-    fine = first_guess(robot, (pitched, None), 10.0, guess=circle, **options | {"knots": 41})
+    fine = first_guess(
+        robot, (pitched, None), 10.0, guess=circle, **options | {"knots": 41}
+    )
     gaps = []
     for knots in ((q, v, u), fine):
         shooting = Shooting(robot, np.linspace(0.0, 10.0, len(knots[0])), held=False)
@@ -687,7 +793,9 @@ def test_a_function_may_name_joints(loop, pitched, first_guess):
     robot, _ = loop
     goal = fflin.configuration(robot, {"joint_1": 0.4})
     options = {"knots": 5, "free": FREE_OF_JOINTS, "limits": None}
-    q, *_ = first_guess(robot, (goal, None), 2.0, guess=lambda t: {"joint_2": 3.5 * t}, **options)
+    q, *_ = first_guess(
+        robot, (goal, None), 2.0, guess=lambda t: {"joint_2": 3.5 * t}, **options
+    )
     joints = fflin.StateMap(robot).joint_positions(q)
     by_name = dict(zip(robot.joint_names, joints.T, strict=True))
     s = np.linspace(0.0, 1.0, 5)
@@ -700,10 +808,14 @@ def test_with_a_base_torque_the_base_of_a_guess_moves_to_the_goal(first_guess):
     goal = turned(robot, 0.5, (0.0, 1.0, 0.0), at=(0.3, 0.0, 0.0))
     options = {"knots": 7, "limits": None}
     q, v, u = first_guess(robot, (goal, None), 4.0, **options)
-    bent = first_guess(robot, (goal, None), 4.0, guess=lambda t: 0.1 * t * np.ones(3), **options)
+    bent = first_guess(
+        robot, (goal, None), 4.0, guess=lambda t: 0.1 * t * np.ones(3), **options
+    )
     assert np.array_equal(bent[0][:, :7], q[:, :7])
     joints = fflin.StateMap(robot).joint_positions(bent[0])
-    assert joints == pytest.approx(0.1 * np.linspace(0.0, 4.0, 7)[:, None] * np.ones(3), abs=1e-12)
+    assert joints == pytest.approx(
+        0.1 * np.linspace(0.0, 4.0, 7)[:, None] * np.ones(3), abs=1e-12
+    )
     assert bent[1][1:, 6:] == pytest.approx(0.1 * np.ones((6, 3)), abs=1e-9)
     assert not np.allclose(bent[2], u) and (v[:, 6:] == 0.0).all()
 
@@ -814,7 +926,10 @@ def test_a_lower_limit_above_the_upper_is_named():
     robot = fflin.load("servicer_7dof")
     effort = fflin.linearize(robot).limits["tau_m.joint_1"]
     inputs = [fflin.BaseTorque(), fflin.JointTorque("joint_1", min=2.0 * effort)]
-    robot, words = robot.replace(inputs=inputs), rf"tau_m\.joint_1 is {2.0 * effort:g}, above"
+    robot, words = (
+        robot.replace(inputs=inputs),
+        rf"tau_m\.joint_1 is {2.0 * effort:g}, above",
+    )
     with pytest.raises(fflin.InputError, match=words):
         fflin.plan(robot, (None, None), 1.0)
     with pytest.raises(fflin.InputError, match=words):
@@ -850,7 +965,9 @@ def test_a_file_of_other_inputs_names_what_differs(free_floating, tmp_path):
     with pytest.raises(fflin.InputError, match=r"other inputs tau_b\.x.*F_b\.z"):
         fflin.Trajectory.load(path, robot)
     own = np.zeros((2, robot.nv))
-    fflin.Trajectory(robot, [0.0, 1.0], [robot.neutral()] * 2, own, np.zeros((2, 3))).save(path)
+    fflin.Trajectory(
+        robot, [0.0, 1.0], [robot.neutral()] * 2, own, np.zeros((2, 3))
+    ).save(path)
     with pytest.raises(fflin.InputError, match=r"lacks the inputs tau_b\.x"):
         fflin.Trajectory.load(path, whole)
 
@@ -858,6 +975,8 @@ def test_a_file_of_other_inputs_names_what_differs(free_floating, tmp_path):
 def test_a_failed_plan_of_internal_inputs_advises_to_free_the_base_velocities():
     """Joint torques conserve the momentum: an end value of omega_b and v_b is no choice."""
     robot = fflin.load("planar_detumble").replace(inputs=[fflin.JointTorque("*")])
-    goal = fflin.configuration(robot, {"joint_1": 0.2}, base=pin.SE3(np.eye(3), np.ones(3)))
+    goal = fflin.configuration(
+        robot, {"joint_1": 0.2}, base=pin.SE3(np.eye(3), np.ones(3))
+    )
     with any_wording(), pytest.raises(fflin.InputError, match="omega_b and v_b"):
         fflin.plan(robot, (goal, None), 5.0, knots=4)

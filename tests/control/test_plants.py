@@ -30,7 +30,9 @@ def test_a_feedback_of_the_nominal_robot_runs_on_another(nominal, dt):
     assert run.attitude_error[-1] < 0.5 < 29.0 < run.attitude_error[0]
     # The motion is that of the other robot under the bound law.
     plain = policy.bind(robot)
-    same = fflin.simulate(other, plain, x0=x0, duration=40.0, sample=dt or None, dt=run.t[1])
+    same = fflin.simulate(
+        other, plain, x0=x0, duration=40.0, sample=dt or None, dt=run.t[1]
+    )
     np.testing.assert_allclose(run.x, same.x, atol=1e-12)
     assert run.urdf_sha256 == other.urdf_sha256
 
@@ -41,7 +43,9 @@ def test_measured_feedback_runs_on_another_robot(nominal):
     weights = unit_weights(sampled)
     law = fflin.lqg(fflin.lqr(sampled, *weights), fflin.kalman(sampled, 1.0, 1.0))
     policy = fflin.OutputFeedback(sampled, law)
-    run = fflin.simulate(robot.perturbed(**SPREAD), policy, x0=displaced(sampled), duration=60.0)
+    run = fflin.simulate(
+        robot.perturbed(**SPREAD), policy, x0=displaced(sampled), duration=60.0
+    )
     assert run.attitude_error[-1] < 1.0
 
 
@@ -52,30 +56,42 @@ def test_schedules_and_allocations_run_on_another_robot():
     along = fflin.linearize_trajectory(robot, t, q, v, u)
     policy = fflin.TrajectoryFeedback(along, fflin.tvlqr(along, 1.0, 1e-3, 1.0))
     other = robot.perturbed(**SPREAD, seed=1)
-    run = fflin.simulate(other, policy, q0=q[0], v0=v[0], duration=0.4, dt=0.005, frame="local")
+    run = fflin.simulate(
+        other, policy, q0=q[0], v0=v[0], duration=0.4, dt=0.005, frame="local"
+    )
     # Exact at the start, off by what the masses are off.
-    exact = fflin.simulate(robot, policy, q0=q[0], v0=v[0], duration=0.4, dt=0.005, frame="local")
+    exact = fflin.simulate(
+        robot, policy, q0=q[0], v0=v[0], duration=0.4, dt=0.005, frame="local"
+    )
     np.testing.assert_allclose(run.u[0], exact.u[0], atol=1e-9)
     assert np.abs(run.u[-1] - exact.u[-1]).max() > 1e-3
 
     lin = fflin.linearize(robot)
     law = fflin.Allocation(fflin.StateFeedback(lin, fflin.lqr(lin).K), robot)
-    apart = fflin.simulate(other, law, x0=displaced(lin), duration=0.2, dt=0.05, sample=0.05)
+    apart = fflin.simulate(
+        other, law, x0=displaced(lin), duration=0.2, dt=0.05, sample=0.05
+    )
     plain = fflin.StateFeedback(lin, fflin.lqr(lin).K)
-    same = fflin.simulate(other, plain, x0=displaced(lin), duration=0.2, dt=0.05, sample=0.05)
+    same = fflin.simulate(
+        other, plain, x0=displaced(lin), duration=0.2, dt=0.05, sample=0.05
+    )
     np.testing.assert_allclose(apart.x, same.x, atol=1e-9)
 
 
 def test_an_allocation_weighs_with_the_masses_that_it_knows():
     cubesat = fflin.load("cubesat", inputs=fflin.load_inputs("cubesat"))
-    thrusters = [each for each in cubesat.inputs if isinstance(each, fflin.Thruster)][:7]
+    thrusters = [each for each in cubesat.inputs if isinstance(each, fflin.Thruster)][
+        :7
+    ]
     robot = fflin.load("cubesat", inputs=thrusters)
     design = robot.replace(inputs=[fflin.BaseTorque(), fflin.BaseForce()])
     other = robot.with_mass_properties({"base": {"mass": 1.0}})
     wanted = np.array([1e-3, -2e-3, 1e-3, 0.1, 0.05, -0.1])
     law = fflin.Allocation(lambda t, q, v: wanted, design)
     q, v = robot.neutral(), np.zeros(robot.nv)
-    np.testing.assert_array_equal(law.bind(other)(0.0, q, v), law.bind(robot)(0.0, q, v))
+    np.testing.assert_array_equal(
+        law.bind(other)(0.0, q, v), law.bind(robot)(0.0, q, v)
+    )
 
 
 class Renamed:

@@ -36,7 +36,8 @@ def test_bode_plots_are_of_the_loops_broken_one_at_a_time(dt):
             angle = next(
                 line.get_ydata()[k]
                 for line in phases.get_lines()
-                if len(line.get_xdata()) == len(w) and line.get_color() == curves[i].get_color()
+                if len(line.get_xdata()) == len(w)
+                and line.get_color() == curves[i].get_color()
             )
             assert np.exp(1j * np.radians(angle)) == pytest.approx(L / abs(L), rel=1e-5)
 
@@ -48,9 +49,13 @@ def test_margins_stand_beside_the_names(name):
     assert_legible(figure)
     *_, loops = input_loops(gain)
     legend = figure.legends[0]
-    for text, each, name in zip(legend.get_texts(), loops, gain.input_names, strict=True):
+    for text, each, name in zip(
+        legend.get_texts(), loops, gain.input_names, strict=True
+    ):
         low, high = each.gain
-        assert text.get_text() == f"{name}: {each.phase:.0f} deg, {low:.2g} to {high:.3g}"
+        assert (
+            text.get_text() == f"{name}: {each.phase:.0f} deg, {low:.2g} to {high:.3g}"
+        )
     colors = [line.get_color() for line in legend.get_lines()]
     assert len(set(colors)) == len(colors)
     assert f"(disk margin {gain.margins.disk:.3g})" in figure.get_suptitle()
@@ -74,7 +79,10 @@ def test_poles_that_lie_together_have_plain_axes():
     axes = fflin.plot_poles([-1.0 + 2.0j, -1.0 - 2.0j, -3.0]).axes[0]
     assert axes.get_xscale() == axes.get_yscale() == "linear"
     # What rounding leaves of zero does not stretch an axis.
-    assert fflin.plot_poles([-1e-17 + 2.0j, -1e-17 - 2.0j, -3.0]).axes[0].get_xscale() == "linear"
+    assert (
+        fflin.plot_poles([-1e-17 + 2.0j, -1e-17 - 2.0j, -3.0]).axes[0].get_xscale()
+        == "linear"
+    )
     unstable = fflin.plot_poles([-200.0, 0.5, 0.0]).axes[0]
     assert unstable.get_xlim()[1] >= 0.5 and unstable.get_xlim()[0] <= -200.0
 
@@ -86,7 +94,10 @@ def test_pole_map_has_the_poles_of_each_set():
     assert_legible(figure)
     shown = lines(figure.axes[0])["closed"]
     np.testing.assert_array_equal(np.sort(shown.get_xdata()), np.sort(gain.poles.real))
-    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["open", "closed"]
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == [
+        "open",
+        "closed",
+    ]
     sampled = fflin.plot_poles(lin.discretize(0.1))
     assert sampled.axes[0].get_xlabel() == "real part"
     assert len(sampled.axes[0].get_lines()) == 2  # with the unit circle
@@ -99,7 +110,9 @@ def test_poles_of_a_sampled_loop_are_shown_as_rates():
     axes = figure.axes[2]
     shown = axes.get_lines()[0]
     z = np.exp(0.1 * (shown.get_xdata() + 1j * shown.get_ydata()))
-    np.testing.assert_allclose(np.sort_complex(z), np.sort_complex(gain.poles), rtol=1e-12)
+    np.testing.assert_allclose(
+        np.sort_complex(z), np.sort_complex(gain.poles), rtol=1e-12
+    )
     assert "poles of A - B K as ln(z)/dt" in [text for text, _ in texts(figure)]
 
 

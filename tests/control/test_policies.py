@@ -16,7 +16,10 @@ def test_it_is_the_least_squares_within_the_bounds(seed):
     rng = np.random.default_rng(seed)
     rows, pushing, others = rng.integers(3, 9), rng.integers(0, 7), rng.integers(0, 4)
     count = max(1, pushing + others)
-    A, b = rng.normal(size=(rows, count)), rng.normal(size=rows) * 10.0 ** rng.integers(-6, 7)
+    A, b = (
+        rng.normal(size=(rows, count)),
+        rng.normal(size=rows) * 10.0 ** rng.integers(-6, 7),
+    )
     least = np.where(np.arange(count) < pushing, 0.0, -np.inf)
     most = np.full(count, np.inf)
     if seed % 3 == 0:
@@ -25,7 +28,9 @@ def test_it_is_the_least_squares_within_the_bounds(seed):
     u = nearest(A, b, least, most)
     assert (u >= least).all() and (u <= most).all()
     size = np.linalg.norm(b)
-    best = lsq_linear(A, b / size, (least / size, most / size), method="bvls", tol=1e-14)
+    best = lsq_linear(
+        A, b / size, (least / size, most / size), method="bvls", tol=1e-14
+    )
     assert np.linalg.norm(A @ u - b) / size <= np.sqrt(2.0 * best.cost) + 1e-9
 
 
@@ -63,10 +68,17 @@ def test_thrusters_that_push_every_way():
     assert not gives_every_wrench(W[:, :7], pushing[:7])
     assert not gives_every_wrench(np.eye(6), np.arange(6) < 3)
     assert gives_every_wrench(np.eye(6), np.zeros(6, dtype=bool))
-    assert gives_every_wrench(np.hstack((np.eye(6), -np.eye(6))), np.ones(12, dtype=bool))
+    assert gives_every_wrench(
+        np.hstack((np.eye(6), -np.eye(6))), np.ones(12, dtype=bool)
+    )
 
 
 def test_what_is_limited_to_nothing_gives_nothing():
-    u = nearest(np.ones((1, 3)), np.array([3.0]), np.array([0, -1.0, 0]), np.array([0, 1.0, 5.0]))
+    u = nearest(
+        np.ones((1, 3)),
+        np.array([3.0]),
+        np.array([0, -1.0, 0]),
+        np.array([0, 1.0, 5.0]),
+    )
     assert u[0] == pytest.approx(0.0, abs=1e-12)
     assert u[1:] == pytest.approx([1.0, 2.0])

@@ -63,7 +63,9 @@ def test_a_model_gives_the_target_the_frame_and_the_sample_time(lin, K):
     q0 = fflin.configuration(robot, {"joint_1": 0.2})
     motion = fflin.simulate(robot, law, q0=q0, duration=1.0)
     sampled = fflin.StateFeedback(lin, K)
-    same = fflin.simulate(robot, sampled, q0=q0, duration=1.0, sample=0.1, dt=motion.step)
+    same = fflin.simulate(
+        robot, sampled, q0=q0, duration=1.0, sample=0.1, dt=motion.step
+    )
     assert motion.x[-1] == pytest.approx(same.x[-1], abs=1e-12)
     assert motion.target == pytest.approx(lin.x0) and motion.frame == lin.frame
 
@@ -93,7 +95,11 @@ def test_data_for_compiled_code_are_not_inherited_by_another_law(lin, K):
 
     assert fflin.StateFeedback(lin, K).form(robot) is not None
     for law in (Halved(lin, K), Mixed(lin, K)):
-        assert law.form(robot) is None and law.feedback_gain is None and law.closed_loop() is None
+        assert (
+            law.form(robot) is None
+            and law.feedback_gain is None
+            and law.closed_loop() is None
+        )
         assert law.prediction(lin, fflin.StateMap(robot)) is None and law.model is lin
         plan = Plan(SimulationOptions(robot=robot, policy=law, duration=1.0))
         reason = not_compilable(plan)
@@ -171,10 +177,17 @@ def test_an_allocation_tells_what_its_policy_does(lin, K):
     robot = fflin.load("planar_detumble")
     law = fflin.Allocation(inner, robot)
     assert law.inner is inner and law.commanded_robot is robot
-    for name in ("model", "feedback_gain", "sample_time", "axes", "sensors", "fed_back"):
-        assert getattr(law, name) is getattr(inner, name) or getattr(law, name) == getattr(
-            inner, name
-        )
+    for name in (
+        "model",
+        "feedback_gain",
+        "sample_time",
+        "axes",
+        "sensors",
+        "fed_back",
+    ):
+        assert getattr(law, name) is getattr(inner, name) or getattr(
+            law, name
+        ) == getattr(inner, name)
     assert law.prediction(lin, fflin.StateMap(robot)) is None
     loop, dt = law.closed_loop()
     assert dt == 0.0 and loop == pytest.approx(lin.A - lin.B @ K)

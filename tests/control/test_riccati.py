@@ -30,7 +30,10 @@ def weightings(lin, rng):
     return {
         "identity": (np.eye(nx), np.eye(nu)),
         "bryson": (np.diag(rng.uniform(0.02, 0.2, nx) ** -2), np.diag(inertia**-2)),
-        "diagonal": (np.diag(10 ** rng.uniform(-2, 2, nx)), np.diag(10 ** rng.uniform(-2, 2, nu))),
+        "diagonal": (
+            np.diag(10 ** rng.uniform(-2, 2, nx)),
+            np.diag(10 ** rng.uniform(-2, 2, nu)),
+        ),
         "full": (full_q @ full_q.T, full_r @ full_r.T + 0.1 * np.eye(nu)),
     }
 
@@ -57,7 +60,13 @@ def general(A, B, Q, R, N=None, dt=0.0):
 
 def compare_with_the_general_solution(equation, found, P, label):
     """Not behind it in the residual, and no further from it than it is from the solution."""
-    A, B, Q, R, dt = equation.A, equation.B, equation.Q, equation.R, float(equation.discrete)
+    A, B, Q, R, dt = (
+        equation.A,
+        equation.B,
+        equation.Q,
+        equation.R,
+        float(equation.discrete),
+    )
     trial = equation.trial(P)
     # A residual below _SOUND ends the refinement.
     assert found.residual <= max(trial.residual, _SOUND), label
@@ -79,7 +88,11 @@ def compare_with_the_general_solution(equation, found, P, label):
 @pytest.mark.parametrize("dt", [0.0, 0.05])
 def test_residual_is_at_or_below_the_general_solvers_and_gains_agree(robots, name, dt):
     rng = np.random.default_rng(3)
-    robot = robots[name] if name in robots else random_tree(rng, int(name.partition("_")[2]))
+    robot = (
+        robots[name]
+        if name in robots
+        else random_tree(rng, int(name.partition("_")[2]))
+    )
     rest = fflin.linearize(robot, random_point(robot, rng)[0])
     lin = rest.discretize(dt) if dt else rest
     for label, (Q, R) in weightings(rest, rng).items():
@@ -89,7 +102,10 @@ def test_residual_is_at_or_below_the_general_solvers_and_gains_agree(robots, nam
         assert found.method == "structured" or dt, label
         try:
             P = general(lin.A, lin.B, Q, R, None, dt)
-        except (ValueError, np.linalg.LinAlgError):  # which of the samples depends on the processor
+        except (
+            ValueError,
+            np.linalg.LinAlgError,
+        ):  # which of the samples depends on the processor
             assert dt and found.residual < 1e-12, label
         else:
             compare_with_the_general_solution(equation, found, P, label)
@@ -156,15 +172,24 @@ def test_half_size_loops_are_loops_of_the_model_and_optimal_without_odd_powers(r
         U = np.linalg.solve(lin.B[m:], missing[m:])
         cost = V.conj().T @ Q @ V + U.conj().T @ R @ U
         assert own == pytest.approx(cost, rel=1e-6, abs=1e-9 * np.abs(cost).max())
-        residual = Riccati(lin.A, lin.B, Q, R, None, 0.0).trial(modes.lyapunov_modal(own)).residual
+        residual = (
+            Riccati(lin.A, lin.B, Q, R, None, 0.0)
+            .trial(modes.lyapunov_modal(own))
+            .residual
+        )
         assert (residual < 1e-11) == even
 
 
 def test_springs_dampers_gravity_motion_and_cross_terms_keep_half_the_size(robots):
     rng = np.random.default_rng(7)
-    robot = robots["servicer_7dof"].replace(stiffness=50.0, damping=3.0, gravity=(0.0, 0.1, -0.3))
+    robot = robots["servicer_7dof"].replace(
+        stiffness=50.0, damping=3.0, gravity=(0.0, 0.1, -0.3)
+    )
     q, v, u = random_point(robot, rng, speed=0.1)
-    for lin in (fflin.linearize(robot, q, v, u), fflin.linearize(robot, q, v, u, moving=True)):
+    for lin in (
+        fflin.linearize(robot, q, v, u),
+        fflin.linearize(robot, q, v, u, moving=True),
+    ):
         nx, nu = lin.B.shape
         Q = np.diag(rng.uniform(1.0, 10.0, nx))
         R = np.diag(1.0 / lin.M.diagonal() ** 2)
@@ -181,14 +206,18 @@ def test_springs_dampers_gravity_motion_and_cross_terms_keep_half_the_size(robot
 
 
 def test_more_inputs_than_coordinates_share_the_force_at_the_least_cost():
-    thrusters = [x for x in fflin.load_inputs("cubesat") if isinstance(x, fflin.Thruster)]
+    thrusters = [
+        x for x in fflin.load_inputs("cubesat") if isinstance(x, fflin.Thruster)
+    ]
     robot = fflin.load("cubesat", inputs=thrusters)
     lin = fflin.linearize(robot)
     assert lin.B.shape == (12, 12)
     Q, R = np.eye(12), np.diag(np.linspace(1.0, 3.0, 12))
     found = solve(lin.A, lin.B, Q, R)
     assert found.method == "structured"
-    assert found.P == pytest.approx(sl.solve_continuous_are(lin.A, lin.B, Q, R), rel=1e-9)
+    assert found.P == pytest.approx(
+        sl.solve_continuous_are(lin.A, lin.B, Q, R), rel=1e-9
+    )
 
 
 def test_other_systems_go_to_the_general_solver():
@@ -198,7 +227,9 @@ def test_other_systems_go_to_the_general_solver():
         found = solve(A, B, np.eye(n), np.eye(nu))
         assert half_size(A, B, np.eye(n), np.eye(nu)) is None
         assert found.method == "general" and found.residual < 1e-14
-        assert found.P == pytest.approx(sl.solve_continuous_are(A, B, np.eye(n), np.eye(nu)))
+        assert found.P == pytest.approx(
+            sl.solve_continuous_are(A, B, np.eye(n), np.eye(nu))
+        )
     with pytest.raises(np.linalg.LinAlgError):
         solve(np.eye(2), np.zeros((2, 1)), np.eye(2), np.eye(1))
 
@@ -232,7 +263,10 @@ def test_badly_scaled_weights_never_cost_the_residual(robots):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 P = general(lin.A, lin.B, Q, R)
-            assert found.residual <= Riccati(lin.A, lin.B, Q, R, None, 0.0).trial(P).residual
+            assert (
+                found.residual
+                <= Riccati(lin.A, lin.B, Q, R, None, 0.0).trial(P).residual
+            )
             assert found.poles.real.max() < 0.0
 
 
@@ -273,7 +307,9 @@ def test_lyapunov_equations_by_modes(monkeypatch):
         assert (np.sort_complex(poles.conj()) == np.sort_complex(poles)).all()
     far = F + 0.1 * rng.normal(size=F.shape)
     exact = np.sort_complex(np.linalg.eigvals(far))
-    assert np.sort_complex(ModalMatrix.of(F, True).poles(far)) == pytest.approx(exact, rel=1e-9)
+    assert np.sort_complex(ModalMatrix.of(F, True).poles(far)) == pytest.approx(
+        exact, rel=1e-9
+    )
 
 
 def test_what_is_not_stable_is_no_solution(robots):
@@ -282,21 +318,29 @@ def test_what_is_not_stable_is_no_solution(robots):
         equation = Riccati(model.A, model.B, np.eye(12), np.eye(6), None, model.dt)
         found = solve(model.A, model.B, np.eye(12), np.eye(6), None, model.dt)
         assert _finished(equation, equation.trial(found.P), None, "general") is not None
-        assert _finished(equation, equation.trial(0.0 * found.P), None, "general") is None
+        assert (
+            _finished(equation, equation.trial(0.0 * found.P), None, "general") is None
+        )
         if not model.dt:
-            assert _finished(equation, equation.trial(-found.P), None, "general") is None
+            assert (
+                _finished(equation, equation.trial(-found.P), None, "general") is None
+            )
 
 
 def test_critical_damping_is_solved_by_half_the_size():
     """The rate's weight is such that both poles of each axis are at -1: modes coincide."""
-    A, B = np.kron([[0.0, 1.0], [0.0, 0.0]], np.eye(3)), np.kron([[0.0], [1.0]], np.eye(3))
+    A, B = (
+        np.kron([[0.0, 1.0], [0.0, 0.0]], np.eye(3)),
+        np.kron([[0.0], [1.0]], np.eye(3)),
+    )
     Q, R = np.diag([1.0] * 3 + [2.0] * 3), np.eye(3)
     found = half_size(A, B, Q, R)
     assert found is not None
     # (s + 1)^2 = s^2 + 2 s + 1: u = -p - 2 pdot.
     assert found.K == pytest.approx(np.kron([[1.0, 2.0]], np.eye(3)), abs=1e-13)
     assert found.residual < 1e-15
-    assert found.poles == pytest.approx(-np.ones(6), abs=1e-7)  # the root of the rounding
+    # the root of the rounding
+    assert found.poles == pytest.approx(-np.ones(6), abs=1e-7)
 
 
 def of_inertias(spread, m=20):
@@ -343,7 +387,9 @@ def test_an_ill_conditioned_inertia_is_solved_by_half_the_size(monkeypatch):
     calls = []
     monkeypatch.setattr(riccati, "_general", lambda *_: calls.append("general"))
     modes = ModalMatrix.of
-    monkeypatch.setattr(ModalMatrix, "of", lambda *given: calls.append("modes") or modes(*given))
+    monkeypatch.setattr(
+        ModalMatrix, "of", lambda *given: calls.append("modes") or modes(*given)
+    )
     found = solve(A, B, Q, R)
     assert calls.count("modes") <= 1
     assert "general" not in calls
@@ -352,7 +398,9 @@ def test_an_ill_conditioned_inertia_is_solved_by_half_the_size(monkeypatch):
     # closed-loop polynomial is z^2 + z sqrt(1/s^2 + 2/s) + 1/s.
     s = np.logspace(0.0, 7.0, 20)
     damping = np.sqrt(1.0 / s**2 + 2.0 / s)
-    roots = np.array([np.roots([1.0, d, 1.0 / each]) for d, each in zip(damping, s, strict=True)])
+    roots = np.array(
+        [np.roots([1.0, d, 1.0 / each]) for d, each in zip(damping, s, strict=True)]
+    )
     slowest = -np.abs(roots.real).min()
     assert found.poles.real.max() == pytest.approx(slowest, rel=1e-6)
 

@@ -56,14 +56,17 @@ def test_designs_are_those_of_reaction_wheels(others, spinning, dt):
         own, expected = getattr(lin, key)[np.ix_(rows, columns)], getattr(other, key)
         assert np.abs(own - expected).max() < CLOSE * np.abs(expected).max()
     for wheel_speeds in (None, True, False):
-        gain, expected = (fflin.lqr(each, wheel_speeds=wheel_speeds) for each in (lin, other))
+        gain, expected = (
+            fflin.lqr(each, wheel_speeds=wheel_speeds) for each in (lin, other)
+        )
         assert set(gain.regulated) == set(expected.regulated)
         assert not {f"q_m.{name}" for name in lin.wheels} & {*gain.regulated}
         assert "q_m.arm" in gain.regulated
         K = gain.K[np.ix_(u, x)]
         assert np.abs(K - expected.K).max() < 10.0 * CLOSE * np.abs(expected.K).max()
         poles, others = np.sort_complex(gain.poles), np.sort_complex(expected.poles)
-        assert np.abs(poles - others).max() < 1e-6  # double poles have the square root of the error
+        # double poles have the square root of the error
+        assert np.abs(poles - others).max() < 1e-6
         assert gain.weights == expected.weights
 
 
@@ -75,14 +78,18 @@ def test_speed_limits_of_wheels_bound_the_default_weights():
     gain, expected = fflin.lqr(lin), fflin.lqr(other)
     assert gain.weights == expected.weights
     assert "bandwidth limited by the speed of wheel_" in gain.weights
-    assert np.abs(gain.K[np.ix_(u, x)] - expected.K).max() < 10.0 * CLOSE * np.abs(expected.K).max()
+    assert (
+        np.abs(gain.K[np.ix_(u, x)] - expected.K).max()
+        < 10.0 * CLOSE * np.abs(expected.K).max()
+    )
 
 
 def test_the_speed_limit_of_a_wheel_without_motor_does_not_bound_the_loop():
     """No input accelerates this wheel relative to inertial space, so its limit has no effect."""
     satellite, _ = spun(AXES[:2], others=(BaseTorque(), BaseForce()))
     satellite = satellite.replace(
-        wheel_joints=["wheel_*"], inputs=[*satellite.inputs[:3], fflin.JointTorque("wheel_1")]
+        wheel_joints=["wheel_*"],
+        inputs=[*satellite.inputs[:3], fflin.JointTorque("wheel_1")],
     )
     limited = satellite.replace(limits={"qdot_m.wheel_2": 1e-3})
     gains = [fflin.lqr(fflin.linearize(each)) for each in (satellite, limited)]
@@ -99,16 +106,22 @@ def test_filters_and_reductions_are_those_of_reaction_wheels(spinning):
     assert "q_m.wheel_1" not in filters[0].estimated
     L, expected = filters[0].L[np.ix_(x, x)], filters[1].L
     assert np.abs(L - expected).max() < 100.0 * CLOSE * np.abs(expected).max()
-    reduced = [fflin.momentum_reduction(each, wheel_speeds=False) for each in (lin, other)]
+    reduced = [
+        fflin.momentum_reduction(each, wheel_speeds=False) for each in (lin, other)
+    ]
     assert set(reduced[0].state_names) == set(reduced[1].state_names)
     assert not any("wheel" in name for name in reduced[0].state_names)
     at = [reduced[0].state_names.index(name) for name in reduced[1].state_names]
     difference = reduced[0].A[np.ix_(at, at)] - reduced[1].A
     assert np.abs(difference).max() < CLOSE * np.abs(reduced[1].A).max()
     # The reports of the operating points state the same momentum of the wheels.
-    points = [point_properties(each, at.q, at.v) for each, at in ((robot, lin), (twin, other))]
+    points = [
+        point_properties(each, at.q, at.v) for each, at in ((robot, lin), (twin, other))
+    ]
     assert points[0].wheel_momentum.wheels == 4
-    assert points[0].wheel_momentum.total == pytest.approx(points[1].wheel_momentum.total)
+    assert points[0].wheel_momentum.total == pytest.approx(
+        points[1].wheel_momentum.total
+    )
     assert spinning == bool(np.abs(points[0].wheel_momentum.total).max() > 1.0)
 
 
@@ -119,7 +132,9 @@ def laws_of(lin, kind):
     gain = fflin.lqr(lin)
     if kind == "outputs":
         noise = {"omega_b": 1e-4, "q_b": 1e-6, "qdot_m": 1e-4, "q_m.arm": 1e-6}
-        return fflin.OutputFeedback(lin, fflin.lqg(gain, fflin.kalman(lin, noise, 1e-4)))
+        return fflin.OutputFeedback(
+            lin, fflin.lqg(gain, fflin.kalman(lin, noise, 1e-4))
+        )
     return fflin.StateFeedback(lin, gain.K)
 
 
@@ -136,20 +151,34 @@ def laws_of(lin, kind):
 )
 def test_motions_and_reports_are_those_of_reaction_wheels(kind, dt, engine):
     found = []
-    for robot, lin in models((BaseTorque(),), axes=AXES[:3], dt=dt if kind != "mpc" else 0.0):
+    for robot, lin in models(
+        (BaseTorque(),), axes=AXES[:3], dt=dt if kind != "mpc" else 0.0
+    ):
         law = laws_of(lin, kind)
         q0 = fflin.configuration(robot, {"arm": 0.5})
         motion = fflin.simulate(
-            robot, law, q0=q0, v0=lin.v, duration=2.0, dt=0.05, engine=engine, linear=False
+            robot,
+            law,
+            q0=q0,
+            v0=lin.v,
+            duration=2.0,
+            dt=0.05,
+            engine=engine,
+            linear=False,
         )
         found.append((lin, motion))
     (lin, motion), (other, twin) = found
     x, _ = matched(lin, other)
-    at = [i for i, name in enumerate(other.state_names) if not name.startswith("q_m.wheel")]
+    at = [
+        i
+        for i, name in enumerate(other.state_names)
+        if not name.startswith("q_m.wheel")
+    ]
     apart = motion.x[:, x] - twin.x
     scale = np.abs(twin.x).max(axis=0) + 1.0
     assert (np.abs(apart) / scale)[:, at].max() < 1e-9
-    assert np.abs(motion.error).max() > 0.05  # the arm is displaced, and the base moves with it
+    # the arm is displaced, and the base moves with it
+    assert np.abs(motion.error).max() > 0.05
     assert motion.wheels == twin.wheels
     assert motion.wheel_inertias == pytest.approx(twin.wheel_inertias, rel=1e-12)
     # Energies and rounding errors at the end of the report differ in their last digits.
@@ -176,7 +205,11 @@ def hub_with_wheel(joint=None, inertia=(0.01, 0.01, 0.02), travel=None, **fields
 
 @pytest.mark.parametrize(
     "dt, engine",
-    [(0.0, "python"), (0.1, "python"), pytest.param(0.1, "compiled", marks=pytest.mark.compiled)],
+    [
+        (0.0, "python"),
+        (0.1, "python"),
+        pytest.param(0.1, "compiled", marks=pytest.mark.compiled),
+    ],
 )
 @pytest.mark.parametrize("drag", [0.0, 1e-4])
 @pytest.mark.parametrize("joint", [pin.JointModelRUBZ, pin.JointModelRZ])
@@ -210,7 +243,9 @@ def test_a_symmetric_joint_at_rest_is_regulated_and_a_named_one_is_not():
     assert lin.ignorable[-1] == "q_m.wheel" and lin.wheels == ()
     assert regulated_part(lin) is lin and "q_m.wheel" in fflin.lqr(lin).regulated
     named = robot.replace(wheel_joints=["wh*"])
-    assert named.wheel_joints == ("wheel",) and named.wheels == pytest.approx({"wheel": 0.02})
+    assert named.wheel_joints == ("wheel",) and named.wheels == pytest.approx(
+        {"wheel": 0.02}
+    )
     lin = fflin.linearize(named)
     assert lin.wheels == ("wheel",) and "q_m.wheel" not in fflin.lqr(lin).regulated
     # The name stays with other changes, and goes with the joint.
@@ -279,7 +314,9 @@ def test_limits_that_no_spin_reaches_are_ignored():
 
 def test_a_wheel_that_is_no_longer_balanced_is_a_joint_again():
     robot = hub_with_wheel(wheel_joints=["wheel"])
-    uneven = robot.with_mass_properties({"wheel": {"inertia": np.diag([0.01, 0.012, 0.02])}})
+    uneven = robot.with_mass_properties(
+        {"wheel": {"inertia": np.diag([0.01, 0.012, 0.02])}}
+    )
     assert robot.wheels and uneven.wheels == {}
     assert "q_m.wheel" in fflin.lqr(fflin.linearize(uneven)).regulated
 
@@ -287,7 +324,9 @@ def test_a_wheel_that_is_no_longer_balanced_is_a_joint_again():
 def test_values_for_all_joints_are_not_for_wheels():
     """As with `ReactionWheel`: springs, dampers and limits of all joints omit the wheels."""
     robot, _ = spun(AXES[:2])
-    robot = robot.replace(wheel_joints=["wheel_*"], damping=0.3, stiffness=2.0, limits={"q_m": 1.0})
+    robot = robot.replace(
+        wheel_joints=["wheel_*"], damping=0.3, stiffness=2.0, limits={"q_m": 1.0}
+    )
     assert robot.damping == {"arm": 0.3} and robot.stiffness == {"arm": 2.0}
     assert robot.limits == {"q_m.arm": (-1.0, 1.0)}
     assert robot.replace(damping={"wheel_1": 0.1}).damping == {"wheel_1": 0.1}
@@ -416,11 +455,16 @@ def test_a_wheel_without_a_motor_keeps_its_momentum():
     lin = fflin.linearize(robot, v=fflin.velocity(robot, {"wheel": 50.0}))
     for wheel_speeds in (None, True, False):
         gain = fflin.lqr(lin, wheel_speeds=wheel_speeds)
-        assert not any("wheel" in name for name in gain.regulated) and len(gain.regulated) == 12
+        assert (
+            not any("wheel" in name for name in gain.regulated)
+            and len(gain.regulated) == 12
+        )
     # The hub feels the gyroscopic torque -omega x h of h = 50 * 0.02 about z.
     at = [lin.state_names.index(f"omega_b.{axis}") for axis in "xy"]
     gyro = lin.A[np.ix_(at, at)]
-    assert gyro == pytest.approx(np.array([[0.0, -1.0 / 4.01], [1.0 / 5.01, 0.0]]), rel=1e-9)
+    assert gyro == pytest.approx(
+        np.array([[0.0, -1.0 / 4.01], [1.0 / 5.01, 0.0]]), rel=1e-9
+    )
 
 
 def test_the_wrist_of_a_moving_arm_is_no_wheel():

@@ -54,12 +54,16 @@ def test_the_solution_meets_the_conditions_of_optimality():
         slopes[k] += np.concatenate((A[k].T @ y[k], B[k].T @ y[k]))
         slopes[k + 1] -= np.concatenate((y[k], -D[k].T @ y[k]))
     slopes, w = slopes[1:], w[1:]
-    bound, soft = np.repeat([[0.6, 0.2], [5.0, np.inf]], (NX, NU), axis=1)[:, None] + 0.0 * w
+    bound, soft = (
+        np.repeat([[0.6, 0.2], [5.0, np.inf]], (NX, NU), axis=1)[:, None] + 0.0 * w
+    )
     out = -slopes * np.sign(w)
     inside, beyond = np.abs(w) < bound - 1e-5, np.abs(w) > bound + 1e-5
     assert inside.any() and beyond.any() and (~inside & np.isinf(soft)).any()
     assert slopes[inside] == pytest.approx(0.0, abs=1e-5)
-    assert out[beyond] == pytest.approx(5.0, abs=1e-5) and not np.isinf(soft[beyond]).any()
+    assert (
+        out[beyond] == pytest.approx(5.0, abs=1e-5) and not np.isinf(soft[beyond]).any()
+    )
     assert (out[~inside] > -1e-5).all() and (out <= soft + 1e-5).all()
     assert (np.abs(u) <= 0.2).all()
 
@@ -77,7 +81,11 @@ def test_combined_variables_keep_their_limits_where_these_cost_more_than_to_exce
     high = before - 0.01 * np.abs(before)
     room = np.hstack((qp["room"], (np.full(4, -np.inf), high)))
     hard, soft = (
-        values(solved(rows=rows, room=room, prices=np.append(qp["prices"], np.full(4, price))))
+        values(
+            solved(
+                rows=rows, room=room, prices=np.append(qp["prices"], np.full(4, price))
+            )
+        )
         for price in (1e3, 1e-6)
     )
     assert (hard <= high + 1e-7).all() and np.abs(hard - high).min() < 1e-7

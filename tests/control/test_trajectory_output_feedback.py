@@ -67,7 +67,14 @@ def fly(robot, along, policy, e, **options):
     options = {"duration": float(along.t[-1]), **options}
     fflin.simulate(
         *(robot, asked),
-        **{"q0": q0, "v0": v0, "dt": STEP, "sample": SAMPLE, "frame": "local", **options},
+        **{
+            "q0": q0,
+            "v0": v0,
+            "dt": STEP,
+            "sample": SAMPLE,
+            "frame": "local",
+            **options,
+        },
     )
     return np.array(rows), np.array(estimates)
 
@@ -142,7 +149,9 @@ def test_it_goes_on_at_rest_where_the_trajectory_ends(loop):
         assert flown.t[-1] == pytest.approx(1.6)
         # The linear loop from sample to sample: the error e, and its estimate z.
         e, z, rows = flown.error[0], np.zeros(len(seen.state_names)), [flown.error[0]]
-        for k, (A, B, C, D) in enumerate(zip(gains.A, gains.B, seen.C, seen.D, strict=False)):
+        for k, (A, B, C, D) in enumerate(
+            zip(gains.A, gains.B, seen.C, seen.D, strict=False)
+        ):
             by = policy.terms(k * SAMPLE)
             u = by.C @ z
             z = by.A @ z + by.B @ (C @ e + D @ u)
@@ -171,7 +180,9 @@ def test_held_inputs_follow_linear_ones_by_their_mean(monkeypatch):
     )
     traj = fflin.Trajectory(robot, t, flown.q, flown.v, u)
     along, gains, seen = pair(robot, traj)
-    run = fflin.simulate(robot, fflin.TrajectoryOutputFeedback(along, gains, seen), dt=STEP)
+    run = fflin.simulate(
+        robot, fflin.TrajectoryOutputFeedback(along, gains, seen), dt=STEP
+    )
     at = round(SAMPLE / STEP)
     seen_state = fflin.simulate(robot, fflin.TrajectoryFeedback(along, gains), dt=STEP)
     # By their value at the sample it is off by half a sample, of first order.

@@ -17,8 +17,12 @@ SEEN = (*POSES, fflin.FramePose("tool"), fflin.Gyroscope("base"))
 
 @pytest.fixture(scope="module")
 def moving():
-    robot = fflin.load("astrobee_arm", gravity=(0.0, 0.1, -0.2), damping=0.05, outputs=SEEN[:2])
-    robot = robot.replace(outputs=[*POSES, fflin.Accelerometer("base"), fflin.Gyroscope("base")])
+    robot = fflin.load(
+        "astrobee_arm", gravity=(0.0, 0.1, -0.2), damping=0.05, outputs=SEEN[:2]
+    )
+    robot = robot.replace(
+        outputs=[*POSES, fflin.Accelerometer("base"), fflin.Gyroscope("base")]
+    )
     return fflin.linearize_trajectory(robot, *motion(robot, knots=41))
 
 
@@ -27,7 +31,9 @@ def resting(name, duration, outputs=POSES, knots=11):
     q = np.tile(robot.neutral(), (knots, 1))
     zero = np.zeros((knots, robot.nv))
     t = np.linspace(0.0, duration, knots)
-    return robot, fflin.linearize_trajectory(robot, t, q, zero, np.zeros((knots, 6 + robot.n)))
+    return robot, fflin.linearize_trajectory(
+        robot, t, q, zero, np.zeros((knots, 6 + robot.n))
+    )
 
 
 def near(expected, relative):
@@ -36,7 +42,9 @@ def near(expected, relative):
 
 def noise_of(traj):
     """Intensities of the inputs' noise, and of the outputs'."""
-    return np.linspace(0.1, 0.3, traj.B.shape[2]) ** 2, np.linspace(1e-2, 3e-2, traj.C.shape[1])
+    return np.linspace(0.1, 0.3, traj.B.shape[2]) ** 2, np.linspace(
+        1e-2, 3e-2, traj.C.shape[1]
+    )
 
 
 def integrated(rate, knots, P):
@@ -87,7 +95,10 @@ def test_of_samples_it_promises_the_covariance_and_no_other_gain_has_less(moving
     rng = np.random.default_rng(1)
     for size in (1e-1, 1.0):
         others = schedule.L * (1.0 + size * rng.normal(size=schedule.L.shape))
-        assert np.linalg.eigvalsh(after(others) - promised)[0] > -1e-6 * np.abs(promised).max()
+        assert (
+            np.linalg.eigvalsh(after(others) - promised)[0]
+            > -1e-6 * np.abs(promised).max()
+        )
         assert np.trace(after(others)) > np.trace(promised)
     for k, t in enumerate(schedule.t[:-1]):
         for late in (0.0, 0.0999):
@@ -122,7 +133,9 @@ def test_filters_are_kept(moving, tmp_path, ending):
     schedule.save(tmp_path / f"filter.{ending}")
     back = fflin.FilterSchedule.load(tmp_path / f"filter.{ending}")
     for item in fields(schedule):
-        assert np.array_equal(getattr(schedule, item.name), getattr(back, item.name)), item.name
+        assert np.array_equal(getattr(schedule, item.name), getattr(back, item.name)), (
+            item.name
+        )
     assert (back.gain(0.1) == schedule.gain(0.1)).all()
     start = "FilterSchedule('astrobee_arm', knots=3, nx=16, nu=8, ny=14, dt=0.2 s, residual="
     assert repr(schedule).startswith(start)

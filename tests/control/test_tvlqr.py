@@ -8,7 +8,11 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import fflin
-from fflin.control.optimal.differential_riccati import solve_back, stepped_back, transitions
+from fflin.control.optimal.differential_riccati import (
+    solve_back,
+    stepped_back,
+    transitions,
+)
 from fflin.dynamics.integrators import GAUSS
 from tests.support.messages import says
 from tests.support.motions import motion
@@ -49,8 +53,12 @@ def test_long_horizons_tend_to_the_regulator_and_keep_P_positive():
     gain = fflin.lqr(fflin.linearize(robot, moving=True), Q, R)
     for Qf in (0.0, 1e6):
         schedule = fflin.tvlqr(traj, Q, R, Qf)
-        assert schedule.P[0] == pytest.approx(gain.P, rel=1e-9, abs=1e-11 * np.abs(gain.P).max())
-        assert schedule.gain(0.0) == pytest.approx(gain.K, rel=1e-8, abs=1e-9 * gain.K.max())
+        assert schedule.P[0] == pytest.approx(
+            gain.P, rel=1e-9, abs=1e-11 * np.abs(gain.P).max()
+        )
+        assert schedule.gain(0.0) == pytest.approx(
+            gain.K, rel=1e-8, abs=1e-9 * gain.K.max()
+        )
         assert schedule.residual < 1e-6
         for P in schedule.P:
             values = np.linalg.eigvalsh(P)
@@ -72,7 +80,9 @@ def test_double_integrators_have_the_closed_form():
         gramian = S * s - (AS + AS.T) * s**2 / 2 + AS @ lin.A.T * s**3 / 3
         expected = np.linalg.inv(back @ np.linalg.inv(Qf) @ back.T + gramian)
         # Within the 1e-7 that interpolation is held to.
-        assert schedule.cost_to_go(t) == pytest.approx(expected, abs=3e-7 * np.abs(expected).max())
+        assert schedule.cost_to_go(t) == pytest.approx(
+            expected, abs=3e-7 * np.abs(expected).max()
+        )
         K = np.linalg.solve(R, lin.B.T @ expected)
         assert schedule.gain(t) == pytest.approx(K, abs=1e-6 * np.abs(K).max())
     assert schedule.P[0] == pytest.approx(
@@ -98,7 +108,9 @@ def test_cost_to_go_is_the_cost_of_the_loop(moving):
         return np.append(A @ y[:-1] + B @ u, y[:-1] @ (Q * y[:-1]) + u @ (R * u))
 
     y = integrated(rate, schedule.t, np.append(e, 0.0))
-    assert y[-1] + 3.0 * y[:-1] @ y[:-1] == pytest.approx(e @ schedule.P[0] @ e, rel=1e-10)
+    assert y[-1] + 3.0 * y[:-1] @ y[:-1] == pytest.approx(
+        e @ schedule.P[0] @ e, rel=1e-10
+    )
     assert schedule.residual < 1e-6
 
 
@@ -113,18 +125,24 @@ def test_it_solves_the_differential_equation(moving):
         return -(A.T @ P + P @ A - P @ B / R @ B.T @ P + np.diag(Q)).ravel()
 
     expected = integrated(rate, moving.t[::-1], np.eye(nx).ravel()).reshape(nx, nx)
-    assert schedule.P[0] == pytest.approx(expected, rel=0.0, abs=1e-9 * np.abs(expected).max())
+    assert schedule.P[0] == pytest.approx(
+        expected, rel=0.0, abs=1e-9 * np.abs(expected).max()
+    )
 
 
 def test_a_step_is_of_order_four():
     rng = np.random.default_rng(5)
-    A0, A1, B0, B1 = (rng.normal(size=shape) for shape in ((4, 4), (4, 4), (4, 2), (4, 2)))
+    A0, A1, B0, B1 = (
+        rng.normal(size=shape) for shape in ((4, 4), (4, 4), (4, 2), (4, 2))
+    )
     nodes = 0.5 + np.array([-1.0, 1.0]) * 3.0**0.5 / 6.0
 
     def at(t):
         t = np.asarray(t)[:, None, None]
         B = (1 - t) * B0 + t * B1
-        return np.array(((1 - t) * A0 + t * A1, B @ B.mT, np.tile(np.eye(4), (len(t), 1, 1))))
+        return np.array(
+            ((1 - t) * A0 + t * A1, B @ B.mT, np.tile(np.eye(4), (len(t), 1, 1)))
+        )
 
     def solved(steps):
         P, h = np.eye(4), 1.0 / steps
@@ -156,7 +174,9 @@ def test_inputs_that_soon_reach_less_are_solved_in_shorter_steps():
         atol=1e-14,
     )
     single = transitions(*(at(np.array([c])) for c in GAUSS), np.ones(1))[:, 0]
-    assert np.abs(stepped_back(single, 1e3 * np.eye(1)) / found.y[0, -1] - 1.0).max() > 0.1
+    assert (
+        np.abs(stepped_back(single, 1e3 * np.eye(1)) / found.y[0, -1] - 1.0).max() > 0.1
+    )
     assert times[0] == 0.0
     assert values[0, 0, 0] == pytest.approx(found.y[0, -1], rel=1e-5)
 
@@ -211,15 +231,23 @@ def test_held_inputs_have_the_cost_that_is_promised_and_no_other_is_less(tumblin
 
             def rate(t, y, u=u):
                 lin = linearizer(*traj.point(t))
-                return np.append(lin.A @ y[:-1] + lin.B @ u, y[:-1] @ (Q * y[:-1]) + u @ (R * u))
+                return np.append(
+                    lin.A @ y[:-1] + lin.B @ u, y[:-1] @ (Q * y[:-1]) + u @ (R * u)
+                )
 
             late = end - 1e-13
-            cuts = [start, *traj.t[(traj.t > start + 1e-9) & (traj.t < end - 1e-9)], end]
+            cuts = [
+                start,
+                *traj.t[(traj.t > start + 1e-9) & (traj.t < end - 1e-9)],
+                end,
+            ]
             y = integrated(lambda t, y, late=late: rate(min(t, late), y), cuts, y)
         return y[-1] + 3.0 * y[:-1] @ y[:-1]
 
     promised = e @ schedule.P[0] @ e
-    assert cost(lambda k: schedule.gain(float(schedule.t[k]))) == pytest.approx(promised, rel=1e-7)
+    assert cost(lambda k: schedule.gain(float(schedule.t[k]))) == pytest.approx(
+        promised, rel=1e-7
+    )
     rng = np.random.default_rng(1)
     for size in (1e-2, 1e-1):
         other = schedule.K * (1.0 + size * rng.normal(size=schedule.K.shape))
@@ -240,7 +268,9 @@ def test_held_inputs_at_rest_are_those_of_the_sampled_regulator():
     lin = fflin.linearize(robot, moving=True)
     gain = fflin.lqr(lin.discretize(0.5), *fflin.sampled_cost(lin, 0.5, Q, R))
     schedule = fflin.tvlqr(traj, Q, R, 0.0, sample=0.5)
-    assert schedule.gain(0.0) == pytest.approx(gain.K, rel=1e-8, abs=1e-9 * gain.K.max())
+    assert schedule.gain(0.0) == pytest.approx(
+        gain.K, rel=1e-8, abs=1e-9 * gain.K.max()
+    )
     steady = fflin.tvlqr(traj, Q, R, "steady", sample=0.5)
     assert np.abs(steady.K - gain.K).max() < 1e-8 * gain.K.max()
     with pytest.raises(fflin.InputError, match=r"0\.3 s.*200 s"):
@@ -261,7 +291,9 @@ def test_a_steady_end_goes_on_as_the_regulator_does(tumbling):
     assert fflin.tvlqr(traj, Q, R, "steady").P[-1] == pytest.approx(at_rest.P)
     # No input holds the spring, and the robot does not fall freely.
     sprung = robot.replace(inputs=robot.inputs[:2], stiffness={"joint_1": 5.0})
-    base_alone = fflin.linearize_trajectory(sprung, traj.t, traj.q, traj.v, traj.u[:, :6])
+    base_alone = fflin.linearize_trajectory(
+        sprung, traj.t, traj.q, traj.v, traj.u[:, :6]
+    )
     with pytest.raises(fflin.EquilibriumError, match="Qf"):
         fflin.tvlqr(base_alone, Q, R[:6])
 
@@ -318,13 +350,17 @@ def test_weights_are_those_of_lqr(tumbling):
     assert says(along.weights, "3 deg")
     assert says(along.weights, f"{pace:.3g} rad/s")
     assert np.diag(along.Q) == pytest.approx(np.diag(about.Q), rel=0.05)
-    assert np.diag(along.R) * pace**4 == pytest.approx(np.diag(about.R) * 0.2**4, rel=0.05)
+    assert np.diag(along.R) * pace**4 == pytest.approx(
+        np.diag(about.R) * 0.2**4, rel=0.05
+    )
     long = resting("ets_vii", 100.0)[1]
     assert says(fflin.tvlqr(long).weights, "0.2 rad/s")  # as at a point, no slower
     slow, quick = (fflin.tvlqr(traj, sample=dt).R.max() for dt in (1.0, 0.25))
     assert slow > 10.0 * quick
     assert (fflin.tvlqr(traj, weights="identity").R == np.eye(9)).all()
-    named = fflin.tvlqr(traj, {"q_b": 2.0, "q_m.joint_*": 3.0}, {"tau_b": 1.0, "*.*": 2.0}, 1.0)
+    named = fflin.tvlqr(
+        traj, {"q_b": 2.0, "q_m.joint_*": 3.0}, {"tau_b": 1.0, "*.*": 2.0}, 1.0
+    )
     assert named.Q.diagonal().tolist() == [2.0] * 3 + [0.0] * 3 + [3.0] * 3 + [0.0] * 9
 
 
@@ -361,7 +397,8 @@ def test_asking_for_a_gain_solves_nothing(moving, monkeypatch):
     schedule = fflin.tvlqr(moving, Q, R, 1.0)
     asked = np.linspace(0.0, 0.4, 57)
     expected = [
-        np.linalg.solve(np.diag(R), moving.matrices(t)[1].T @ schedule.cost_to_go(t)) for t in asked
+        np.linalg.solve(np.diag(R), moving.matrices(t)[1].T @ schedule.cost_to_go(t))
+        for t in asked
     ]
     schedule.gain(0.0)
     monkeypatch.setattr(np.linalg, "solve", None)
@@ -388,4 +425,6 @@ def test_knots_need_not_be_close_for_the_motion_between_them():
     coarse = fflin.linearize_trajectory(robot, t[::4], run.q[::4], run.v[::4], u[::4])
     Q, R = weights(fine)
     all_, few = (fflin.tvlqr(each, Q, R, 1.0) for each in (fine, coarse))
-    assert few.P[0] == pytest.approx(all_.P[0], rel=0.0, abs=1e-5 * np.abs(all_.P[0]).max())
+    assert few.P[0] == pytest.approx(
+        all_.P[0], rel=0.0, abs=1e-5 * np.abs(all_.P[0]).max()
+    )

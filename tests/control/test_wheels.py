@@ -44,14 +44,21 @@ def textbook(axes, Q, R):
 
 
 def attitude(lin):
-    return [lin.state_names.index(f"{g}.{axis}") for g in ("q_b", "omega_b") for axis in "xyz"]
+    return [
+        lin.state_names.index(f"{g}.{axis}")
+        for g in ("q_b", "omega_b")
+        for axis in "xyz"
+    ]
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_the_gain_is_that_of_the_single_body(layout):
     axes = LAYOUTS[layout]
     lin = fflin.linearize(wheeled(axes))
-    Q, R = np.diag([5.0, 6.0, 7.0, 1.0, 2.0, 3.0]), 0.5 + np.diag(0.1 * np.arange(len(axes)))
+    Q, R = (
+        np.diag([5.0, 6.0, 7.0, 1.0, 2.0, 3.0]),
+        0.5 + np.diag(0.1 * np.arange(len(axes))),
+    )
     whole = np.zeros_like(lin.A)
     at = attitude(lin)
     whole[np.ix_(at, at)] = Q
@@ -64,14 +71,17 @@ def test_the_gain_is_that_of_the_single_body(layout):
     B = np.vstack((np.zeros((3, len(axes))), -np.linalg.solve(inertia, A)))
     F = np.block([[np.zeros((3, 3)), 0.5 * np.eye(3)], [np.zeros((3, 6))]])
     poles = np.linalg.eigvals(F - B @ K)
-    assert np.sort_complex(gain.poles) == pytest.approx(np.sort_complex(poles), rel=1e-6)
+    assert np.sort_complex(gain.poles) == pytest.approx(
+        np.sort_complex(poles), rel=1e-6
+    )
     # In the whole's own variables too, as P = S' P_z S.
     defect = lin.A.T @ gain.P + gain.P @ lin.A + gain.Q
     defect -= gain.P @ lin.B @ np.linalg.solve(R, lin.B.T @ gain.P)
     assert np.abs(defect).max() < 1e-12 * np.abs(gain.Q).max()
     # Weights on what is not regulated say nothing.
     assert (
-        fflin.lqr(lin, whole + np.diag([i not in at for i in range(len(whole))]), R).K == gain.K
+        fflin.lqr(lin, whole + np.diag([i not in at for i in range(len(whole))]), R).K
+        == gain.K
     ).all()
 
 
@@ -106,7 +116,12 @@ def test_the_motion_is_that_of_the_rigid_body_under_the_textbooks_law(layout):
     turn = pin.SE3(pin.rpy.rpyToMatrix(0.6, -0.8, 0.5), np.zeros(3))
     q0 = fflin.configuration(robot, base=turn)
     motion = fflin.simulate(
-        robot, fflin.StateFeedback(lin, gain.K), q0=q0, duration=12.0, dt=0.01, linear=False
+        robot,
+        fflin.StateFeedback(lin, gain.K),
+        q0=q0,
+        duration=12.0,
+        dt=0.01,
+        linear=False,
     )
     inertia, A = without_wheels(axes)
     K = gain.K[:, attitude(lin)]
@@ -144,15 +159,21 @@ def test_wheels_on_links_hold_base_and_joints():
     arm = fflin.load("servicer_7dof")
     motors = [JointTorque(name) for name in arm.joint_names]
     on = ("base", "link_3", "base", "panel_left")
-    robot = arm.replace(inputs=[*motors, *wheels(AXES[:4], 2e-3, on)], gravity=(0, 0, 0))
+    robot = arm.replace(
+        inputs=[*motors, *wheels(AXES[:4], 2e-3, on)], gravity=(0, 0, 0)
+    )
     q = fflin.configuration(robot, {"joint_2": 0.4, "joint_4": -1.1})
     lin = fflin.linearize(robot, q)
     gain = fflin.lqr(lin)
     assert len(gain.regulated) == 2 * (3 + arm.n) and gain.margins.disk > 0.4
     turned = pin.SE3(pin.rpy.rpyToMatrix(0.2, 0.1, -0.2), np.zeros(3))
-    q0 = fflin.configuration(robot, {"joint_2": 0.5, "joint_4": -1.0, "joint_6": 0.1}, turned)
+    q0 = fflin.configuration(
+        robot, {"joint_2": 0.5, "joint_4": -1.0, "joint_6": 0.1}, turned
+    )
     duration = 7.0 / gain.margin
-    motion = fflin.simulate(robot, fflin.StateFeedback(lin, gain.K), q0=q0, duration=duration)
+    motion = fflin.simulate(
+        robot, fflin.StateFeedback(lin, gain.K), q0=q0, duration=duration
+    )
     last = dict(zip(motion.state_names, motion.error[-1], strict=True))
     assert max(abs(last[name]) for name in gain.regulated) < 2e-3
     assert motion.attitude_error[0] > 15.0 and motion.momentum_drift.max() < 1e-12
@@ -170,7 +191,9 @@ def test_the_default_bears_much_and_settles(dt):
         q0 = fflin.configuration(
             robot, base=pin.SE3(pin.rpy.rpyToMatrix(0.5, 0.1, 0.1), np.zeros(3))
         )
-        motion = fflin.simulate(robot, fflin.StateFeedback(lin, gain.K), q0=q0, duration=60.0)
+        motion = fflin.simulate(
+            robot, fflin.StateFeedback(lin, gain.K), q0=q0, duration=60.0
+        )
         assert motion.attitude_error[-1] < 0.01 * motion.attitude_error[0]
         # Wheels share the work: none spins but for the turn that is to be made.
         assert np.abs(motion.v[-1, 6:]).max() < 1e-2
@@ -241,11 +264,14 @@ def test_a_wheel_that_is_at_its_limit_is_told_and_quickens_nothing(spin):
     still = fflin.lqr(fflin.linearize(robot))
     spun = fflin.lqr(fflin.linearize(robot, v=fflin.velocity(robot, {"wheel_2": spin})))
     assert says(still.weights, "speed of wheel_2")
-    assert says(spun.weights, "speed of wheel_2", "at the operating point", "qdot_m.wheel_2")
+    assert says(
+        spun.weights, "speed of wheel_2", "at the operating point", "qdot_m.wheel_2"
+    )
     assert spun.R == pytest.approx(still.R, rel=1e-9)
     # A spin slows one mode, and the record has the slowest.
     assert (
-        f"decay rate at least {spun.margin:.3g} 1/s" in spun.weights and spun.margin < still.margin
+        f"decay rate at least {spun.margin:.3g} 1/s" in spun.weights
+        and spun.margin < still.margin
     )
 
 
@@ -258,10 +284,13 @@ def test_spinning_wheels_are_held_about_their_speed():
     assert len(gain.regulated) == 6 and gain.margins.disk > 1.1
     start = v.copy()
     start[3:6] = 0.02, -0.01, 0.01
-    motion = fflin.simulate(robot, fflin.StateFeedback(lin, gain.K), v0=start, duration=80.0)
+    motion = fflin.simulate(
+        robot, fflin.StateFeedback(lin, gain.K), v0=start, duration=80.0
+    )
     assert motion.attitude_error.max() > 1.0 and motion.attitude_error[-1] < 1e-2
     assert (
-        np.abs(motion.v[-1, 6:] - v[6:]).max() < 0.2 * np.abs(motion.v[:, 6:] - v[6:]).max() + 5.0
+        np.abs(motion.v[-1, 6:] - v[6:]).max()
+        < 0.2 * np.abs(motion.v[:, 6:] - v[6:]).max() + 5.0
     )
 
 
@@ -277,7 +306,9 @@ def test_speeds_come_back_where_something_else_turns_the_body():
     assert gain.margin == pytest.approx(0.02, rel=0.05) and gain.margins.disk > 1.1
     off = fflin.velocity(robot, {"wheel_1": 20.0, "wheel_2": 60.0})
     policy = fflin.StateFeedback(lin, gain.K)
-    motion = fflin.simulate(robot, policy, v0=off, duration=300.0, dt=0.05, linear=False)
+    motion = fflin.simulate(
+        robot, policy, v0=off, duration=300.0, dt=0.05, linear=False
+    )
     assert np.abs(motion.v[-1] - v).max() < 0.1 and motion.attitude_error[-1] < 0.005
     assert motion.attitude_error.max() < 2.0
     loose = fflin.lqr(lin, wheel_speeds=False)
@@ -305,7 +336,9 @@ def test_four_wheels_turn_against_each_other_on_request():
     idle = fflin.velocity(robot, {f"wheel_{k}": 50.0 * (-1) ** k for k in range(1, 5)})
     for design, left in ((gain, 0.2), (loose, 50.0)):
         policy = fflin.StateFeedback(lin, design.K)
-        motion = fflin.simulate(robot, policy, v0=idle, duration=300.0, dt=0.1, linear=False)
+        motion = fflin.simulate(
+            robot, policy, v0=idle, duration=300.0, dt=0.1, linear=False
+        )
         assert np.abs(motion.v[-1, 6:]).max() <= left + 1e-6
         assert motion.attitude_error.max() < 0.3
     assert np.abs(motion.v[-1] - idle).max() < 1e-6
@@ -342,14 +375,18 @@ def test_what_cannot_be_held_is_refused():
             fflin.lqr(fflin.linearize(wheeled(ORTHOGONAL[:count])))
     arm = fflin.load("ets_vii")
     idle = arm.replace(inputs=[JointTorque("joint_1"), *wheels(ORTHOGONAL, 1.0)])
-    with pytest.raises(fflin.StabilizabilityError, match=r"momentum of joint_2, .* joint_3"):
+    with pytest.raises(
+        fflin.StabilizabilityError, match=r"momentum of joint_2, .* joint_3"
+    ):
         fflin.lqr(fflin.linearize(idle))
 
 
 def test_damping_of_wheels_is_said_to_be_why_nothing_is_held():
     """Their speeds stay in the model with it, and the momentum of all that no input changes."""
     names = [f"wheel_{k}" for k in (1, 2, 3)]
-    lin = fflin.linearize(wheeled(ORTHOGONAL).replace(damping=dict.fromkeys(names, 1e-7)))
+    lin = fflin.linearize(
+        wheeled(ORTHOGONAL).replace(damping=dict.fromkeys(names, 1e-7))
+    )
     words = "remove the damping of the wheels"
     reduced = fflin.momentum_reduction(lin)
     for model in (lin, lin.discretize(0.1), reduced):
@@ -359,7 +396,9 @@ def test_damping_of_wheels_is_said_to_be_why_nothing_is_held():
     with pytest.raises(fflin.StabilizabilityError) as told:
         fflin.lqr(fflin.linearize(wheeled(ORTHOGONAL[:1])))
     assert "damping" not in str(told.value)
-    helped = wheeled(ORTHOGONAL, others=[BaseTorque()]).replace(damping={"wheel_1": 1e-7})
+    helped = wheeled(ORTHOGONAL, others=[BaseTorque()]).replace(
+        damping={"wheel_1": 1e-7}
+    )
     assert fflin.lqr(fflin.linearize(helped)).margin > 0.0
 
 
@@ -398,7 +437,9 @@ def test_the_closed_form_holds_too():
 
 
 def test_a_filter_estimates_what_is_regulated():
-    robot = wheeled(AXES[:3]).replace(outputs=[fflin.BasePose(), fflin.JointVelocities()])
+    robot = wheeled(AXES[:3]).replace(
+        outputs=[fflin.BasePose(), fflin.JointVelocities()]
+    )
     lin = fflin.linearize(robot).discretize(0.1)
     gain = fflin.lqr(lin)
     found = fflin.kalman(lin, {"wheel": 1e-4}, 1e-6, G=lin.B)
@@ -408,10 +449,14 @@ def test_a_filter_estimates_what_is_regulated():
     seen = [i for i, name in enumerate(lin.output_names) if found.L[:, i].any()]
     assert len(seen) == 3  # the attitude, and neither position nor the wheels' speeds
     loop = np.linalg.eigvals((lin.A - found.L @ lin.C)[np.ix_(at, at)])
-    assert np.sort(np.abs(loop)) == pytest.approx(np.sort(np.abs(found.poles)), abs=1e-9)
+    assert np.sort(np.abs(loop)) == pytest.approx(
+        np.sort(np.abs(found.poles)), abs=1e-9
+    )
     compensator = fflin.lqg(gain, found)
     assert compensator.state_names == gain.regulated and compensator.A.shape == (6, 6)
-    q0 = fflin.configuration(robot, base=pin.SE3(pin.rpy.rpyToMatrix(0.3, 0.1, 0), np.ones(3)))
+    q0 = fflin.configuration(
+        robot, base=pin.SE3(pin.rpy.rpyToMatrix(0.3, 0.1, 0), np.ones(3))
+    )
     policy = fflin.OutputFeedback(lin, compensator)
     motion = fflin.simulate(robot, policy, q0=q0, duration=80.0)
     assert motion.attitude_error[-1] < 0.02
@@ -420,7 +465,10 @@ def test_a_filter_estimates_what_is_regulated():
 def test_a_filter_and_a_gain_of_unlike_speeds_are_refused():
     robot = wheeled(AXES[:3], others=[BaseTorque()])
     lin = fflin.linearize(robot)
-    W, loose = {name: 1e-3 for name in ("q_b", "omega_b", "qdot_m")}, {"wheel_speeds": False}
+    W, loose = (
+        {name: 1e-3 for name in ("q_b", "omega_b", "qdot_m")},
+        {"wheel_speeds": False},
+    )
     both = fflin.kalman(lin, W, 1e-4)
     assert both.estimated == fflin.lqr(lin).regulated
     fflin.lqg(fflin.lqr(lin, **loose), both)
@@ -442,7 +490,11 @@ def test_the_carrier_without_its_wheels_is_the_body_that_is_designed_for():
     other = other.replace(inputs=[*motors, BaseTorque()])
     beside = fflin.momentum_reduction(fflin.linearize(other))
     gain = fflin.lqr(lin, {"q_b": 3.0, "q_m": 2.0, "omega_b": 1.0, "qdot_m": 1.0}, 0.7)
-    same = fflin.lqr(beside, {"q_b": 3.0, "q_m": 2.0, "omega_b": 1.0, "qdot_m": 1.0}, 0.7)
+    same = fflin.lqr(
+        beside, {"q_b": 3.0, "q_m": 2.0, "omega_b": 1.0, "qdot_m": 1.0}, 0.7
+    )
     at = [lin.state_names.index(name) for name in beside.state_names]
     sign = np.array([1.0] * arm.n + [-1.0] * 3)
-    assert gain.K[:, at] == pytest.approx(sign[:, None] * same.K, abs=1e-8 * np.abs(same.K).max())
+    assert gain.K[:, at] == pytest.approx(
+        sign[:, None] * same.K, abs=1e-8 * np.abs(same.K).max()
+    )

@@ -12,7 +12,9 @@ from tests.support.robots import FRAMES, random_point, random_pose, random_tree
 
 THRUSTERS = (
     fflin.Thruster("base", (0.4, 0.1, -0.2), (1.0, 0.2, 0.0)),
-    fflin.Thruster("link_3", (0.1, 0.0, 0.2), (0.0, -3.0, 0.0), name="on_the_arm", torque=0.5),
+    fflin.Thruster(
+        "link_3", (0.1, 0.0, 0.2), (0.0, -3.0, 0.0), name="on_the_arm", torque=0.5
+    ),
     fflin.Thruster("tool", (0.0, 0.05, 0.0), (0.3, 0.1, -1.0)),
 )
 
@@ -36,8 +38,12 @@ def flying(frame, seed, name="servicer_7dof", **fields):
     robot = fflin.load(name)
     fields.setdefault("inputs", mixed(robot))
     robot = robot.replace(
-        stiffness={joint: 10.0 * (k + 1) for k, joint in enumerate(robot.joint_names[1::2])},
-        damping={joint: 0.5 * (k + 1) for k, joint in enumerate(robot.joint_names[::2])},
+        stiffness={
+            joint: 10.0 * (k + 1) for k, joint in enumerate(robot.joint_names[1::2])
+        },
+        damping={
+            joint: 0.5 * (k + 1) for k, joint in enumerate(robot.joint_names[::2])
+        },
         rest={robot.joint_names[1]: 0.3},
         gravity=(0.3, -1.0, -3.7),
         **fields,
@@ -47,7 +53,9 @@ def flying(frame, seed, name="servicer_7dof", **fields):
     return robot, q, v, u
 
 
-@pytest.mark.parametrize("turned", [False, True], ids=["own reference", "turned reference"])
+@pytest.mark.parametrize(
+    "turned", [False, True], ids=["own reference", "turned reference"]
+)
 @pytest.mark.parametrize("frame", FRAMES)
 @pytest.mark.parametrize("name", ["servicer_7dof", "ets_vii", "canadarm2"])
 def test_check_holds_with_all_that_acts(name, frame, turned):
@@ -56,9 +64,9 @@ def test_check_holds_with_all_that_acts(name, frame, turned):
     lin = fflin.linearize(robot, q, v, u, frame=frame, reference=reference)
     found = fflin.check(robot, lin)
     assert found.ok, found
-    assert {row.block.split(", ")[-1] for row in found.rows if row.block.startswith("B")} == {
-        *("tau_b]", "F_b]", "tau_m]", "thrust]")
-    }
+    assert {
+        row.block.split(", ")[-1] for row in found.rows if row.block.startswith("B")
+    } == {*("tau_b]", "F_b]", "tau_m]", "thrust]")}
 
 
 @pytest.mark.parametrize("frame", FRAMES)
@@ -68,11 +76,16 @@ def test_check_holds_on_random_trees_with_thrusters(frame):
     for index in range(2, robot.model.njoints):
         robot.model.addJointFrame(index)
     thrusters = [
-        fflin.Thruster(f"joint_{k}", rng.normal(size=3), rng.normal(size=3)) for k in range(7)
+        fflin.Thruster(f"joint_{k}", rng.normal(size=3), rng.normal(size=3))
+        for k in range(7)
     ]
-    robot = robot.replace(inputs=thrusters, stiffness=3.0, damping=0.2, gravity=(0, 0, -9.81))
+    robot = robot.replace(
+        inputs=thrusters, stiffness=3.0, damping=0.2, gravity=(0, 0, -9.81)
+    )
     q, v, _ = random_point(random_tree(np.random.default_rng(3), 7), rng)
-    found = fflin.check(robot, fflin.linearize(robot, q, v, rng.normal(size=7), frame=frame))
+    found = fflin.check(
+        robot, fflin.linearize(robot, q, v, rng.normal(size=7), frame=frame)
+    )
     assert found.ok, found
 
 
@@ -82,11 +95,16 @@ def test_check_holds_where_joints_mimic_others():
         stiffness=5.0,
         damping=0.1,
         gravity=(0, 0, -9.81),
-        inputs=(fflin.Thruster("panda_rightfinger", (0, 0, 0.1), (1, 0, 0)), fflin.BaseTorque()),
+        inputs=(
+            fflin.Thruster("panda_rightfinger", (0, 0, 0.1), (1, 0, 0)),
+            fflin.BaseTorque(),
+        ),
     )
     q, v, _ = random_point(fflin.load("panda"), np.random.default_rng(4))
     for frame in FRAMES:
-        found = fflin.check(robot, fflin.linearize(robot, q, v, [3.0, 1, 2, 3], frame=frame))
+        found = fflin.check(
+            robot, fflin.linearize(robot, q, v, [3.0, 1, 2, 3], frame=frame)
+        )
         assert found.ok, found
 
 
@@ -122,7 +140,9 @@ def test_thrust_slope_by_the_closed_form():
     wrench = np.concatenate((direction, np.cross(point, direction)))
     J = pin.computeJointJacobian(model, data, q, joint)
     order = [3, 4, 5, 0, 1, 2, *range(6, 6 + n)]
-    depth = {j.idx_v: len(model.supports[model.getJointId(j.name)]) for j in robot.joints}
+    depth = {
+        j.idx_v: len(model.supports[model.getJointId(j.name)]) for j in robot.joints
+    }
     depth |= dict.fromkeys(range(6), 0)
     slope = np.zeros((6 + n, n))
     for row, j in enumerate(order):
@@ -141,12 +161,15 @@ def test_thrust_slope_by_the_closed_form():
         dq = np.zeros(6 + n)
         dq[6 + column] = h
         inertia = [
-            fflin.linearize(bare, pin.integrate(model, q, k * dq)).M @ a for k in (1, -1, 2, -2)
+            fflin.linearize(bare, pin.integrate(model, q, k * dq)).M @ a
+            for k in (1, -1, 2, -2)
         ]
         dMa = (8 * (inertia[0] - inertia[1]) - (inertia[2] - inertia[3])) / (12 * h)
         expected = np.linalg.solve(M, slope[:, column] - dMa)
         given = lin.A[6 + n :, 6 + column]
-        assert given == pytest.approx(expected, rel=1e-8, abs=1e-8 * np.abs(expected).max())
+        assert given == pytest.approx(
+            expected, rel=1e-8, abs=1e-8 * np.abs(expected).max()
+        )
 
 
 def test_null_space_thrust_is_a_fixed_point_and_can_be_unstable():
@@ -154,7 +177,9 @@ def test_null_space_thrust_is_a_fixed_point_and_can_be_unstable():
     model = pin.Model()
     model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "free")
     model.addFrame(pin.Frame("base", 1, 0, pin.SE3.Identity(), pin.FrameType.OP_FRAME))
-    model.appendBodyToJoint(1, pin.Inertia(10.0, np.zeros(3), np.eye(3)), pin.SE3.Identity())
+    model.appendBodyToJoint(
+        1, pin.Inertia(10.0, np.zeros(3), np.eye(3)), pin.SE3.Identity()
+    )
     place = pin.SE3(np.eye(3), np.array([0.5, 0.0, 0.0]))
     model.addJoint(1, pin.JointModelRZ(), place, "hinge")
     model.addFrame(pin.Frame("rod", 2, 0, pin.SE3.Identity(), pin.FrameType.OP_FRAME))
@@ -170,7 +195,9 @@ def test_null_space_thrust_is_a_fixed_point_and_can_be_unstable():
         assert fflin.check(robot, lin).ok
         poles[sign] = [p for p in np.linalg.eigvals(lin.A) if abs(p) > 0.1]
         assert ("unstable" in model_report(lin)) == (sign < 0)
-    assert np.sort(np.imag(poles[1.0])) == pytest.approx(np.sort(np.real(poles[-1.0])), rel=1e-9)
+    assert np.sort(np.imag(poles[1.0])) == pytest.approx(
+        np.sort(np.real(poles[-1.0])), rel=1e-9
+    )
     assert np.abs(np.real(poles[1.0])).max() < 1e-9 < np.real(poles[-1.0]).max()
 
 
@@ -179,9 +206,13 @@ def test_springs_between_base_and_rotor_have_the_closed_form_frequency():
     J1, J2, k, d = 3.0, 0.5, 8.0, 0.2
     model = pin.Model()
     model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "free")
-    model.appendBodyToJoint(1, pin.Inertia(5.0, np.zeros(3), J1 * np.eye(3)), pin.SE3.Identity())
+    model.appendBodyToJoint(
+        1, pin.Inertia(5.0, np.zeros(3), J1 * np.eye(3)), pin.SE3.Identity()
+    )
     model.addJoint(1, pin.JointModelRX(), pin.SE3.Identity(), "panel")
-    model.appendBodyToJoint(2, pin.Inertia(1.0, np.zeros(3), J2 * np.eye(3)), pin.SE3.Identity())
+    model.appendBodyToJoint(
+        2, pin.Inertia(1.0, np.zeros(3), J2 * np.eye(3)), pin.SE3.Identity()
+    )
     robot = fflin.from_model(model, stiffness={"panel": k}, damping={"panel": d})
     poles = np.linalg.eigvals(fflin.linearize(robot).A)
     expected = np.roots([1.0, d * (1 / J1 + 1 / J2), k * (1 / J1 + 1 / J2)])
@@ -194,7 +225,9 @@ def test_two_panel_frequencies_of_a_free_hub():
     m, J, a, k, hub, I = 4.0, 0.6, 1.2, 50.0, 30.0, 8.0
     model = pin.Model()
     model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "free")
-    model.appendBodyToJoint(1, pin.Inertia(hub, np.zeros(3), I * np.eye(3)), pin.SE3.Identity())
+    model.appendBodyToJoint(
+        1, pin.Inertia(hub, np.zeros(3), I * np.eye(3)), pin.SE3.Identity()
+    )
     for name, side in (("left", 1.0), ("right", -1.0)):
         place = pin.SE3(np.eye(3), np.array([0.0, side * 0.5, 0.0]))
         index = model.addJoint(1, pin.JointModelRX(), place, name)
@@ -238,7 +271,9 @@ def test_gravity_moves_the_base_and_nothing_against_it(frame):
     assert not rate[g.qdot_m].any() and not rate[g.omega_b].any()
     assert np.linalg.norm(rate[g.v_b]) == pytest.approx(np.hypot(0.5, 9.81), rel=1e-12)
     if frame != "local":
-        assert rate[g.v_b] == pytest.approx(pose.rotation.T @ [0.5, 0.0, -9.81], abs=1e-12)
+        assert rate[g.v_b] == pytest.approx(
+            pose.rotation.T @ [0.5, 0.0, -9.81], abs=1e-12
+        )
         assert (falling.A == free.A).all()
     assert fflin.check(heavy, falling).ok
 
@@ -269,7 +304,9 @@ def test_bad_fields_are_told():
         "'joint_8'": {"inputs": [fflin.JointTorque("joint_8")]},
         "inputs": {"inputs": []},
         "input": {"inputs": ["thruster"]},
-        "'thruster_2'": {"inputs": [replace(THRUSTERS[0], name="thruster_2"), THRUSTERS[0]]},
+        "'thruster_2'": {
+            "inputs": [replace(THRUSTERS[0], name="thruster_2"), THRUSTERS[0]]
+        },
         "twice": {"inputs": [fflin.BaseForce(), fflin.BaseForce()]},
         "'panel_left'": {"stiffness": {"panel_left": -1}},
         "'panel'": {"damping": {"panel": 1}},
@@ -297,7 +334,11 @@ def test_points_by_name():
     v = fflin.velocity(robot, {"joint_3": 0.2, "omega_b.y": -0.1, "v_b.z": 2.0})
     state = fflin.StateMap(robot, frame="local").to_state(fflin.configuration(robot), v)
     named = dict(zip(fflin.StateMap(robot).names, state, strict=True))
-    assert (named["qdot_m.joint_3"], named["omega_b.y"], named["v_b.z"]) == (0.2, -0.1, 2.0)
+    assert (named["qdot_m.joint_3"], named["omega_b.y"], named["v_b.z"]) == (
+        0.2,
+        -0.1,
+        2.0,
+    )
     u = fflin.effort(robot, {"tau_m.joint_3": 4.0})
     assert u[8] == 4.0 and np.count_nonzero(u) == 1
     with pytest.raises(fflin.UnknownNameError, match="'joint_33'"):

@@ -27,8 +27,16 @@ def grasped(name, seed=0, speed=0.2):
     options["payload_v"] = speed * rng.standard_normal(6)
     if isinstance(payload, str):
         payload = fflin.load(payload)
-        options["payload_q"], options["payload_v"], _ = random_point(payload, rng, speed=speed)
-    return robot, frame, payload, options, fflin.capture(robot, frame, payload, **options)
+        options["payload_q"], options["payload_v"], _ = random_point(
+            payload, rng, speed=speed
+        )
+    return (
+        robot,
+        frame,
+        payload,
+        options,
+        fflin.capture(robot, frame, payload, **options),
+    )
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -50,7 +58,9 @@ def test_the_weld_is_closed_and_the_impulse_changes_both(name):
     pin.forwardKinematics(whole.model, data, found.q, found.v)
     pin.updateFramePlacements(whole.model, data)
     local = pin.ReferenceFrame.LOCAL
-    grasp, held = (whole.model.getFrameId(each, pin.FrameType.BODY) for each in (frame, "payload"))
+    grasp, held = (
+        whole.model.getFrameId(each, pin.FrameType.BODY) for each in (frame, "payload")
+    )
     relative = data.oMf[grasp].actInv(data.oMf[held])
     assert relative.isApprox(options["placement"], 1e-12)
     twist = pin.getFrameVelocity(whole.model, data, held, local)
@@ -60,7 +70,9 @@ def test_the_weld_is_closed_and_the_impulse_changes_both(name):
     names = [name for name in robot.model.names if name not in ("universe",)]
     v = np.concatenate(
         [
-            found.v[(j := whole.model.joints[whole.model.getJointId(name)]).idx_v :][: j.nv]
+            found.v[(j := whole.model.joints[whole.model.getJointId(name)]).idx_v :][
+                : j.nv
+            ]
             for name in names
         ]
     )
@@ -78,7 +90,10 @@ def test_the_weld_is_closed_and_the_impulse_changes_both(name):
     if isinstance(payload, pin.Inertia):
         before = pin.Motion(np.array(options["payload_v"]))
         impulse = payload * before - payload * pin.Motion(twist.vector)
-        assert np.abs(impulse.vector - found.impulse).max() < 1e-10 * np.abs(found.impulse).max()
+        assert (
+            np.abs(impulse.vector - found.impulse).max()
+            < 1e-10 * np.abs(found.impulse).max()
+        )
 
 
 def test_it_is_the_limit_of_a_stiff_grasp():
@@ -164,7 +179,9 @@ def test_a_body_that_was_caught_has_parameters_of_its_own():
     assert S.parameters["link_7.mass"].value == pytest.approx(6.0)
     of = fflin.uncertain(found.robot, {"payload.density": 0.1})
     heavier = of.at({"payload.density": 1.1})
-    again = fflin.capture(robot, "tool", pin.Inertia(550.0, DEBRIS.lever, 1.1 * DEBRIS.inertia))
+    again = fflin.capture(
+        robot, "tool", pin.Inertia(550.0, DEBRIS.lever, 1.1 * DEBRIS.inertia)
+    )
     B, wanted = (fflin.linearize(each).B for each in (heavier, again.robot))
     assert np.abs(B - wanted).max() < 1e-12 * np.abs(wanted).max()
 
@@ -180,8 +197,14 @@ def test_what_is_wrong_is_one_line():
         (lambda: fflin.capture(robot, "tool", DEBRIS, prefix="a.b"), "dots"),
         (lambda: fflin.capture(robot, "tool", DEBRIS, payload_v=[1.0]), "payload_v"),
         (lambda: fflin.capture(robot, "tool", DEBRIS, placement=3), "placement"),
-        (lambda: fflin.capture(robot, "tool", pin.Inertia.Zero()), "mass of 'payload' is 0 kg"),
-        (lambda: fflin.capture(robot, "tool", other.replace(gravity=(0, 0, -9.8))), "gravity"),
+        (
+            lambda: fflin.capture(robot, "tool", pin.Inertia.Zero()),
+            "mass of 'payload' is 0 kg",
+        ),
+        (
+            lambda: fflin.capture(robot, "tool", other.replace(gravity=(0, 0, -9.8))),
+            "gravity",
+        ),
     ]
     for call, said in cases:
         with pytest.raises(fflin.FflinError) as error:
@@ -194,7 +217,8 @@ def test_a_robot_grasps_its_twin():
     q, v, _ = random_point(robot, np.random.default_rng(1), speed=0.1)
     others = [fflin.load("ets_vii"), robot, robot.replace(damping=0.0)]
     first, *same = (
-        fflin.capture(robot, "tool", each, q=q, payload_q=q, payload_v=v) for each in others
+        fflin.capture(robot, "tool", each, q=q, payload_q=q, payload_v=v)
+        for each in others
     )
     for found in same:
         assert (found.v == first.v).all() and (found.momentum == first.momentum).all()
@@ -203,14 +227,18 @@ def test_a_robot_grasps_its_twin():
 def test_momentum_that_a_payload_stores_is_not_lost_in_silence():
     wheel = fflin.ReactionWheel((0.0, 0.0, 1.0), momentum=2.0)
     with pytest.raises(fflin.InputError, match="momentum"):
-        fflin.capture(fflin.load("ets_vii"), "tool", fflin.load("cubesat", inputs=[wheel]))
+        fflin.capture(
+            fflin.load("ets_vii"), "tool", fflin.load("cubesat", inputs=[wheel])
+        )
 
 
 @pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
 def test_all_of_a_payload_hangs_where_it_was_on_its_base(tmp_path):
     """Its frames, rotors and mimic joints, and a root that is not at its base's origin."""
     mimic = '<mimic joint="b" multiplier="-2" offset="0.3"/>'
-    document = MIMIC.format(links=LINKS, a="revolute", b="revolute", parent="base", mimic=mimic)
+    document = MIMIC.format(
+        links=LINKS, a="revolute", b="revolute", parent="base", mimic=mimic
+    )
     (tmp_path / "r.urdf").write_text(document)
     held = fflin.load(tmp_path / "r.urdf")
     model = held.model.copy()
@@ -218,7 +246,10 @@ def test_all_of_a_payload_hangs_where_it_was_on_its_base(tmp_path):
     model.jointPlacements[1] = random_pose(np.random.default_rng(2), 50.0)
     held = replace(held, model=model)
     robot = fflin.load("ets_vii", limits={"joint_1": (-1.0, 1.0)})
-    at, q = random_pose(np.random.default_rng(1), 70.0), fflin.configuration(held, {"b": 0.4})
+    at, q = (
+        random_pose(np.random.default_rng(1), 70.0),
+        fflin.configuration(held, {"b": 0.4}),
+    )
     found = fflin.capture(robot, "tool", held, placement=at, payload_q=q)
     whole = found.robot
     assert whole.limits == robot.limits
@@ -230,7 +261,10 @@ def test_all_of_a_payload_hangs_where_it_was_on_its_base(tmp_path):
     for each, point, start in ((held, q, "base"), (whole, found.q, "payload")):
         data = each.create_data()
         pin.framesForwardKinematics(each.model, data, point)
-        names = [start, *(f"{start}.{x}" if each is whole else x for x in ("base", "la", "lb"))]
+        names = [
+            start,
+            *(f"{start}.{x}" if each is whole else x for x in ("base", "la", "lb")),
+        ]
         first, *rest = (data.oMf[each.model.getFrameId(name)] for name in names)
         placed.append([first.actInv(one) for one in rest])
     for one, other in zip(*placed, strict=True):
@@ -242,7 +276,9 @@ def test_all_of_a_payload_hangs_where_it_was_on_its_base(tmp_path):
 
 
 def test_a_robot_with_wheels_keeps_its_gravity():
-    robot = fflin.load("cubesat", inputs=[fflin.ReactionWheel((0, 0, 1.0), inertia=1e-3)])
+    robot = fflin.load(
+        "cubesat", inputs=[fflin.ReactionWheel((0, 0, 1.0), inertia=1e-3)]
+    )
     robot = robot.replace(gravity=(0.0, 0.0, -9.81))
     whole = fflin.capture(robot, "base", DEBRIS).robot
     assert whole.gravity == (0.0, 0.0, -9.81) and list(whole.wheels) == ["wheel_1"]

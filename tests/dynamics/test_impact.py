@@ -48,7 +48,9 @@ def test_the_other_joints_are_free_and_the_impulse_is_on_the_jammed_one():
     assert "tau_m.joint_3" not in fflin.linearize(found.robot).input_names
     again = fflin.load("servicer_7dof", lock={"joint_3": float(q[9])})
     one, other = (fflin.linearize(each, found.q) for each in (found.robot, again))
-    assert one.state_names == other.state_names and np.abs(one.B - other.B).max() < 1e-15
+    assert (
+        one.state_names == other.state_names and np.abs(one.B - other.B).max() < 1e-15
+    )
 
 
 def test_it_is_the_limit_of_a_stiff_brake():
@@ -88,11 +90,16 @@ def test_fields_lose_what_is_of_the_joint():
         stiffness=2.0,
         limits={"tau_m": 5.0, "q_m.joint_2": 1.0},
         weights={"q": {"q_m.joint_2": 4.0}},
-        outputs=[fflin.JointPositions(("joint_2", "joint_3")), fflin.JointVelocities(("joint_2",))],
+        outputs=[
+            fflin.JointPositions(("joint_2", "joint_3")),
+            fflin.JointVelocities(("joint_2",)),
+        ],
         passive=["joint_1", "joint_2"],
         start={"joints": {"joint_2": 0.3, "joint_3": 0.1}},
     )
-    left = fflin.jam(robot, "joint_2", q=fflin.configuration(robot, {"joint_2": 0.3})).robot
+    left = fflin.jam(
+        robot, "joint_2", q=fflin.configuration(robot, {"joint_2": 0.3})
+    ).robot
     assert left.locked == ("joint_2=0.3",) and left.passive == ("joint_1",)
     assert "joint_2" not in left.stiffness and len(left.stiffness) == 5
     assert not any("joint_2" in name for name in left.limits) and len(left.limits) == 4
@@ -104,7 +111,9 @@ def test_fields_lose_what_is_of_the_joint():
 @pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
 def test_what_mimics_a_joint_stops_with_it(tmp_path):
     mimic = '<mimic joint="b" multiplier="-2" offset="0.3"/>'
-    document = MIMIC.format(links=LINKS, a="revolute", b="revolute", parent="base", mimic=mimic)
+    document = MIMIC.format(
+        links=LINKS, a="revolute", b="revolute", parent="base", mimic=mimic
+    )
     (tmp_path / "r.urdf").write_text(document)
     robot = fflin.load(tmp_path / "r.urdf")
     q = fflin.configuration(robot, {"b": 0.4})
@@ -128,7 +137,9 @@ def test_what_was_caught_may_jam_too():
     assert len(shapes(left.robot)[0]) == len(shapes(caught.robot)[0])
 
 
-@pytest.mark.parametrize("payload", [pin.Inertia(5.0, np.zeros(3), np.eye(3)), "cubesat"])
+@pytest.mark.parametrize(
+    "payload", [pin.Inertia(5.0, np.zeros(3), np.eye(3)), "cubesat"]
+)
 def test_a_link_of_what_was_caught_never_stands_for_a_whole_body(payload):
     """A model of other origin has no links, so the body that grasps keeps its own name."""
     model = fflin.load("planar_detumble").model

@@ -16,7 +16,9 @@ def chain(*inertias):
     """A robot of a base and revolute joints one after the other, all about z, 0.1 m apart."""
     model = pin.Model()
     model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "free")
-    model.appendBodyToJoint(1, pin.Inertia(5.0, np.zeros(3), np.eye(3)), pin.SE3.Identity())
+    model.appendBodyToJoint(
+        1, pin.Inertia(5.0, np.zeros(3), np.eye(3)), pin.SE3.Identity()
+    )
     place = pin.SE3(np.eye(3), np.array([0.1, 0.0, 0.0]))
     for index, inertia in enumerate(inertias):
         joint = model.addJoint(index + 1, pin.JointModelRZ(), place, f"joint_{index}")
@@ -37,7 +39,9 @@ def exact_inverse(M):
         for i in range(n):
             if i != k and rows[i][k]:
                 factor = rows[i][k]
-                rows[i] = [x - factor * y for x, y in zip(rows[i], rows[k], strict=True)]
+                rows[i] = [
+                    x - factor * y for x, y in zip(rows[i], rows[k], strict=True)
+                ]
     return np.array([[float(x) for x in row[n:]] for row in rows])
 
 
@@ -101,7 +105,9 @@ def test_slide_beyond_its_bound_costs_no_digit():
     exact = exact_inverse(lin.M)
     mobility = np.sqrt(exact.diagonal())
     error = np.abs(lin.B[6 + robot.n :] - exact) / np.outer(mobility, mobility)
-    assert error.max() < 8 * len(exact) * np.finfo(float).eps * lin.certificate.condition
+    assert (
+        error.max() < 8 * len(exact) * np.finfo(float).eps * lin.certificate.condition
+    )
 
 
 def test_far_base_costs_no_digit():
@@ -123,7 +129,10 @@ def test_long_chain_is_inverted_as_right_by_every_way(n):
     assert inertia_bounds(robot.model)[6:] @ mobility[6:] ** 2 > 4.6e5
     scale = np.sqrt(lin.M.diagonal())
     residual = (lin.M @ inverse - np.eye(6 + n)) / scale[:, None] * scale
-    assert np.abs(residual).max() < 8 * (6 + n) * np.finfo(float).eps * lin.certificate.condition
+    assert (
+        np.abs(residual).max()
+        < 8 * (6 + n) * np.finfo(float).eps * lin.certificate.condition
+    )
     assert (inverse == inverse.T).all()
 
 
@@ -168,7 +177,9 @@ def test_massless_base_is_refused_where_its_m_is_singular():
 
 
 @pytest.mark.parametrize("parent", ["base", "la"])
-@pytest.mark.parametrize("types", [("revolute", "revolute"), ("prismatic", "continuous")])
+@pytest.mark.parametrize(
+    "types", [("revolute", "revolute"), ("prismatic", "continuous")]
+)
 def test_mimic_joints_leave_one_degree_of_freedom(types, parent, tmp_path):
     """Joint a = -2 b + 0.3, before its leader: M_r = S^T M S, and the motion obeys it."""
     document = MIMIC.format(

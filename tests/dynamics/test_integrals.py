@@ -11,7 +11,9 @@ from tests.support.robots import random_tree
 
 def moved_root():
     model = fflin.load("planar_detumble").model.copy()
-    model.jointPlacements[1] = pin.SE3(pin.exp3(np.array([0.3, -0.8, 0.5])), np.array([1.0, 2, 3]))
+    model.jointPlacements[1] = pin.SE3(
+        pin.exp3(np.array([0.3, -0.8, 0.5])), np.array([1.0, 2, 3])
+    )
     return fflin.from_model(model)
 
 
@@ -65,7 +67,9 @@ def rows_of(robot, count, seed=0):
     rng = np.random.default_rng(seed)
     bound = np.ones(robot.nq)
     pin.seed(seed)
-    q = np.array([pin.randomConfiguration(robot.model, -bound, bound) for _ in range(count)])
+    q = np.array(
+        [pin.randomConfiguration(robot.model, -bound, bound) for _ in range(count)]
+    )
     return q, rng.normal(size=(count, robot.nv))
 
 
@@ -90,7 +94,9 @@ def test_sums_are_those_of_pinocchio(name):
         assert found.energy[i] == pytest.approx(energy, rel=tolerance)
         size = np.sqrt(2.0 * energy * robot.mass) * (1.0 + np.sqrt(polar / robot.mass))
         assert np.abs(found.momentum[i] - momentum).max() < tolerance * size
-        assert np.abs(found.center[i] - center).max() < tolerance * np.sqrt(polar / robot.mass)
+        assert np.abs(found.center[i] - center).max() < tolerance * np.sqrt(
+            polar / robot.mass
+        )
         assert found.polar[i] == pytest.approx(polar, rel=tolerance)
 
 

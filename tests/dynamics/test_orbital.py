@@ -15,7 +15,9 @@ N = 0.3  # so fast that it is seen beside the rest
 
 def in_orbit(robot):
     return robot.replace(
-        orbit=fflin.CircularOrbit(mean_motion=N, body="x", mu=N**2 * 1e12, body_radius=1.0)
+        orbit=fflin.CircularOrbit(
+            mean_motion=N, body="x", mu=N**2 * 1e12, body_radius=1.0
+        )
     )
 
 
@@ -37,10 +39,15 @@ def test_a_body_is_pulled_as_its_mass_points(frame):
     pin.forwardKinematics(robot.model, data, q)
     place, r = data.oMi[1], {"lvlh": [0, 0, -1.0], "hill": [1.0, 0, 0]}[frame]
     G = N**2 * (3.0 * np.outer(r, r) - np.eye(3))
-    pulls = [place.rotation.T @ (m * G @ place.act(x)) for m, x in zip(masses, points, strict=True)]
+    pulls = [
+        place.rotation.T @ (m * G @ place.act(x))
+        for m, x in zip(masses, points, strict=True)
+    ]
     torque = sum(np.cross(x, pull) for x, pull in zip(points, pulls, strict=True))
     found = field.wrenches(data)[1]
-    assert np.allclose(found.linear, sum(pulls), rtol=0, atol=1e-13 * np.abs(pulls).max())
+    assert np.allclose(
+        found.linear, sum(pulls), rtol=0, atol=1e-13 * np.abs(pulls).max()
+    )
     assert np.allclose(found.angular, torque, rtol=0, atol=1e-13 * np.abs(pulls).max())
 
 
@@ -78,7 +85,9 @@ def test_a_free_motion_has_the_power_of_no_force(name, frame):
         place, speed = pin.integrate(robot.model, q, t * (v + 0.5 * t * a)), v + t * a
         pin.forwardKinematics(robot.model, data, place)
         potential = aba.field.potential(data)
-        return np.array([pin.computeKineticEnergy(robot.model, data, place, speed), potential])
+        return np.array(
+            [pin.computeKineticEnergy(robot.model, data, place, speed), potential]
+        )
 
     h = 1e-4
     kinetic, potential = (energies(h) - energies(-h)) / (2.0 * h)

@@ -36,7 +36,9 @@ def with_sensor(model, joint, placement):
     model = model.copy()
     for index, name in enumerate(model.names):
         if not model.existFrame(name):
-            model.addFrame(pin.Frame(name, index, pin.SE3.Identity(), pin.FrameType.JOINT))
+            model.addFrame(
+                pin.Frame(name, index, pin.SE3.Identity(), pin.FrameType.JOINT)
+            )
     model.addFrame(pin.Frame("imu", joint, placement, pin.FrameType.OP_FRAME))
     return fflin.from_model(model)
 
@@ -44,7 +46,9 @@ def with_sensor(model, joint, placement):
 def bundled(name):
     """A bundled robot with a sensor off the axes of its last link."""
     model = fflin.load(name).model
-    return with_sensor(model, model.njoints - 1, random_pose(np.random.default_rng(7), 100.0))
+    return with_sensor(
+        model, model.njoints - 1, random_pose(np.random.default_rng(7), 100.0)
+    )
 
 
 def tree(seed):
@@ -121,19 +125,26 @@ def measure(robot, outputs, reference, gravity, q, v, a, q_star):
             angular = sum(h.angular for h in momenta) - np.cross(com, linear)
             y += [to_reference @ angular, to_reference @ linear]
             continue
-        index = next(i for i, frame in enumerate(model.frames) if frame.name == output.frame)
+        index = next(
+            i for i, frame in enumerate(model.frames) if frame.name == output.frame
+        )
         frame = model.frames[index]
         oMf = data.oMf[index]
         velocity = frame.placement.actInv(data.v[frame.parentJoint])
         rate = frame.placement.actInv(data.a[frame.parentJoint])
         w, v_f = velocity.angular, velocity.linear
         if isinstance(output, RelativePose):
-            seeing = next(i for i, frame in enumerate(model.frames) if frame.name == output.to)
+            seeing = next(
+                i for i, frame in enumerate(model.frames) if frame.name == output.to
+            )
             relative = data.oMf[seeing].inverse() * oMf
             before = was[seeing].T @ was[index]
             y += [relative.translation, pin.log3(before.T @ relative.rotation)]
         elif isinstance(output, FramePose):
-            y += [reference.actInv(oMf.translation), pin.log3(was[index].T @ oMf.rotation)]
+            y += [
+                reference.actInv(oMf.translation),
+                pin.log3(was[index].T @ oMf.rotation),
+            ]
         elif isinstance(output, FrameVelocity):
             y += [w, to_reference @ oMf.rotation @ v_f]
         elif isinstance(output, Gyroscope):
@@ -199,7 +210,13 @@ def test_rigid_body_closed_form():
         R, r = refMb.rotation, refMb.translation
         v_b, w, a_b, w_dot = v[:3], v[3:], a[:3], a[3:]
         g = pin.XYZQUATToSE3(q[:7]).rotation.T @ GRAVITY
-        force = a_b + np.cross(w, v_b) - g + np.cross(w_dot, p) + np.cross(w, np.cross(w, p))
+        force = (
+            a_b
+            + np.cross(w, v_b)
+            - g
+            + np.cross(w_dot, p)
+            + np.cross(w, np.cross(w, p))
+        )
         h = J @ w
         v_p, v_c = v_b + np.cross(w, p), v_b + np.cross(w, c)
         y = [
@@ -244,7 +261,9 @@ def test_rigid_body_closed_form():
 
 def test_body_spinning_about_its_sensors_axis_by_numbers():
     """At 2 rad/s about z, 0.5 m out on x: 2 m/s^2 inwards; g upwards where it stands."""
-    robot = with_sensor(fflin.load("cubesat").model, 1, pin.SE3(E, np.array([0.5, 0.0, 0.0])))
+    robot = with_sensor(
+        fflin.load("cubesat").model, 1, pin.SE3(E, np.array([0.5, 0.0, 0.0]))
+    )
     state = StateMap(robot)
     v = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 2.0])
     data, q, rest = robot.create_data(), robot.neutral(), np.zeros(6)
@@ -266,7 +285,13 @@ def test_laws(name):
     model, data = robot.model, robot.create_data()
     state = StateMap(robot, reference=random_pose(rng, 50.0))
     root = model.names[1]
-    outputs = [CenterOfMass(), Momentum(), FramePose("imu"), FrameVelocity("imu"), Gyroscope(root)]
+    outputs = [
+        CenterOfMass(),
+        Momentum(),
+        FramePose("imu"),
+        FrameVelocity("imu"),
+        Gyroscope(root),
+    ]
     sensing = Sensing(state, outputs)
     rows = {name: index for index, name in enumerate(sensing.names)}
 
@@ -277,11 +302,21 @@ def test_laws(name):
     sensed = sensing.evaluate(data, q, v, a)
     y, rate = sensed.y, sensed.by_q @ v
     linear = y[part("momentum.linear")]
-    assert rate[part("com")] * robot.mass == pytest.approx(linear, abs=1e-12 * robot.mass)
+    assert rate[part("com")] * robot.mass == pytest.approx(
+        linear, abs=1e-12 * robot.mass
+    )
     # A frame's velocity is the rate of its pose, and momentum and velocity are linear in v.
-    assert rate[part("imu.position")] == pytest.approx(y[part("imu.velocity")], abs=1e-12)
-    assert rate[part("imu.rotation")] == pytest.approx(y[part("imu.angular_velocity")], abs=1e-12)
-    moving = [index for name, index in rows.items() if "momentum" in name or "velocity" in name]
+    assert rate[part("imu.position")] == pytest.approx(
+        y[part("imu.velocity")], abs=1e-12
+    )
+    assert rate[part("imu.rotation")] == pytest.approx(
+        y[part("imu.angular_velocity")], abs=1e-12
+    )
+    moving = [
+        index
+        for name, index in rows.items()
+        if "momentum" in name or "velocity" in name
+    ]
     scale = np.abs(y[moving]).max()
     assert sensed.by_v[moving] @ v == pytest.approx(y[moving], abs=1e-13 * scale)
     assert y[part(f"{root}.gyroscope")] == pytest.approx(v[3:6], abs=1e-15)
@@ -289,7 +324,10 @@ def test_laws(name):
     a = pin.aba(model, data, q, v, np.zeros(robot.nv))
     forces = sensed.by_q @ v + sensed.by_v @ a
     kept = part("momentum.angular") + part("momentum.linear")
-    assert np.abs(forces[kept]).max() < 1e-11 * np.abs(sensed.by_v[kept]).max() * np.abs(a).max()
+    assert (
+        np.abs(forces[kept]).max()
+        < 1e-11 * np.abs(sensed.by_v[kept]).max() * np.abs(a).max()
+    )
     # Gyroscope and accelerometer feel no displacement of the base.
     feeling = Sensing(state, [Gyroscope("imu"), Accelerometer("imu")])
     assert not feeling.evaluate(data, q, v, a).by_q[:, :6].any()
@@ -348,7 +386,8 @@ def test_orbit_costs_no_digits(name):
     q_far, v_far, a_far = q.copy(), v.copy(), a.copy()
     q_far[:3] += away
     v_far[:3] = speed
-    a_far[:3] -= np.cross(v[3:6], speed)  # the same motion of the base, seen from its axes
+    # the same motion of the base, seen from its axes
+    a_far[:3] -= np.cross(v[3:6], speed)
     far = sensing.evaluate(robot.create_data(), q_far, v_far, a_far)
     oRr = state.reference.rotation
     oRb = (robot.model.jointPlacements[1] * pin.XYZQUATToSE3(q[:7])).rotation
@@ -358,7 +397,11 @@ def test_orbit_costs_no_digits(name):
     drift = {"velocity": 1.0, "linear": robot.mass}
     for row in range(0, len(sensing.names), 3):
         rows, kind = slice(row, row + 3), sensing.names[row].split(".")[-2]
-        y, by_q, by_v = here.y[rows].copy(), here.by_q[rows].copy(), here.by_v[rows].copy()
+        y, by_q, by_v = (
+            here.y[rows].copy(),
+            here.by_q[rows].copy(),
+            here.by_v[rows].copy(),
+        )
         scale = 1.0
         relative = "/" in sensing.names[row]
         if kind in shift and not relative:
@@ -371,12 +414,17 @@ def test_orbit_costs_no_digits(name):
         elif kind == "acceleration":
             by_v[:, 3:6] -= here.by_a[rows, :3] @ skew(speed)
             scale = SPEED
-        assert np.abs(far.y[rows] - y).max() < 1e-15 * scale * 4 + 1e-14 * np.abs(y).max()
+        assert (
+            np.abs(far.y[rows] - y).max() < 1e-15 * scale * 4 + 1e-14 * np.abs(y).max()
+        )
         # Columns of the joints: not a digit, but of the acceleration that was given.
         tolerance = 1e-11 if kind == "acceleration" else 0.0
         assert np.abs(far.by_q[rows, 6:] - by_q[:, 6:]).max(initial=0.0) <= tolerance
         assert (far.by_v[rows, 6:] == by_v[:, 6:]).all()
-        assert np.abs(far.by_q[rows, :6] - by_q[:, :6]).max() < 1e-15 * scale * 8 + tolerance
+        assert (
+            np.abs(far.by_q[rows, :6] - by_q[:, :6]).max()
+            < 1e-15 * scale * 8 + tolerance
+        )
         assert np.abs(far.by_v[rows, :6] - by_v[:, :6]).max() < 1e-15 * scale * 8
         assert (far.by_a[rows] == here.by_a[rows]).all()
 
@@ -484,7 +532,9 @@ def test_joints_are_a_tuple_of_names():
 def test_relative_pose_of_a_planar_arm_in_closed_form():
     """A joint about y, seen from the one before it."""
     robot = fflin.load("planar_detumble")
-    robot = robot.replace(outputs=[RelativePose(robot.joint_names[1], robot.joint_names[0])])
+    robot = robot.replace(
+        outputs=[RelativePose(robot.joint_names[1], robot.joint_names[0])]
+    )
     joint = robot.joint(robot.joint_names[1])
     arm = robot.model.jointPlacements[robot.model.getJointId(joint.name)].translation
     angle = 0.7
@@ -513,4 +563,6 @@ def test_relative_pose_does_not_see_the_base(degrees):
     assert fflin.check(robot, lin).ok
     # The other way round it is the inverse: p' = -R^T p.
     back = fflin.linearize(robot.replace(outputs=[RelativePose(*frames[::-1])]), q, v)
-    assert np.linalg.norm(back.y0[:3]) == pytest.approx(np.linalg.norm(lin.y0[:3]), rel=1e-13)
+    assert np.linalg.norm(back.y0[:3]) == pytest.approx(
+        np.linalg.norm(lin.y0[:3]), rel=1e-13
+    )

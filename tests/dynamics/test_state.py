@@ -28,7 +28,9 @@ def test_round_trip_is_the_identity(robots, name, frame, degrees):
         x[state.groups.q_m] *= 3.0  # beyond pi
         q, v = state.to_pinocchio(x)
         # A continuous joint is an angle without turns: `near` says which turn is meant.
-        assert np.abs(state.to_state(q, v, near=x) - x).max() < 1e-14 * max(1, np.abs(x).max())
+        assert np.abs(state.to_state(q, v, near=x) - x).max() < 1e-14 * max(
+            1, np.abs(x).max()
+        )
         turns = (state.to_state(q, v) - x) / (2 * np.pi)
         assert np.abs(turns - np.round(turns)).max() < 1e-14 * max(1, np.abs(x).max())
 
@@ -36,7 +38,9 @@ def test_round_trip_is_the_identity(robots, name, frame, degrees):
 def test_default_reference_gives_the_inertial_attitude_and_position():
     robot = fflin.load("cubesat")
     pose = random_pose(np.random.default_rng(2), 70.0)
-    x = fflin.StateMap(robot).to_state(fflin.configuration(robot, base=pose), np.zeros(6))
+    x = fflin.StateMap(robot).to_state(
+        fflin.configuration(robot, base=pose), np.zeros(6)
+    )
     quaternion = pin.Quaternion(pose.rotation).coeffs()
     assert x[:3] == pytest.approx(quaternion[:3] * np.sign(quaternion[3]), abs=1e-15)
     assert x[3:6] == pytest.approx(pose.translation, abs=1e-15)
@@ -81,7 +85,9 @@ def test_velocity_frames_are_what_they_say(frame):
     x = state.to_state(q, v)
     data = robot.model.createData()
     pin.forwardKinematics(robot.model, data, q, v)
-    world = pin.getVelocity(robot.model, data, 1, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
+    world = pin.getVelocity(
+        robot.model, data, 1, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+    )
     in_reference = {
         "omega_b": reference.rotation.T @ world.angular,
         "v_b": reference.rotation.T @ world.linear,
@@ -148,7 +154,9 @@ def test_chart_matrices(degrees):
     """Q^T Q = E - q q^T, det Q = q0 (the source has it inverted), J = 2 Q^-1."""
     rng = np.random.default_rng(7)
     robot = fflin.load("cubesat")
-    chart = fflin.StateMap(robot).chart(fflin.configuration(robot, base=random_pose(rng, degrees)))
+    chart = fflin.StateMap(robot).chart(
+        fflin.configuration(robot, base=random_pose(rng, degrees))
+    )
     assert isinstance(chart, Chart)
     E = np.eye(3)
     Q = 2.0 * chart.N

@@ -14,7 +14,9 @@ from tests.support.weights import unit_weights
 
 def anywhere(robot, rng):
     """A configuration at any turn of the base, both signs of its quaternion, and a velocity."""
-    joints = dict(zip(robot.joint_names, rng.uniform(-3.0, 3.0, size=robot.n), strict=True))
+    joints = dict(
+        zip(robot.joint_names, rng.uniform(-3.0, 3.0, size=robot.n), strict=True)
+    )
     q = fflin.configuration(robot, joints, random_pose(rng, 150.0))
     q[3:7] *= rng.choice([-1.0, 1.0])
     return q, fflin.StateMap(robot).spread(rng.normal(size=6 + robot.n))
@@ -42,7 +44,9 @@ def test_a_small_error_of_a_joint_keeps_its_digits(name):
     for size in (1e-9, 1e-8, 1e-3, 2.0):
         q, v = anywhere(robot, rng)
         apart = size * rng.uniform(-1.0, 1.0, size=robot.n)
-        turned = dict(zip(robot.joint_names, state.joint_positions(q) + apart, strict=True))
+        turned = dict(
+            zip(robot.joint_names, state.joint_positions(q) + apart, strict=True)
+        )
         other = fflin.configuration(robot, turned)
         e = moving_error(state, q, v, other, v)[at]
         np.testing.assert_allclose(e, apart, rtol=0, atol=2e-15)
@@ -67,7 +71,10 @@ def test_rates_tell_the_turns_between_rows():
     state, t = fflin.StateMap(robot), np.linspace(0.0, 2.0, 5)
     rates = np.outer(1.0 + t, (40.0, -60.0, 0.5))
     angles = np.outer(t + 0.5 * t**2, (40.0, -60.0, 0.5))
-    q = [fflin.configuration(robot, dict(zip(robot.joint_names, a, strict=True))) for a in angles]
+    q = [
+        fflin.configuration(robot, dict(zip(robot.joint_names, a, strict=True)))
+        for a in angles
+    ]
     v = np.hstack((np.zeros((5, 6)), rates))
     found = state_history(state, np.array(q), v, t=t)[:, state.groups.q_m]
     np.testing.assert_allclose(found, angles, atol=1e-12)
@@ -98,7 +105,9 @@ def test_cf4_is_the_published_scheme():
     for _ in range(2):  # the work space of the first step does not reach the second
         found_q, found_v = step(f, 1.0, q, v)
         np.testing.assert_allclose(found_q, expected, rtol=0.0, atol=1e-14)
-        np.testing.assert_allclose(found_v, v + h / 6 * (l1 + 2 * l2 + 2 * l3 + l4), atol=1e-14)
+        np.testing.assert_allclose(
+            found_v, v + h / 6 * (l1 + 2 * l2 + 2 * l3 + l4), atol=1e-14
+        )
     assert times[:4] == times[4:8]
 
 
@@ -120,12 +129,20 @@ def test_a_policy_may_keep_what_it_is_given():
         calls.append(len(kept))
 
     fflin.simulate(
-        robot, policy, v0=0.1 * v0, duration=0.05, dt=0.01, disturbance=push, callback=count
+        robot,
+        policy,
+        v0=0.1 * v0,
+        duration=0.05,
+        dt=0.01,
+        disturbance=push,
+        callback=count,
     )
     # Before the run, the functions are called to choose the step. In each step they are called at
     # four stages.
     assert np.diff(calls)[:-1].tolist() == [8] * 4
-    assert all((q == q_then).all() and (v == v_then).all() for q, v, q_then, v_then in kept)
+    assert all(
+        (q == q_then).all() and (v == v_then).all() for q, v, q_then, v_then in kept
+    )
 
 
 def test_a_rotor_may_spin_fast_and_a_link_may_not():
@@ -154,7 +171,9 @@ def test_momentum_is_kept_far_away():
     motion = fflin.simulate(robot, q0=q, v0=0.2 * v, duration=1.0, dt=0.01)
     # Of a place at 7e6 m the digits end at 1e-9 m.
     assert motion.momentum_drift.max() < 1e-9
-    np.testing.assert_allclose(motion.momentum, np.tile(motion.momentum[:1], (101, 1)), atol=1e-8)
+    np.testing.assert_allclose(
+        motion.momentum, np.tile(motion.momentum[:1], (101, 1)), atol=1e-8
+    )
 
 
 def test_energy_counts_gravity_and_springs_from_where_they_are_zero():
@@ -191,7 +210,9 @@ def test_a_loop_that_rotates_past_half_a_turn_says_when():
     # The angle t is the same rotation as t - 2 pi, and q_b is of the shorter one.
     angle = np.mod(motion.t + np.pi, 2.0 * np.pi) - np.pi
     np.testing.assert_allclose(motion.x[:, 2], np.sin(angle / 2.0), atol=1e-12)
-    np.testing.assert_allclose(motion.attitude_error, np.degrees(np.abs(angle)), atol=1e-5)
+    np.testing.assert_allclose(
+        motion.attitude_error, np.degrees(np.abs(angle)), atol=1e-5
+    )
 
 
 def bent(robot):

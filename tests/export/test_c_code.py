@@ -48,7 +48,9 @@ def tracking():
 
 def mixed():
     """A compensator with a direct term, and outputs among which are continuous joints."""
-    robot, lin, by = compensated(fflin.load("cubesat", inputs=fflin.load_inputs("cubesat")))
+    robot, lin, by = compensated(
+        fflin.load("cubesat", inputs=fflin.load_inputs("cubesat"))
+    )
     D = np.random.default_rng(1).normal(size=lin.D.T.shape) * ~lin.D.any(axis=1)
     return robot, fflin.LinearController((by.A, by.B, by.C, D, lin.dt), lin)
 
@@ -126,7 +128,10 @@ def test_limits_are_reached_and_told(kind, tmp_path):
         *exhaustive(
             ("hybrid", ("< 0 ? -1 : 1", "< 0 ? 1 : -1")),
             ("hybrid", ("r[0] * q[3] -", "r[0] * q[3] +")),
-            ("hybrid", ("const controller_real x = two *", "const controller_real x = -two *")),
+            (
+                "hybrid",
+                ("const controller_real x = two *", "const controller_real x = -two *"),
+            ),
             ("world", ("rotate(q, 1", "rotate(q, -1")),
             ("hybrid", ("u[i] -= weight", "u[i] += weight")),
             ("grid", ("upper ? share[a]", "!upper ? share[a]")),
@@ -150,7 +155,12 @@ def test_the_header_names_every_entry(tmp_path):
     robot, by = law("hybrid")
     fflin.write_c(by, tmp_path, name="arm", real="float")  # which is replaced
     header = (fflin.write_c(by, tmp_path, name="arm") / "arm.h").read_text()
-    for name in (*by.lin.state_names, *by.lin.input_names, robot.urdf_sha256, fflin.__version__):
+    for name in (
+        *by.lin.state_names,
+        *by.lin.input_names,
+        robot.urdf_sha256,
+        fflin.__version__,
+    ):
         assert name in header
     assert "typedef double arm_real;" in header
 
@@ -159,9 +169,14 @@ def test_the_code_has_no_state_and_calls_sqrt_alone(tmp_path):
     by = law("grid")[1]
     source = (fflin.write_c(by, tmp_path) / "controller.c").read_text()
     header = (tmp_path / "controller.h").read_text()
-    assert f"K interpolated linearly over {', '.join(by.table()[0])}, constant outside" in header
+    assert (
+        f"K interpolated linearly over {', '.join(by.table()[0])}, constant outside"
+        in header
+    )
     assert not re.search(r"^static (?!const|int|void)", source, re.MULTILINE)
-    called = set(re.findall(r"\b(\w+)\(", re.sub(r"/\*.*?\*/", "", source, flags=re.DOTALL)))
+    called = set(
+        re.findall(r"\b(\w+)\(", re.sub(r"/\*.*?\*/", "", source, flags=re.DOTALL))
+    )
     own = set(re.findall(r"^(?:static )?(?:int|void) (\w+)\(", source, re.MULTILINE))
     assert called - own <= {"sqrt", "if", "for"}
 
@@ -191,9 +206,17 @@ def test_a_simulation_with_the_code_is_the_simulation_without(kind, tmp_path):
         robot, by = law(kind)
     code = fflin.CLaw(fflin.write_c(by, tmp_path, robot=robot))
     joints = dict.fromkeys(robot.joint_names[-1:], 0.2)
-    turned = POSE * pin.SE3(pin.rpy.rpyToMatrix(0.1, 0.2, 0.3), np.array([0.02, 0.0, 0.1]))
-    q0 = robot.neutral() if kind == "schedule" else fflin.configuration(robot, joints, turned)
-    options = {"q0": q0, "duration": 1.0, "dt": 0.01, "engine": "python"} | FLIGHTS[kind]
+    turned = POSE * pin.SE3(
+        pin.rpy.rpyToMatrix(0.1, 0.2, 0.3), np.array([0.02, 0.0, 0.1])
+    )
+    q0 = (
+        robot.neutral()
+        if kind == "schedule"
+        else fflin.configuration(robot, joints, turned)
+    )
+    options = {"q0": q0, "duration": 1.0, "dt": 0.01, "engine": "python"} | FLIGHTS[
+        kind
+    ]
     one, other = (fflin.simulate(robot, each, **options) for each in (by, code))
     scale = 1.0 + np.abs(one.u).max()
     assert np.abs(one.q - other.q).max() < 1e-12
@@ -206,7 +229,9 @@ def test_a_law_from_a_file_needs_its_robot(tmp_path):
     gain = fflin.lqr(fflin.linearize(robot))
     gain.save(tmp_path / "gain.npz")
     loaded = fflin.Gain.load(tmp_path / "gain.npz")
-    one, other = (fflin.write_c(x, tmp_path / f"{k}") for k, x in enumerate((gain, loaded)))
+    one, other = (
+        fflin.write_c(x, tmp_path / f"{k}") for k, x in enumerate((gain, loaded))
+    )
     assert (one / "controller.c").read_bytes() == (other / "controller.c").read_bytes()
     unknown = replace(loaded, robot="of my own")
     with pytest.raises(fflin.InputError, match="robot="):
@@ -241,7 +266,9 @@ def test_what_cannot_be_written_is_refused(change, match, tmp_path):
 
 def test_the_code_is_not_flown_with_another_robot(tmp_path):
     code = fflin.CLaw(fflin.write_c(law("hybrid")[1], tmp_path))
-    with pytest.raises(fflin.InputError, match="the given robot 'planar_detumble' lacks"):
+    with pytest.raises(
+        fflin.InputError, match="the given robot 'planar_detumble' lacks"
+    ):
         code.bind(fflin.load("planar_detumble"))
     with pytest.raises(fflin.FileError, match=r"nowhere: No such file"):
         fflin.CLaw(tmp_path / "nowhere")
@@ -265,7 +292,9 @@ def test_a_gain_from_a_file_keeps_its_pose_and_sample_time(ending, dt, tmp_path)
     gain = fflin.lqr(lin.discretize(dt) if dt else lin)
     gain.save(tmp_path / f"gain.{ending}")
     loaded = fflin.Gain.load(tmp_path / f"gain.{ending}")
-    one, other = (fflin.write_c(x, tmp_path / f"{k}") for k, x in enumerate((gain, loaded)))
+    one, other = (
+        fflin.write_c(x, tmp_path / f"{k}") for k, x in enumerate((gain, loaded))
+    )
     assert fflin.CLaw(other).dt == dt
     in_memory, from_file = (fflin.CLaw(x).bind(robot) for x in (one, other))
     random = np.random.default_rng(4)
@@ -274,12 +303,16 @@ def test_a_gain_from_a_file_keeps_its_pose_and_sample_time(ending, dt, tmp_path)
         q = fflin.configuration(robot, {"joint_3": random.normal()}, POSE * turn)
         v = random.normal(size=robot.nv)
         u = in_memory(0.0, q, v)
-        assert from_file(0.0, q, v) == pytest.approx(u, rel=1e-11, abs=1e-11 * np.abs(u).max())
+        assert from_file(0.0, q, v) == pytest.approx(
+            u, rel=1e-11, abs=1e-11 * np.abs(u).max()
+        )
 
 
 def test_a_gain_from_a_file_is_not_written_for_another_robot(tmp_path):
     robot = fflin.load("planar_detumble")
-    gain = fflin.lqr(fflin.linearize(robot.with_mass_properties({"base": {"mass": 900.0}})))
+    gain = fflin.lqr(
+        fflin.linearize(robot.with_mass_properties({"base": {"mass": 900.0}}))
+    )
     gain.save(tmp_path / "gain.npz")
     loaded = fflin.Gain.load(tmp_path / "gain.npz")
     with pytest.raises(fflin.InputError, match="another URDF or other masses than"):
@@ -299,7 +332,9 @@ def test_a_law_is_not_written_for_another_robot_of_the_same_name(kind, saved, tm
     else:
         v0 = fflin.velocity(robot, {"joint_1": 0.1})
         motion = fflin.simulate(robot, v0=v0, duration=2.0, every=20)
-        by = fflin.tvlqr(fflin.linearize_trajectory(robot, motion.trajectory()), sample=0.1)
+        by = fflin.tvlqr(
+            fflin.linearize_trajectory(robot, motion.trajectory()), sample=0.1
+        )
     if saved:
         by.save(tmp_path / "by.npz")
         by = type(by).load(tmp_path / "by.npz")
@@ -313,7 +348,9 @@ def test_a_law_is_not_written_for_another_robot_of_the_same_name(kind, saved, tm
 
 def test_the_code_is_not_flown_with_other_continuous_joints(tmp_path):
     xml = find_robot("servicer_7dof").path.read_text()
-    (tmp_path / "own.urdf").write_text(xml.replace('type="revolute"', 'type="continuous"'))
+    (tmp_path / "own.urdf").write_text(
+        xml.replace('type="revolute"', 'type="continuous"')
+    )
     robot = fflin.load("servicer_7dof")
     code = fflin.CLaw(fflin.write_c(fflin.lqr(fflin.linearize(robot)), tmp_path / "c"))
     turning = fflin.load(tmp_path / "own.urdf")
@@ -328,7 +365,9 @@ def test_files_of_another_law_or_edited_ones_are_refused(ending, tmp_path):
     robot = fflin.load("planar_detumble")
     lin = fflin.linearize(robot)
     folders = [
-        fflin.write_c(fflin.StateFeedback(lin, k * fflin.lqr(lin).K), tmp_path / f"{k}", real=real)
+        fflin.write_c(
+            fflin.StateFeedback(lin, k * fflin.lqr(lin).K), tmp_path / f"{k}", real=real
+        )
         for k, real in ((1.0, "double"), (2.0, "float"))
     ]
     one, other = (folder / f"controller.{ending}" for folder in folders)
@@ -346,12 +385,16 @@ def test_a_folder_holds_several_laws_and_none_is_lost(tmp_path):
     fflin.write_c(gain, tmp_path)
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
     for law in (by, fflin.lqr(fflin.linearize(fflin.load("cubesat")))):
-        with pytest.raises(fflin.InputError, match=r"controller\.h exists and does not belong to"):
+        with pytest.raises(
+            fflin.InputError, match=r"controller\.h exists and does not belong to"
+        ):
             fflin.write_c(law, tmp_path)
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
     fflin.write_c(fflin.OutputFeedback(lin, by), tmp_path, name="filter")
     fflin.write_c(fflin.lqr(lin, 2.0, 1.0), tmp_path)  # the same gain, tuned again
-    with pytest.raises(fflin.FileError, match="contains the laws controller, filter; choose one"):
+    with pytest.raises(
+        fflin.FileError, match="contains the laws controller, filter; choose one"
+    ):
         fflin.CLaw(tmp_path)
     names = [fflin.CLaw(tmp_path, name=name).name for name in ("controller", "filter")]
     assert names == ["controller", "filter"]
@@ -382,7 +425,10 @@ def test_a_schedule_is_written_again_over_itself(tmp_path):
 def test_folders_that_cannot_be_used_are_one_line(tmp_path, monkeypatch):
     by = law("no joints")[1]
     (tmp_path / "file").touch()
-    for folder, said in (("a" * 300, "File name too long"), ("file/c", "Not a directory")):
+    for folder, said in (
+        ("a" * 300, "File name too long"),
+        ("file/c", "Not a directory"),
+    ):
         with pytest.raises(fflin.FileError, match=said):
             fflin.write_c(by, tmp_path / folder)
         with pytest.raises(fflin.FileError, match=said):
@@ -406,21 +452,29 @@ def test_what_fails_leaves_no_folder(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("real", ["double", "float"])
-def test_invalid_arguments_give_the_inputs_at_the_target_and_a_state_of_zeros(real, tmp_path):
+def test_invalid_arguments_give_the_inputs_at_the_target_and_a_state_of_zeros(
+    real, tmp_path
+):
     robot, by = law("hybrid")
     code = fflin.CLaw(fflin.write_c(by, tmp_path, real=real, limits=0.5))
     library = _compiled(tmp_path / "controller.c", "cc")
     kind = np.float64 if real == "double" else np.float32
     good = measured(StateMap(robot), by.lin.q, by.lin.v).astype(kind)
     u0, seen = np.clip(by.lin.u0, -0.5, 0.5), set()
-    for index, value in product(range(len(good)), (np.nan, np.inf, -np.inf, np.finfo(kind).max)):
+    for index, value in product(
+        range(len(good)), (np.nan, np.inf, -np.inf, np.finfo(kind).max)
+    ):
         given, x, u = (np.full(len(each), 7.0, kind) for each in (good, by.lin.x0, u0))
         given[:] = good
         given[index] = value
         status = library.controller_state(given.ctypes, x.ctypes)
         assert not x.any() if status == 2 else np.isfinite(x).all()
         status = library.controller_step(given.ctypes, u.ctypes)
-        assert u == pytest.approx(u0, abs=1e-12) if status == 2 else (np.abs(u) <= 0.5).all()
+        assert (
+            u == pytest.approx(u0, abs=1e-12)
+            if status == 2
+            else (np.abs(u) <= 0.5).all()
+        )
         seen.add((bool(np.isfinite(value)), status))
     # A finite argument that is too large reaches the limits, or overflows.
     assert seen == {(False, 2), (True, 1), (True, 2)}
@@ -460,7 +514,9 @@ def test_half_a_turn_is_decided_as_in_python(axis, side, about_neutral):
 def test_units_of_a_compensator_are_those_of_its_robot(tmp_path):
     robot = fflin.load("planar_detumble")
     lin = fflin.linearize(robot).discretize(0.1)
-    by = replace(fflin.lqg(fflin.lqr(lin), fflin.kalman(lin, 1e-3, 1e-4)), robot="of my own")
+    by = replace(
+        fflin.lqg(fflin.lqr(lin), fflin.kalman(lin, 1e-3, 1e-4)), robot="of my own"
+    )
     with pytest.raises(fflin.InputError, match="robot="):
         fflin.write_c(by, tmp_path / "none")
     header = (fflin.write_c(by, tmp_path, robot=robot) / "controller.h").read_text()
@@ -477,5 +533,7 @@ def test_a_damaged_folder_is_one_line(change, tmp_path):
     path = tmp_path / "controller.json"
     about_law = json.loads(path.read_text())
     path.write_text(json.dumps({**about_law, **change} if change else []))
-    with pytest.raises(fflin.FileError, match=r"controller\.json: (not a|does not belong)"):
+    with pytest.raises(
+        fflin.FileError, match=r"controller\.json: (not a|does not belong)"
+    ):
         fflin.CLaw(tmp_path)

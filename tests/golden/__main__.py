@@ -13,8 +13,12 @@ def main():
     """Return the exit status: 1 where something differs."""
     parser = argparse.ArgumentParser(prog="python -m tests.golden", description=__doc__)
     what = parser.add_mutually_exclusive_group(required=True)
-    what.add_argument("--check", action="store_true", help="compare both engines with the record")
-    what.add_argument("--write", action="store_true", help="make the record anew, in Python")
+    what.add_argument(
+        "--check", action="store_true", help="compare both engines with the record"
+    )
+    what.add_argument(
+        "--write", action="store_true", help="make the record anew, in Python"
+    )
     parser.add_argument("--engine", choices=ENGINES, help="compare this one alone")
     options = parser.parse_args()
     if options.write:

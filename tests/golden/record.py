@@ -59,7 +59,9 @@ def _condition(lin):
 def _models(name):
     """A, B, f0, C and D at a point in motion in each frame, and K of the LQR at rest."""
     robot = fflin.load(name)
-    robot = robot.replace(outputs=[fflin.FullState(), fflin.CenterOfMass(), fflin.Momentum()])
+    robot = robot.replace(
+        outputs=[fflin.FullState(), fflin.CenterOfMass(), fflin.Momentum()]
+    )
     q, v, u = random_point(robot, np.random.default_rng(1))
     found = {}
     for frame in ("hybrid", "local", "world"):
@@ -91,7 +93,9 @@ def _flown(robot, policy, engine, **options):
     """Rows of a motion, and why it ended."""
     motion = fflin.simulate(robot, policy, **{"linear": False} | options, engine=engine)
     rows = np.linspace(0, len(motion.t) - 1, _ROWS + 1).astype(int)[1:]
-    found = {key: getattr(motion, key)[rows] for key in ("t", "q", "v", "x", "u", "momentum")}
+    found = {
+        key: getattr(motion, key)[rows] for key in ("t", "q", "v", "x", "u", "momentum")
+    }
     largest = np.abs(motion.u).max(axis=0)
     return {
         **found,
@@ -132,12 +136,16 @@ def _forces(engine):
     lin = fflin.linearize(robot)
     K = 0.05 * np.random.default_rng(1).normal(size=lin.B.shape[::-1])
     policy = fflin.StateFeedback(lin, K)
-    return _flown(robot, policy, engine, x0=displaced(lin), duration=2.0, dt=0.02, limits=0.2)
+    return _flown(
+        robot, policy, engine, x0=displaced(lin), duration=2.0, dt=0.02, limits=0.2
+    )
 
 
 def _pulses(engine):
     """On-off thrusters, wheels that saturate, samples and a delay."""
-    jets = [replace(jet, on_off=True, least_impulse=0.004, max=0.3) for jet in JETS[:12]]
+    jets = [
+        replace(jet, on_off=True, least_impulse=0.004, max=0.3) for jet in JETS[:12]
+    ]
     wheels = [
         fflin.ReactionWheel(axis, name=f"w{k}", inertia=0.001, max_speed=8.0, max=0.01)
         for k, axis in enumerate(np.eye(3).tolist())
@@ -146,8 +154,16 @@ def _pulses(engine):
     lin = fflin.linearize(robot)
     K = 0.1 * np.random.default_rng(3).normal(size=lin.B.shape[::-1])
     K[12:, 9:12] = -0.02 * np.eye(3)
-    policy = fflin.StateFeedback(replace(lin.discretize(0.1), u0=0.01 + 0.0 * lin.u0), K)
-    options = {"x0": displaced(lin), "duration": 2.0, "dt": 0.02, "delay": 0.14, "limits": "urdf"}
+    policy = fflin.StateFeedback(
+        replace(lin.discretize(0.1), u0=0.01 + 0.0 * lin.u0), K
+    )
+    options = {
+        "x0": displaced(lin),
+        "duration": 2.0,
+        "dt": 0.02,
+        "delay": 0.14,
+        "limits": "urdf",
+    }
     return _flown(robot, policy, engine, **options)
 
 
@@ -161,10 +177,15 @@ def _stops(engine):
     found = {}
     for name, gain, start in (("diverged", -K, x0), ("left", 0.0 * K, tumbling)):
         policy = fflin.StateFeedback(lin, gain)
-        options = SimulationOptions(robot=robot, policy=policy, x0=start, duration=8.0, dt=0.01)
+        options = SimulationOptions(
+            robot=robot, policy=policy, x0=start, duration=8.0, dt=0.01
+        )
         plan = Plan(options).replace(within_chart=True)
         run = go(plan) if engine == "python" else recorded(plan)
-        found |= {f"{name} stopped": run.stopped.split(" at ")[0], f"{name} rows": len(run.t)}
+        found |= {
+            f"{name} stopped": run.stopped.split(" at ")[0],
+            f"{name} rows": len(run.t),
+        }
     return found
 
 
@@ -172,14 +193,24 @@ def _campaign(engine):
     """64 runs with every kind of dispersion."""
     robot = fflin.load(
         "planar_detumble",
-        inputs=[fflin.BaseTorque(), fflin.BaseForce(), *map(fflin.JointTorque, _JOINTS)],
+        inputs=[
+            fflin.BaseTorque(),
+            fflin.BaseForce(),
+            *map(fflin.JointTorque, _JOINTS),
+        ],
         stiffness={"joint_*": 0.2},
         damping={"joint_*": 0.1},
     )
     lin = fflin.linearize(robot)
     policy = fflin.StateFeedback(lin, coarse(fflin.lqr(lin).K))
     given = {
-        **{"q_b": 0.05, "r_b.x": (-0.1, 0.2), "q_m.*": 0.05, "omega_b": 0.02, "qdot_m": 0.01},
+        **{
+            "q_b": 0.05,
+            "r_b.x": (-0.1, 0.2),
+            "q_m.*": 0.05,
+            "omega_b": 0.02,
+            "qdot_m": 0.01,
+        },
         **{"base.mass": 0.1, "joint_2.com": 0.02, "joint_3.inertia": (-0.2, 0.2)},
         **{"link_1.density": (-0.2, 0.2), "*.gain": {"range": 0.05, "tied": True}},
         **{"tau_b.bias": 0.01, "F_b.x.fails": (0.5, 2.0), "F_b.misalignment": 0.05},
@@ -188,12 +219,27 @@ def _campaign(engine):
     }
     campaign = fflin.monte_carlo(
         *(robot, policy, given),
-        **{"runs": 64, "duration": 3.0, "dt": 0.05, "sample": 0.1, "limits": 4.0, "histories": 4},
+        **{
+            "runs": 64,
+            "duration": 3.0,
+            "dt": 0.05,
+            "sample": 0.1,
+            "limits": 4.0,
+            "histories": 4,
+        },
         **{"goals": ["attitude < 4 deg"], "engine": engine, "threads": 1},
     )
-    found = {key: getattr(campaign, key) for key in ("errors", "largest", "settle", "stop", "end")}
-    some = {key: getattr(campaign, key)[::16] for key in ("drawn", "q", "v", "x", "u", "largest_u")}
-    more = {key: getattr(campaign, key)[::16] for key in ("error_history", "input_history")}
+    found = {
+        key: getattr(campaign, key)
+        for key in ("errors", "largest", "settle", "stop", "end")
+    }
+    some = {
+        key: getattr(campaign, key)[::16]
+        for key in ("drawn", "q", "v", "x", "u", "largest_u")
+    }
+    more = {
+        key: getattr(campaign, key)[::16] for key in ("error_history", "input_history")
+    }
     return {**found, **some, **more, "met": campaign.met("attitude < 4 deg")}
 
 
@@ -206,7 +252,9 @@ def _sweep(engine):
     for name in ("planar_detumble", "canadarm2"):
         robot = fflin.load(name)
         rng = np.random.default_rng(4)
-        points = [random_point(robot, rng) for _ in range(24 if engine == "compiled" else 4)]
+        points = [
+            random_point(robot, rng) for _ in range(24 if engine == "compiled" else 4)
+        ]
         q, v, u = map(np.array, zip(*points, strict=True))
         for kind, given in (("rest", (q,)), ("motion", (q, v, u))):
             batch = fflin.sweep(robot, *given, threads=1)
@@ -226,11 +274,21 @@ def _funnel(engine):
     schedule = replace(schedule, K=coarse(schedule.K), P=coarse(schedule.P))
     reach = fflin.funnel(
         *(robot, schedule, {"attitude": 2.0}),
-        **{"within": {"attitude": 40.0}, "samples": 8, "knots": 3, "dt": 0.05, "limits": 3.0},
+        **{
+            "within": {"attitude": 40.0},
+            "samples": 8,
+            "knots": 3,
+            "dt": 0.05,
+            "limits": 3.0,
+        },
         **{"engine": engine, "threads": 1},
     )
     found = {key: getattr(reach, key) for key in ("t", "tried", "rho", "rate")}
-    return {**found, "outcomes": reach.outcomes.astype(int), "inside": reach.inside.astype(int)}
+    return {
+        **found,
+        "outcomes": reach.outcomes.astype(int),
+        "inside": reach.inside.astype(int),
+    }
 
 
 def _validity(engine):
@@ -240,12 +298,26 @@ def _validity(engine):
     lin = fflin.linearize(robot, q)
     K = coarse(fflin.lqr(lin).K)
     reach = fflin.validity(
-        *(robot, lin, K), attitude=60.0, joint=0.5, samples=8, limits=3.0, engine=engine, threads=1
+        *(robot, lin, K),
+        attitude=60.0,
+        joint=0.5,
+        samples=8,
+        limits=3.0,
+        engine=engine,
+        threads=1,
     )
     error = reach.prediction_error
     return {
-        **{"sampled": reach.sampled, "outcomes": list(reach.outcomes), "inside": reach.inside},
-        **{"prediction error": error, "rate": np.array(reach.rate), "slope": reach.slope},
+        **{
+            "sampled": reach.sampled,
+            "outcomes": list(reach.outcomes),
+            "inside": reach.inside,
+        },
+        **{
+            "prediction error": error,
+            "rate": np.array(reach.rate),
+            "slope": reach.slope,
+        },
         f"{_TOLERANCE}prediction error": 1e-9,
         f"{_TOLERANCE}slope": 1e-6,
     }
@@ -260,7 +332,9 @@ def cases():
         robots += [] if make in (followed, followed_outputs) else ["planar_detumble"]
         for name in robots:
             case = f"policies {make.__name__} {name}"
-            made[case] = lambda engine, make=make, name=name: _policy(make, name, engine)
+            made[case] = lambda engine, make=make, name=name: _policy(
+                make, name, engine
+            )
     whole = (_forces, _pulses, _stops, _campaign, _sweep, _funnel, _validity)
     return made | {each.__name__[1:]: each for each in whole}
 
@@ -301,7 +375,9 @@ def differences(case, engine, golden):
         tolerance = tolerance or TIGHT
         apart = _apart(found[key], golden[f"{case}/{key}"], least)
         if not apart <= tolerance:
-            said.append(f"{case}/{key}: {apart:.2g} apart, expected at most {tolerance:.2g}")
+            said.append(
+                f"{case}/{key}: {apart:.2g} apart, expected at most {tolerance:.2g}"
+            )
     return said
 
 

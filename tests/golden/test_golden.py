@@ -8,7 +8,9 @@ from tests.support.robots import mostly
 
 # Not without numba, and not by engine: models are made in Python.
 # Each policy has a quick case with another robot.
-LONG = [case for case in cases() if case.startswith("policies") and case.endswith("ets_vii")]
+LONG = [
+    case for case in cases() if case.startswith("policies") and case.endswith("ets_vii")
+]
 LONG += ["policies controlled cubesat", "policies controlled_in_samples cubesat"]
 LONG += ["policies shared cubesat", "campaign", "funnel", "validity"]
 QUICK = [case for case in cases() if case not in LONG]

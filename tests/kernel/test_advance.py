@@ -49,7 +49,9 @@ def one_lane(value):
 
 
 def planned(robot, policy=None, faults=None, **options):
-    plan = Plan(SimulationOptions(robot=robot, policy=policy, **{"linear": False} | options))
+    plan = Plan(
+        SimulationOptions(robot=robot, policy=policy, **{"linear": False} | options)
+    )
     if faults is not None:
         plan = plan.replace(plant=Plant(plan.plant.state, faults=faults))
     return plan
@@ -93,7 +95,8 @@ def both(plan, tolerance=1e-10):
     plan = plan.replace(times=plan.times._replace(every=1))
     expected, found = go(plan), advanced(plan)
     if expected.stopped.startswith("diverged"):
-        found = [rows[:-1] for rows in found]  # the end of a diverged run is not recorded
+        # the end of a diverged run is not recorded
+        found = [rows[:-1] for rows in found]
     names = ("q", "v", "u", "momentum", "center")
     for name, value in zip(names, found, strict=True):
         other = getattr(expected, name)
@@ -107,7 +110,10 @@ def both(plan, tolerance=1e-10):
 
 @pytest.mark.parametrize(
     "make",
-    [*(each for each in POLICIES if each is not followed_outputs), *exhaustive(followed_outputs)],
+    [
+        *(each for each in POLICIES if each is not followed_outputs),
+        *exhaustive(followed_outputs),
+    ],
     ids=lambda make: make.__name__,
 )
 def test_the_mechanics_are_those_of_pinocchio_under_every_policy(robots, make):
@@ -119,16 +125,23 @@ def test_the_mechanics_are_those_of_pinocchio_under_every_policy(robots, make):
     assert np.abs(u).max() > 1e-3
 
 
-@pytest.mark.parametrize("make", [outputs, controlled_in_samples, *exhaustive(followed_outputs)])
+@pytest.mark.parametrize(
+    "make", [outputs, controlled_in_samples, *exhaustive(followed_outputs)]
+)
 def test_samples_of_one_step_agree_with_pinocchio(robots, make):
     robot, policy, options = make(plain(robots["ets_vii"]))
     x0 = displaced(fflin.linearize(robot), degrees=20.0)
-    both(planned(robot, policy, **{"x0": x0} | options | {"dt": SAMPLE, "duration": 2.5}))
+    both(
+        planned(robot, policy, **{"x0": x0} | options | {"dt": SAMPLE, "duration": 2.5})
+    )
 
 
 @pytest.mark.parametrize(
     ("make", "dt"),
-    [(followed, 0.4), pytest.param(followed_outputs, SAMPLE, marks=pytest.mark.exhaustive)],
+    [
+        (followed, 0.4),
+        pytest.param(followed_outputs, SAMPLE, marks=pytest.mark.exhaustive),
+    ],
 )
 def test_a_trajectory_that_ends_before_the_run_agrees_with_pinocchio(robots, make, dt):
     robot, policy, options = make(plain(robots["ets_vii"]))
@@ -145,10 +158,14 @@ def test_inputs_that_are_held_between_knots_agree_with_pinocchio(robots, count):
     both(planned(robot, gains, q0=q[0], v0=1.1 * v[0], dt=0.01, duration=0.4))
 
 
-def test_gains_between_grid_points_agree_with_pinocchio_in_all_cells_and_outside(robots):
+def test_gains_between_grid_points_agree_with_pinocchio_in_all_cells_and_outside(
+    robots,
+):
     robot, policy, _ = between_gains(plain(robots["planar_detumble"]))
     x0 = displaced(policy.lin)
-    for x0[6], x0[7] in itertools.product((-0.5, -0.1, 0.1, 0.15, 0.3, 0.6), (-0.4, 0.1, 0.5)):
+    for x0[6], x0[7] in itertools.product(
+        (-0.5, -0.1, 0.1, 0.15, 0.3, 0.6), (-0.4, 0.1, 0.5)
+    ):
         (_, _, u, *_), _ = both(planned(robot, policy, x0=x0, dt=0.02, duration=0.04))
         assert np.abs(u).max() > 1e-3
 
@@ -159,12 +176,16 @@ def test_a_gyroscope_measures_the_rotation_in_the_axes_of_its_own_frame():
     model = random_tree(rng, 3).model.copy()
     frame = pin.Frame("sensor", 3, random_pose(rng, 100.0), pin.FrameType.OP_FRAME)
     sensor = model.addFrame(frame)
-    robot = plain(fflin.from_model(model, name="tree")).replace(outputs=[fflin.Gyroscope("sensor")])
+    robot = plain(fflin.from_model(model, name="tree")).replace(
+        outputs=[fflin.Gyroscope("sensor")]
+    )
     lin = fflin.linearize(robot)
     D = rng.normal(size=(lin.B.shape[1], 3))
     q0, v0, _ = random_point(robot, rng, degrees=40.0, speed=0.1)
     policy = fflin.LinearController(D, lin)
-    (q, v, u, *_), _ = both(planned(robot, policy, q0=q0, v0=v0, dt=0.001, duration=0.002))
+    (q, v, u, *_), _ = both(
+        planned(robot, policy, q0=q0, v0=v0, dt=0.001, duration=0.002)
+    )
     data = robot.create_data()
     pin.forwardKinematics(robot.model, data, q[0], v[0])
     omega = pin.getFrameVelocity(robot.model, data, sensor, pin.LOCAL).angular
@@ -172,23 +193,31 @@ def test_a_gyroscope_measures_the_rotation_in_the_axes_of_its_own_frame():
 
 
 @pytest.mark.parametrize("angle", [3.0, -3.0])
-def test_the_angle_of_a_continuous_joint_is_read_on_the_turn_of_the_target(robots, angle):
+def test_the_angle_of_a_continuous_joint_is_read_on_the_turn_of_the_target(
+    robots, angle
+):
     robot = plain(robots["planar_detumble"])
     targets = {"joint_1": angle, "joint_2": -angle}
     lin = fflin.linearize(robot, fflin.configuration(robot, targets))
     policy, x0 = fflin.StateFeedback(lin, fflin.lqr(lin).K), lin.x0.copy()
     x0[6:8] += np.copysign(0.5, (angle, -angle))
     (_, _, u, *_), _ = both(planned(robot, policy, x0=x0, dt=0.02, duration=0.2))
-    assert u[0] == pytest.approx(lin.u0 - policy.K @ (x0 - lin.x0), rel=1e-10, abs=1e-12)
+    assert u[0] == pytest.approx(
+        lin.u0 - policy.K @ (x0 - lin.x0), rel=1e-10, abs=1e-12
+    )
 
 
 @pytest.mark.parametrize("every", [0, 1, 3])
-def test_a_run_does_not_depend_on_its_slices_and_on_the_rows_that_are_recorded(robots, every):
+def test_a_run_does_not_depend_on_its_slices_and_on_the_rows_that_are_recorded(
+    robots, every
+):
     robot, policy, options = outputs(plain(robots["planar_detumble"]))
     x0 = displaced(fflin.linearize(robot))
     plan = planned(robot, policy, x0=x0, duration=0.35, **options)
     whole = advanced(plan)
-    for rows, expected in zip(advanced(plan, None, every, (1, 9, 20)), whole, strict=True):
+    for rows, expected in zip(
+        advanced(plan, None, every, (1, 9, 20)), whole, strict=True
+    ):
         kept = expected[:-1:every] if every else expected[:0]
         assert np.array_equal(rows, np.vstack((kept, expected[-1:])))
 
@@ -202,7 +231,13 @@ def test_inputs_are_the_clipped_commands_of_the_sample_that_is_delayed(frame, de
     policy = fflin.StateFeedback(lin, fflin.lqr(lin).K)
     x0 = displaced(lin, degrees=60.0)
     limits = {"tau_b": (-0.02, 0.03)}
-    options = {"dt": 0.02, "sample": 0.1, "delay": delay, "duration": 0.6, "limits": limits}
+    options = {
+        "dt": 0.02,
+        "sample": 0.1,
+        "delay": delay,
+        "duration": 0.6,
+        "limits": limits,
+    }
     plan = planned(robot, policy, x0=x0, **options)
     (q, v, u, *_), _ = both(plan)
     late, low, high = round(delay / 0.02), *np.tile([[-np.inf], [np.inf]], u.shape[1])
@@ -243,7 +278,9 @@ def test_springs_gravity_wheels_and_faulty_actuators_agree_with_pinocchio(method
     lin = fflin.linearize(robot, reference=HOME)
     size = lin.B.shape[1]
     policy = fflin.StateFeedback(lin, 0.05 * rng.normal(size=lin.B.shape[::-1]))
-    turn = np.concatenate([pin.exp3(0.1 * rng.normal(size=3)).ravel("F") for _ in range(2)])
+    turn = np.concatenate(
+        [pin.exp3(0.1 * rng.normal(size=3)).ravel("F") for _ in range(2)]
+    )
     gain, bias = 1.0 + 0.1 * rng.normal(size=size), 0.1 * rng.normal(size=size)
     until = np.where(np.arange(size) % 4 == 3, 0.1, np.inf)
     faults = ActuatorFaults(gain, bias, until, turn)
@@ -255,11 +292,15 @@ def test_springs_gravity_wheels_and_faulty_actuators_agree_with_pinocchio(method
 
 def test_a_body_moves_by_newtons_law_until_its_thrust_fails():
     """The centre of mass accelerates by g + F / m until the failure, and then by g."""
-    robot = free_body((2.0, 3.0, 4.0)).replace(inputs=[fflin.BaseForce()], gravity=(0.1, 0.2, -0.3))
+    robot = free_body((2.0, 3.0, 4.0)).replace(
+        inputs=[fflin.BaseForce()], gravity=(0.1, 0.2, -0.3)
+    )
     m, g, until, dt = robot.mass, np.array(robot.gravity), 0.2, 0.02
     force, start = np.array([5.0, -7.0, 11.0]), np.array([0.3, -0.2, 0.1])
     faults = ActuatorFaults(np.ones(3), force, np.full(3, until), np.eye(3).ravel())
-    q0 = np.array([1.0, 2.0, 3.0, *np.sin(0.3) * np.array([0.6, 0.0, 0.8]), np.cos(0.3)])
+    q0 = np.array(
+        [1.0, 2.0, 3.0, *np.sin(0.3) * np.array([0.6, 0.0, 0.8]), np.cos(0.3)]
+    )
     v0 = np.zeros(6)
     R = pin.Quaternion(q0[3:]).matrix()
     v0[:3] = R.T @ start
@@ -302,7 +343,9 @@ def test_a_run_ends_at_the_same_step_as_in_the_python_engine(how, said, toleranc
     lin = fflin.linearize(robot)
     x0, gain = how(lin)
     policy = fflin.StateFeedback(lin, gain * fflin.lqr(lin).K)
-    plan = planned(robot, policy, x0=x0, dt=0.05, duration=20.0).replace(within_chart=True)
+    plan = planned(robot, policy, x0=x0, dt=0.05, duration=20.0).replace(
+        within_chart=True
+    )
     (q, *_), stopped = both(plan, tolerance)
     assert stopped.startswith(said) and 3 < len(q) < 400
 
@@ -310,7 +353,9 @@ def test_a_run_ends_at_the_same_step_as_in_the_python_engine(how, said, toleranc
 @pytest.mark.parametrize("sign", [1.0, *exhaustive(-1.0)])
 def test_a_free_spin_leaves_the_chart_at_half_a_turn(sign):
     """A body at the angle a with the rate w is at a + w t, up to 180 deg from the reference."""
-    robot = free_body((2.0, 3.0, 4.0)).replace(inputs=[fflin.BaseTorque(), fflin.BaseForce()])
+    robot = free_body((2.0, 3.0, 4.0)).replace(
+        inputs=[fflin.BaseTorque(), fflin.BaseForce()]
+    )
     lin = fflin.linearize(robot, reference=HOME)
     policy = fflin.StateFeedback(lin, np.zeros(lin.B.shape[::-1]))
     a, w, dt = 1.0, sign * 0.7, 0.05
@@ -334,13 +379,19 @@ def test_a_run_diverges_at_the_rotation_per_step_that_is_too_large(axis):
     faults = ActuatorFaults(np.ones(3), torque, np.full(3, 9.0), np.eye(3).ravel())
     plan = planned(robot, None, faults, dt=0.05, duration=9.0)
     (_, v, *_), stopped = both(plan)
-    assert stopped.startswith("diverged at t = 4.95 s")  # 1 rad / 0.05 s is reached at 4.94 s
+    # 1 rad / 0.05 s is reached at 4.94 s
+    assert stopped.startswith("diverged at t = 4.95 s")
     assert "rotates by 1 rad per step" in stopped
     assert v[:, 3 + axis] == pytest.approx(-4.05 * 0.05 * np.arange(99), rel=1e-12)
 
 
 def test_the_message_of_an_end_has_the_index_of_its_reason():
-    messages = ("", "diverged at t = 1 s", "left the chart at t = 1 s", "event at t = 1 s")
+    messages = (
+        "",
+        "diverged at t = 1 s",
+        "left the chart at t = 1 s",
+        "event at t = 1 s",
+    )
     assert [STOPS[stop_of(message)] for message in messages] == list(STOPS)
 
 
@@ -355,11 +406,17 @@ def test_momentum_is_constant_and_the_centre_of_mass_moves_along_a_line(seed):
     q, v, _, momentum, relative = advanced(plan, about)
     data, kept, center = robot.create_data(), [], []
     for point in zip(q, v, strict=True):
-        kept.append(pin.computeCentroidalMomentum(robot.model, data, *point).vector.copy())
+        kept.append(
+            pin.computeCentroidalMomentum(robot.model, data, *point).vector.copy()
+        )
         center.append(data.com[0].copy())
     line = center[0] + np.outer(0.02 * np.arange(len(q)), kept[0][:3] / robot.mass)
     assert np.array(center) == pytest.approx(line, abs=1e-12)
-    assert np.array(kept) == pytest.approx(np.tile(kept[0], (len(q), 1)), rel=1e-12, abs=1e-11)
+    assert np.array(kept) == pytest.approx(
+        np.tile(kept[0], (len(q), 1)), rel=1e-12, abs=1e-11
+    )
     assert relative == pytest.approx(np.array(center) - about, abs=1e-12)
     kept[0][3:] += np.cross(center[0] - about, kept[0][:3])
-    assert momentum == pytest.approx(np.tile(kept[0], (len(q), 1)), rel=1e-12, abs=1e-11)
+    assert momentum == pytest.approx(
+        np.tile(kept[0], (len(q), 1)), rel=1e-12, abs=1e-11
+    )

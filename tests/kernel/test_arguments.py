@@ -59,8 +59,20 @@ def test_every_kind_of_field_is_read_where_it_stands():
     @numba.njit
     def read(words):
         of = opened(words)
-        whole = (of.count, of.table[1, 2], of.indices[1], len(of.inner.values), of.table.shape[1])
-        real = (of.reals[1], of.lanes[1, 7], of.inner.share, of.more.share, of.more.values[2])
+        whole = (
+            of.count,
+            of.table[1, 2],
+            of.indices[1],
+            len(of.inner.values),
+            of.table.shape[1],
+        )
+        real = (
+            of.reals[1],
+            of.lanes[1, 7],
+            of.inner.share,
+            of.more.share,
+            of.more.values[2],
+        )
         return whole, real, (of.on, of.flags[1], of.flags[2])
 
     value, words, _ = laid_out(VALUE, OUTER)
@@ -89,17 +101,24 @@ def test_what_is_written_in_compiled_code_stands_in_the_arrays():
 
 
 def test_arrays_are_converted_to_their_kind_or_refused():
-    for reals in (np.array([0.5, 2.0], np.float32), np.array([0.5, 9.0, 2.0, 9.0])[::2]):
+    for reals in (
+        np.array([0.5, 2.0], np.float32),
+        np.array([0.5, 9.0, 2.0, 9.0])[::2],
+    ):
         value, words, _ = laid_out(VALUE._replace(reals=reals), OUTER)
         assert value.reals.dtype == float and value.reals.flags.c_contiguous
-        assert value.reals.tolist() == [0.5, 2.0] and words[2] == value.reals.ctypes.data
+        assert (
+            value.reals.tolist() == [0.5, 2.0] and words[2] == value.reals.ctypes.data
+        )
     with pytest.raises(AssertionError):
         laid_out(VALUE._replace(reals=np.zeros((2, 1))), OUTER)
 
 
 def test_an_empty_value_has_all_fields():
     value, words, fresh = laid_out(empty(OUTER), OUTER)
-    assert value.count == 0 and value.lanes.shape == (0, 8) and value.table.shape == (0, 0)
+    assert (
+        value.count == 0 and value.lanes.shape == (0, 8) and value.table.shape == (0, 0)
+    )
     assert len(words) == OUTER.size == 20 and len(fresh) == 1
 
 

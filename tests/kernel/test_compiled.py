@@ -35,7 +35,9 @@ def compiled(monkeypatch, tmp_path, signatures):
     """A function of the kernel that keeps its code in a folder of its own."""
     from fflin.kernel import machine_code
 
-    new = SimpleNamespace(stats=SimpleNamespace(cache_path=tmp_path), compile=signatures.append)
+    new = SimpleNamespace(
+        stats=SimpleNamespace(cache_path=tmp_path), compile=signatures.append
+    )
     monkeypatch.setattr(machine_code, "translated", lambda function, how: new)
     kernel_code._prepared.cache_clear()
     yield new
@@ -43,7 +45,9 @@ def compiled(monkeypatch, tmp_path, signatures):
 
 
 @pytest.mark.compiled
-def test_compilation_is_announced_once_for_all_threads(compiled, caplog, tmp_path, signatures):
+def test_compilation_is_announced_once_for_all_threads(
+    compiled, caplog, tmp_path, signatures
+):
     ready = Barrier(4)
 
     def ask():
@@ -65,7 +69,9 @@ def test_compilation_is_announced_once_for_all_threads(compiled, caplog, tmp_pat
 
 
 @pytest.mark.compiled
-def test_a_thread_that_waits_for_another_names_no_process(compiled, caplog, tmp_path, monkeypatch):
+def test_a_thread_that_waits_for_another_names_no_process(
+    compiled, caplog, tmp_path, monkeypatch
+):
     began, told, asked = Event(), Event(), []
 
     def compile(signature):
@@ -90,7 +96,9 @@ def test_a_thread_that_waits_for_another_names_no_process(compiled, caplog, tmp_
 
 @pytest.mark.compiled
 @pytest.mark.parametrize("older", [False, True])
-def test_code_that_is_older_than_any_source_is_not_taken(compiled, caplog, tmp_path, older):
+def test_code_that_is_older_than_any_source_is_not_taken(
+    compiled, caplog, tmp_path, older
+):
     kept = tmp_path / f"derivatives.derive-1.{kernel_code.VERSION}.nbi"
     kept.write_bytes(b"")
     sources = Path(kernel_code.__file__).parent.glob("*.py")
@@ -119,7 +127,9 @@ def test_machine_code_is_found_where_numba_keeps_it(monkeypatch, tmp_path):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     assert not kernel_code.is_kept("loop", "advance")
     (tmp_path / "kernel_0").mkdir()
-    (tmp_path / "kernel_0" / f"loop.advance-1.{kernel_code.VERSION}.nbi").write_bytes(b"")
+    (tmp_path / "kernel_0" / f"loop.advance-1.{kernel_code.VERSION}.nbi").write_bytes(
+        b""
+    )
     assert kernel_code.is_kept("loop", "advance")
     assert not kernel_code.is_kept("loop", "another")
     monkeypatch.setattr(kernel_code, "VERSION", "py39")
@@ -162,18 +172,32 @@ def test_one_set_of_machine_code_serves_every_robot_policy_and_option(robots, na
         if make is between_gains and not robots[name].n:
             continue
         robot, policy, options = make(plain(robots[name]))
-        options = {"dt": 0.05, "engine": "compiled"} | options | {"duration": 0.1, "linear": False}
+        options = (
+            {"dt": 0.05, "engine": "compiled"}
+            | options
+            | {"duration": 0.1, "linear": False}
+        )
         for most in (None, 0.5):
             fflin.simulate(robot, policy, **options, limits=most)
-    wheel = fflin.ReactionWheel((0, 0, 1), name="w", inertia=1e-4, max_speed=30.0, max=0.5)
+    wheel = fflin.ReactionWheel(
+        (0, 0, 1), name="w", inertia=1e-4, max_speed=30.0, max=0.5
+    )
     jets = [replace(jet, on_off=True, max=0.3) for jet in JETS]
     robot = robots[name].replace(inputs=[*jets, wheel], gravity=(0.0, 0.1, 0.0))
     lin = fflin.linearize(robot)
     law = fflin.StateFeedback(lin, np.zeros(lin.B.shape[::-1]))
     given = {"*.mass": 0.1, "q_b.sensor": 1e-3, "*.noise": 1e-3, "delay": [0.0, 0.1]}
-    options = {"runs": 9, "duration": 0.4, "dt": 0.05, "sample": 0.1, "engine": "compiled"}
+    options = {
+        "runs": 9,
+        "duration": 0.4,
+        "dt": 0.05,
+        "sample": 0.1,
+        "engine": "compiled",
+    }
     fflin.monte_carlo(robot, law, given, limits="urdf", **options, threads=1)
-    fflin.monte_carlo(robots[name], None, {"q_b": 0.1}, runs=1, duration=0.1, engine="compiled")
+    fflin.monte_carlo(
+        robots[name], None, {"q_b": 0.1}, runs=1, duration=0.1, engine="compiled"
+    )
     assert [len(each.signatures) for each in (advance, take)] == [1, 1]
 
 
@@ -193,7 +217,9 @@ def test_a_terminal_shows_the_seconds_of_a_compilation(monkeypatch):
 
 
 @pytest.mark.compiled
-def test_code_that_cannot_be_stored_is_compiled_and_told_once(compiled, caplog, signatures):
+def test_code_that_cannot_be_stored_is_compiled_and_told_once(
+    compiled, caplog, signatures
+):
     compiled.stats.cache_path = None
     kernel_code._said_unstored.clear()
     found = kernel_code.kernel("derivatives", "derive")

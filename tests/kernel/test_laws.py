@@ -23,7 +23,9 @@ def acting(limits, commands, delay=0, nu=None, initial=None, channels=None):
     The channel is appended to `channels`.
     """
     size = commands.shape[1]
-    channel = channel_of(limits, np.zeros(size) if initial is None else initial, SAMPLE, delay)
+    channel = channel_of(
+        limits, np.zeros(size) if initial is None else initial, SAMPLE, delay
+    )
     rows = []
     for step in range(SAMPLE * len(commands)):
         u = commands[step // SAMPLE].copy()
@@ -53,7 +55,11 @@ def pulsed(on_off, most, least):
 @pytest.mark.parametrize("delay", [0, 1, 4, 7])
 def test_the_impulse_of_a_held_sample_is_that_of_its_clipped_command(delay):
     rng = np.random.default_rng(delay)
-    low, high, initial = np.array([-1.0, -0.5]), np.array([0.4, 2.0]), np.array([0.1, -0.9])
+    low, high, initial = (
+        np.array([-1.0, -0.5]),
+        np.array([0.4, 2.0]),
+        np.array([0.1, -0.9]),
+    )
     commands = rng.uniform(-3.0, 3.0, size=(6, 2))
     u = acting(Saturation(low, high), commands, delay, initial=initial)
     assert u[:delay] == pytest.approx(np.tile([0.1, -0.5], (delay, 1)), abs=0.0)
@@ -72,11 +78,15 @@ def test_pulses_fire_the_impulse_of_the_commands_but_for_what_is_left(on_off):
     wanted = SAMPLE * DT * commands[:, 0].cumsum()
     fired = DT * u.cumsum()[SAMPLE - 1 :: SAMPLE]
     # Nothing is lost or made: what is not fired yet is left, at most a pulse of it.
-    assert channels[0].pulses.left[0] == pytest.approx(wanted[-1] - fired[-1], abs=1e-12)
+    assert channels[0].pulses.left[0] == pytest.approx(
+        wanted[-1] - fired[-1], abs=1e-12
+    )
     # Only impulses below the least impulse wait for the next sample.
     assert np.abs(wanted - fired).max() <= least + 1e-12
     of_samples = DT * u.reshape(-1, SAMPLE).sum(axis=1)
-    assert ((of_samples == 0.0) | (of_samples >= least - 1e-12)).all() and (of_samples > 0.0).any()
+    assert ((of_samples == 0.0) | (of_samples >= least - 1e-12)).all() and (
+        of_samples > 0.0
+    ).any()
     if on_off:
         # A pulse has the full thrust, except in the step in which it ends.
         pulses = u.reshape(-1, SAMPLE)
@@ -88,10 +98,14 @@ def test_pulses_fire_the_impulse_of_the_commands_but_for_what_is_left(on_off):
 @pytest.mark.parametrize("on_off", [False, True])
 def test_the_command_above_the_largest_thrust_is_not_fired_later(on_off):
     u = acting(pulsed(on_off, 2.0, 0.0), np.array([[5.0], [0.0]]))
-    assert u == pytest.approx(2.0 * np.repeat([[1.0], [0.0]], SAMPLE, axis=0), abs=1e-15)
+    assert u == pytest.approx(
+        2.0 * np.repeat([[1.0], [0.0]], SAMPLE, axis=0), abs=1e-15
+    )
 
 
-@pytest.mark.parametrize(("factor", "fires"), [(1.0 - 1e-10, True), (1.0 - 1e-8, False)])
+@pytest.mark.parametrize(
+    ("factor", "fires"), [(1.0 - 1e-10, True), (1.0 - 1e-8, False)]
+)
 def test_a_thruster_fires_its_least_impulse_despite_a_rounding_error(factor, fires):
     command = np.array([[factor * 0.15 / (SAMPLE * DT)]])
     assert (acting(pulsed(False, 2.0, 0.15), command) > 0.0).all() == fires
@@ -105,7 +119,9 @@ def test_pulses_begin_only_in_lanes_in_which_a_command_arrives():
             value[:] = 0.3
         channel.fresh[:] = fresh
         rules._begin_pulses(channel, SAMPLE, np.ones(1))
-        expected = (0.0, 0.3 / (SAMPLE * DT) + 1.0, 2.0 * SAMPLE) if fresh else (0.3,) * 3
+        expected = (
+            (0.0, 0.3 / (SAMPLE * DT) + 1.0, 2.0 * SAMPLE) if fresh else (0.3,) * 3
+        )
         assert np.ravel(values) == pytest.approx(expected, abs=1e-15)
 
 
@@ -131,11 +147,14 @@ def test_a_wheel_spins_up_by_its_torque_to_its_largest_speed_and_no_further(aske
     u = acting(limits, commands, nu=speed)
     w = DT / inertia * u.cumsum()
     edge = speeds[asked > 0.0]
-    assert u[0] == torques[asked > 0.0] and w[2] == pytest.approx(u[0, 0] * 3 * DT / inertia)
+    assert u[0] == torques[asked > 0.0] and w[2] == pytest.approx(
+        u[0, 0] * 3 * DT / inertia
+    )
     assert w[3 * SAMPLE - 1] == pytest.approx(edge, rel=1e-12)
     assert (np.abs(w) <= abs(edge) * (1.0 + 1e-12)).all()
     assert u[3 * SAMPLE - 1] == pytest.approx(0.0, abs=1e-12)
-    assert u[3 * SAMPLE] == torques[asked < 0.0]  # away from its limit a wheel has all its torque
+    # away from its limit a wheel has all its torque
+    assert u[3 * SAMPLE] == torques[asked < 0.0]
 
 
 def test_a_wheel_beyond_its_speed_is_only_slowed_down():
@@ -153,7 +172,9 @@ def test_a_faulty_input_has_a_gain_a_bias_and_turned_axes_until_it_fails():
     turns = [pin.exp3(rng.normal(size=3)) for _ in range(2)]
     until, given = np.full(7, 9.0), np.empty(7)
     until[1] = 2.025  # within the step from 2.0
-    faults = ActuatorFaults(gain, bias, until, np.concatenate([R.ravel("F") for R in turns]))
+    faults = ActuatorFaults(
+        gain, bias, until, np.concatenate([R.ravel("F") for R in turns])
+    )
     fractions = {1.9: 1.0, 2.0: 0.25, 2.1: 0.0}
     for t, fraction in fractions.items():
         expected = gain * u + bias
@@ -172,8 +193,11 @@ def test_an_allocation_meets_the_conditions_of_karush_kuhn_and_tucker(seed):
     A, b = rng.normal(size=(size, count)), 10.0 ** (seed % 3) * rng.normal(size=size)
     least, most = -rng.uniform(0.0, 0.4, size=count), rng.uniform(0.05, 0.4, size=count)
     least[::3] = 0.0  # of thrusters, which cannot pull
-    least[1], least[4] = 0.02, most[4]  # an input that cannot be zero, and a constant one
-    problem = least_squares(least, most, size)._replace(columns=np.append(A.T.ravel(), b))
+    # an input that cannot be zero, and a constant one
+    least[1], least[4] = 0.02, most[4]
+    problem = least_squares(least, most, size)._replace(
+        columns=np.append(A.T.ravel(), b)
+    )
     solve(problem, size, 0)
     u, unit, force = np.array(problem.x), np.linalg.norm(A), np.linalg.norm(b)
     assert (u >= least).all() and (u <= most).all()
@@ -198,7 +222,9 @@ def test_an_allocation_that_can_realise_the_force_is_the_smallest(seed):
     least, most = -rng.uniform(0.2, 1.0, size=count), rng.uniform(0.2, 1.0, size=count)
     least[::2] = 0.0
     b = A @ rng.uniform(least, most)
-    problem = least_squares(least, most, size)._replace(columns=np.append(A.T.ravel(), b))
+    problem = least_squares(least, most, size)._replace(
+        columns=np.append(A.T.ravel(), b)
+    )
     solve(problem, size, 0)
     u = np.array(problem.x)
     free = (u > least + 1e-9) & (u < most - 1e-9)
@@ -209,7 +235,9 @@ def test_an_allocation_that_can_realise_the_force_is_the_smallest(seed):
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_an_allocation_never_leaves_its_bounds_and_its_cost_never_grows(seed, monkeypatch):
+def test_an_allocation_never_leaves_its_bounds_and_its_cost_never_grows(
+    seed, monkeypatch
+):
     """The cost ``|A x - b|^2 + LEAST^2 |x|^2`` and the bounds, at each step of the solver."""
     rng = np.random.default_rng(seed)
     size, count, seen, fit = 6, 12, [], allocation._fit
@@ -237,7 +265,9 @@ def test_an_allocation_never_leaves_its_bounds_and_its_cost_never_grows(seed, mo
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_inputs_with_equal_forces_get_equal_fractions_of_a_force_that_is_too_large(seed):
+def test_inputs_with_equal_forces_get_equal_fractions_of_a_force_that_is_too_large(
+    seed,
+):
     rng = np.random.default_rng(seed)
     A, b = rng.normal(size=(6, 8)), rng.normal(size=6)
     least, most = np.zeros(8), rng.uniform(0.02, 0.2, size=8)
@@ -252,19 +282,26 @@ def test_an_allocation_of_no_force_has_no_force_and_an_allocation_of_nan_is_nan(
     rng = np.random.default_rng(2)
     A, most = rng.normal(size=(6, 9)), np.full(9, 0.5)
     assert (nearest(A, np.zeros(6), -most, most) == 0.0).all()
-    least = np.append(0.1, -most[1:])  # the first input cannot be zero, and the others balance it
+    # the first input cannot be zero, and the others balance it
+    least = np.append(0.1, -most[1:])
     u = nearest(A, np.zeros(6), least, most)
-    assert u[0] == pytest.approx(0.1, rel=1e-12) and A @ u == pytest.approx(np.zeros(6), abs=1e-12)
+    assert u[0] == pytest.approx(0.1, rel=1e-12) and A @ u == pytest.approx(
+        np.zeros(6), abs=1e-12
+    )
     assert np.isnan(nearest(A, np.append(np.zeros(5), np.nan), least, most)).all()
     # Inputs without effect are as near to zero as their bounds allow.
-    assert (nearest(np.zeros((6, 9)), np.ones(6), least, most) == np.maximum(least, 0.0)).all()
+    assert (
+        nearest(np.zeros((6, 9)), np.ones(6), least, most) == np.maximum(least, 0.0)
+    ).all()
     assert (nearest(np.zeros((6, 9)), np.zeros(6), -most, most) == 0.0).all()
 
 
 def test_an_allocation_to_inputs_at_their_bounds_ends_after_few_steps(monkeypatch):
     """Rounding errors return an input to its bound, and the solver must not release it again."""
     rng, fit, calls = np.random.default_rng(1), allocation._fit, []
-    monkeypatch.setattr(allocation, "_fit", lambda *given: (calls.append(1), fit(*given)))
+    monkeypatch.setattr(
+        allocation, "_fit", lambda *given: (calls.append(1), fit(*given))
+    )
     for _ in range(4000):
         count = int(rng.integers(1, 7))
         A = np.rint(1.5 * rng.normal(size=(6, count)))
@@ -278,7 +315,12 @@ def test_an_allocation_to_inputs_at_their_bounds_ends_after_few_steps(monkeypatc
 def test_loops_that_are_compiled_agree_with_the_functions_of_numpy_that_they_replace():
     rng = np.random.default_rng(0)
     Q = np.linalg.qr(rng.normal(size=(5, 3)))[0].T.ravel()
-    a, b, x, empty = rng.normal(size=12), rng.normal(size=12), rng.normal(size=5), np.zeros(6)
+    a, b, x, empty = (
+        rng.normal(size=12),
+        rng.normal(size=12),
+        rng.normal(size=5),
+        np.zeros(6),
+    )
     given = {
         allocation.row_product: (a, 2, b, 3, 5),
         allocation.add_row: (a, 2, 0.7, b, 3, 5),
@@ -289,7 +331,9 @@ def test_loops_that_are_compiled_agree_with_the_functions_of_numpy_that_they_rep
     for function, arguments in given.items():
         ends = []
         for each in (function, vec.IN_PLACE[function]):
-            copies = [np.array(value) if np.ndim(value) else value for value in arguments]
+            copies = [
+                np.array(value) if np.ndim(value) else value for value in arguments
+            ]
             result = each(*copies)
             ends.append(np.hstack([*copies, 0.0 if result is None else result]))
         assert ends[0] == pytest.approx(ends[1], abs=1e-14)
@@ -302,7 +346,9 @@ def test_a_run_goes_on_within_its_speeds_and_its_chart():
 
     def at(angle, *rates, sign=1.0):
         q = np.append(np.zeros(3), (0.0, 0.0, np.sin(angle / 2.0), np.cos(angle / 2.0)))
-        return bool(goes_on(StopConditions(bounds**2, [sign]), origin, q, np.array(rates)))
+        return bool(
+            goes_on(StopConditions(bounds**2, [sign]), origin, q, np.array(rates))
+        )
 
     for rates, expected in (
         ((1.9, -2.9), True),

@@ -22,7 +22,9 @@ INPUTS = {"tau_b": slice(0, 3), "F_b": slice(3, 6), "tau_m": slice(6, None)}
 def moving(request):
     robot = fflin.load("servicer_7dof")
     point = random_point(robot, np.random.default_rng(1), degrees=50.0)
-    lin = fflin.linearize(robot, *point, frame=request.param, reference=pin.SE3.Identity())
+    lin = fflin.linearize(
+        robot, *point, frame=request.param, reference=pin.SE3.Identity()
+    )
     return robot, lin, fflin.StateMap(robot, frame=request.param).groups._asdict()
 
 
@@ -49,7 +51,9 @@ def test_planted_error_is_found_in_its_block(moving, row, column):
     by = {row.test for row in found.failures if row.block == block}
     assert {"ABA derivatives", "differences"} <= by
     # Where B's block is wrong so is M^-1; no other block of A or B is accused.
-    others = {r.block for r in found.failures if r.test in ("ABA derivatives", "differences")}
+    others = {
+        r.block for r in found.failures if r.test in ("ABA derivatives", "differences")
+    }
     assert others == {block}
     assert not found.ok
     assert f"{block} (" in str(found) and "FAILED" in str(found)
@@ -67,7 +71,9 @@ def test_flipped_sign_of_any_nonzero_block_is_found(moving, matrix):
             if (array == getattr(lin, matrix)).all():
                 continue
             found = fflin.check(robot, replace(lin, **{matrix: array}))
-            assert f"{matrix}[{row}, {column}]" in {failure.block for failure in found.failures}
+            assert f"{matrix}[{row}, {column}]" in {
+                failure.block for failure in found.failures
+            }
             flipped += 1
     assert flipped >= (10 if matrix == "A" else 9)
 
@@ -79,14 +85,18 @@ def test_wrong_point_is_found():
         vector = getattr(lin, name).copy()
         vector[7] += 1e-6
         found = fflin.check(robot, replace(lin, **{name: vector}))
-        assert {"x0": "x0", "f0": "f0[q_m]"}[name] in {row.block for row in found.failures}
+        assert {"x0": "x0", "f0": "f0[q_m]"}[name] in {
+            row.block for row in found.failures
+        }
 
 
 def test_model_of_another_inertia_is_found():
     """The matrices of one robot do not pass as those of another with the same joints."""
     robot = fflin.load("ets_vii")
     model = robot.model.copy()
-    model.inertias[3] = model.inertias[3] + pin.Inertia(0.01, np.zeros(3), np.eye(3) * 1e-3)
+    model.inertias[3] = model.inertias[3] + pin.Inertia(
+        0.01, np.zeros(3), np.eye(3) * 1e-3
+    )
     heavier = fflin.from_model(model, name="ets_vii")
     assert not fflin.check(heavier, fflin.linearize(robot)).ok
 
@@ -96,9 +106,13 @@ def test_own_m_of_a_model_does_not_loosen_the_check():
     lin = fflin.linearize(robot)
     noise = np.random.default_rng(3).normal(size=(15, 15))
     nearly_singular = np.ones((15, 15)) + 1e-15 * noise @ noise.T
-    wrong = replace(lin, A=1.5 * lin.A, B=1.3 * lin.B, _inertia=lambda _: nearly_singular)
+    wrong = replace(
+        lin, A=1.5 * lin.A, B=1.3 * lin.B, _inertia=lambda _: nearly_singular
+    )
     found = fflin.check(robot, wrong)
-    assert {"M", "B[omega_b, tau_b]", "A[q_b, omega_b]"} <= {row.block for row in found.failures}
+    assert {"M", "B[omega_b, tau_b]", "A[q_b, omega_b]"} <= {
+        row.block for row in found.failures
+    }
     assert max(row.tolerance for row in found.rows) < 1e-7
 
 
@@ -107,7 +121,9 @@ def test_check_keeps_its_edge_at_orbital_speed():
     q, v, u = random_point(robot, np.random.default_rng(4))
     v[:3] = 7.6e3, -200.0, 30.0
     for frame in ("hybrid", "local", "world"):
-        lin = fflin.linearize(robot, q, v, 0.05 * u, frame=frame, reference=pin.SE3.Identity())
+        lin = fflin.linearize(
+            robot, q, v, 0.05 * u, frame=frame, reference=pin.SE3.Identity()
+        )
         assert fflin.check(robot, lin).ok
         groups = fflin.StateMap(robot).groups
         A = lin.A.copy()
@@ -144,7 +160,10 @@ def test_report_fits_80_columns():
     robot = fflin.load("tiago_dual")
     text = str(fflin.check(robot, fflin.linearize(robot)))
     assert max(map(len, text.splitlines())) <= 80
-    assert text.startswith("A and B are verified: largest error") and "123 comparisons" in text
+    assert (
+        text.startswith("A and B are verified: largest error")
+        and "123 comparisons" in text
+    )
 
 
 def test_rounding_of_a_large_acceleration_is_no_failure():
@@ -154,11 +173,15 @@ def test_rounding_of_a_large_acceleration_is_no_failure():
     robot = robot.replace(inputs=[push], outputs=[fflin.Accelerometer("base")])
     v = fflin.velocity(robot, {"omega_b.x": 1.3, "omega_b.y": -0.7, "v_b.z": 0.4})
     for thrust in (1.0, 3.3, 7.1):
-        assert fflin.check(robot, fflin.linearize(robot, v=v, u=[thrust], moving=True)).ok
+        assert fflin.check(
+            robot, fflin.linearize(robot, v=v, u=[thrust], moving=True)
+        ).ok
 
 
 @pytest.mark.parametrize("speed", [1e-6, 1e-9, 1e-12, 1e-15])
-@pytest.mark.parametrize("name", ["planar_detumble", "canadarm2", "dual_arm", "inspector"])
+@pytest.mark.parametrize(
+    "name", ["planar_detumble", "canadarm2", "dual_arm", "inspector"]
+)
 def test_a_motion_that_is_almost_at_rest_is_confirmed(name, speed):
     robot = fflin.load(name)
     v = speed * np.random.default_rng(0).standard_normal(robot.nv)
@@ -193,14 +216,18 @@ def test_a_continuous_joint_may_pass_half_a_turn(turn, moving):
 def test_a_tolerance_takes_the_place_of_every_figures_own():
     """As of a tool whose A and B are differences themselves."""
     robot = fflin.load("servicer_7dof")
-    lin = fflin.linearize(robot, *random_point(robot, np.random.default_rng(3), degrees=30.0))
+    lin = fflin.linearize(
+        robot, *random_point(robot, np.random.default_rng(3), degrees=30.0)
+    )
     noise = 1e-7 * np.random.default_rng(4).uniform(-1.0, 1.0, lin.A.shape)
     near = replace(lin, A=lin.A * (1.0 + noise))
     own, loose = fflin.check(robot, near), fflin.check(robot, near, tolerance=1e-6)
     assert not own.ok and loose.ok and loose.max_error == own.max_error
     assert {row.tolerance for row in loose.rows} == {1e-6}
     assert "at most 1.0e-06" in loose.title
-    assert not fflin.check(robot, planted(lin, "A", slice(6, 9), slice(9, 12)), tolerance=1e-6).ok
+    assert not fflin.check(
+        robot, planted(lin, "A", slice(6, 9), slice(9, 12)), tolerance=1e-6
+    ).ok
     assert not fflin.check(robot, lin, tolerance=1e-20).ok
     for wrong in (0.0, -1e-6, 1.0, np.nan, np.inf, "much", True):
         with pytest.raises(fflin.InputError, match="tolerance"):
@@ -221,7 +248,9 @@ def test_a_weak_mode_is_verified():
 
 def test_the_momentum_of_a_weak_mode_is_not_lost_in_the_momentum_of_the_robot():
     """A unit amplitude of the mode moves the centre of mass of 350 kg by 3e-9 m."""
-    array = fflin.FlexibleAppendage("panel_left_1", 0.3, [[0], [0], [1e-6]], [[1e-6], [0], [0]])
+    array = fflin.FlexibleAppendage(
+        "panel_left_1", 0.3, [[0], [0], [1e-6]], [[1e-6], [0], [0]]
+    )
     robot = fflin.load("inspector", lock=["hinge_*"], appendages=[array])
     robot = robot.replace(outputs=[fflin.CenterOfMass(), fflin.Momentum()])
     q, v, _ = random_point(robot, np.random.default_rng(7), degrees=20.0)
@@ -241,7 +270,9 @@ def test_the_momentum_of_a_weak_mode_is_not_lost_in_the_momentum_of_the_robot():
 
 def falling(frame="base"):
     gravity = (0.0, 0.0, -9.81)
-    return fflin.load("servicer_7dof", gravity=gravity, outputs=[fflin.Accelerometer(frame)])
+    return fflin.load(
+        "servicer_7dof", gravity=gravity, outputs=[fflin.Accelerometer(frame)]
+    )
 
 
 @pytest.mark.parametrize("frame", ["base", "tool"])
@@ -264,7 +295,9 @@ def test_the_headline_names_the_block_that_failed():
     C[1, 0] += 1e-3
     A[13, 7] += 1e-3
     found = fflin.check(robot, replace(lin, C=C))
-    assert str(found).startswith("C (accelerometer) is not verified: 1 of 123 comparisons FAILED")
+    assert str(found).startswith(
+        "C (accelerometer) is not verified: 1 of 123 comparisons FAILED"
+    )
     found = fflin.check(robot, replace(lin, A=A, C=C))
     first = " ".join(str(found).split("\n\n")[0].split())
     assert first == (
@@ -300,7 +333,9 @@ def test_errors_do_not_depend_on_units():
         A[lin.A.shape[0] // 2 :] *= 1.01
         B *= 1.01
         found = fflin.check(other, replace(lin, A=A, B=B))
-        errors.append({r.block: r.error for r in found.rows if r.test == "ABA derivatives"})
+        errors.append(
+            {r.block: r.error for r in found.rows if r.test == "ABA derivatives"}
+        )
     planted = [block for block, error in errors[0].items() if error > 1e-6]
     assert len(planted) > 12
     for other in errors[1:]:
@@ -345,7 +380,9 @@ def test_aba_of_light_links_with_mimic_joints_is_accurate(seed):
 
 def test_a_velocity_that_is_zero_but_for_rounding_is_no_scale():
     robot = fflin.load("servicer_7dof")
-    tug = robot.replace(stiffness={"panel_left": 100.0, "panel_right": 100.0}, damping=0.5)
+    tug = robot.replace(
+        stiffness={"panel_left": 100.0, "panel_right": 100.0}, damping=0.5
+    )
     q = fflin.configuration(tug, {"joint_2": 0.4, "joint_4": -1.1})
     v = fflin.velocity(tug, {"joint_1": 0.1, "omega_b.z": 0.02})
     lin = fflin.linearize(tug, q, v, fflin.effort(tug, {"tau_m.joint_1": 2.0}))

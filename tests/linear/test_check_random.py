@@ -43,7 +43,9 @@ class Sizes:
             forces[:, :3] += 2.0 * case.robot.orbit.mean_motion * turning
         self.terms = {
             "A": np.vstack((np.abs(lin.A[:nv]), np.abs(self.inverse) @ forces)),
-            "B": np.vstack((np.abs(lin.B[:nv]), np.abs(self.inverse) @ np.abs(M @ lower))),
+            "B": np.vstack(
+                (np.abs(lin.B[:nv]), np.abs(self.inverse) @ np.abs(M @ lower))
+            ),
         }
 
     def largest(self, name, matrix, rows, columns, at):
@@ -70,9 +72,13 @@ class Sizes:
 def vectors(lin):
     """{output row: the rows of the same vector, such as the three rows of a position}."""
     names = [
-        name if name in lin.state_names else name.rpartition(".")[0] for name in lin.output_names
+        name if name in lin.state_names else name.rpartition(".")[0]
+        for name in lin.output_names
     ]
-    return {row: np.flatnonzero([n == name for n in names]) for row, name in enumerate(names)}
+    return {
+        row: np.flatnonzero([n == name for n in names])
+        for row, name in enumerate(names)
+    }
 
 
 class Entry(NamedTuple):
@@ -87,8 +93,13 @@ def rounds(case, lin, references, rng):
     """Yield (matrix, entries): one random entry of each block, each block by itself in a round."""
     state, nv, sizes = references.route.state, len(lin.M), Sizes(case, lin)
     exact = references.matrices()
-    groups = {name: np.arange(state.nx)[part] for name, part in state.groups._asdict().items()}
-    inputs = {name: np.array(part) for name, part in references.route.aba.actuation.groups.items()}
+    groups = {
+        name: np.arange(state.nx)[part] for name, part in state.groups._asdict().items()
+    }
+    inputs = {
+        name: np.array(part)
+        for name, part in references.route.aba.actuation.groups.items()
+    }
 
     def entry(name, rows, columns, block):
         at = rng.choice(rows), rng.choice(columns)

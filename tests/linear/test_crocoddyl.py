@@ -49,7 +49,9 @@ def test_the_matrices_are_the_derivatives_of_the_step(flight):
     assert nodes.dt == STEP and nodes.state_names[:2] == ("p.x", "p.y")
     for k in (0, 7, 19):
         point = flight.q[k], flight.v[k], flight.u[k]
-        for got, expected in zip((nodes.A[k], nodes.B[k]), differences(robot, *point), strict=True):
+        for got, expected in zip(
+            (nodes.A[k], nodes.B[k]), differences(robot, *point), strict=True
+        ):
             # Central differences at 1e-6 have errors of about 1e-10.
             assert got == pytest.approx(expected, abs=1e-8 * np.abs(expected).max())
         one = flight[k].to("crocoddyl", dt=STEP)
@@ -64,7 +66,9 @@ def test_a_model_comes_back_from_the_step():
     back = fflin.from_tool(
         robot, "crocoddyl", step.q, step.v, A=step.A, B=step.B, dt=STEP, moving=True
     )
-    assert back.A == pytest.approx(lin.A, abs=1e-10) and back.B == pytest.approx(lin.B, abs=1e-10)
+    assert back.A == pytest.approx(lin.A, abs=1e-10) and back.B == pytest.approx(
+        lin.B, abs=1e-10
+    )
 
 
 @pytest.mark.parametrize("tool", ["pinocchio", "crocoddyl"])

@@ -40,7 +40,9 @@ def test_what_is_balanced_is_a_fixed_point(name):
     u = fflin.equilibrium(floating, q).u
     state = StateMap(robot)
     stiffness, _, rest = robot.springs
-    expected = np.concatenate((np.zeros(6), stiffness * (state.joint_positions(q) - rest)))
+    expected = np.concatenate(
+        (np.zeros(6), stiffness * (state.joint_positions(q) - rest))
+    )
     assert u == pytest.approx(expected, rel=1e-10, abs=1e-10)
 
 
@@ -96,7 +98,12 @@ def test_least_norm_against_every_active_set(trials):
         fans = thrusters(body, rng, int(rng.integers(5, 11)))
         torques = [fflin.BaseTorque()] if trial % 3 else []
         robot = body.replace(
-            inputs=[*fans[:2], *torques, *fans[2:], *map(fflin.JointTorque, body.joint_names)],
+            inputs=[
+                *fans[:2],
+                *torques,
+                *fans[2:],
+                *map(fflin.JointTorque, body.joint_names),
+            ],
             gravity=rng.normal(size=3),
         )
         q = fflin.configuration(robot, dict.fromkeys(robot.joint_names, 0.7))
@@ -147,7 +154,9 @@ def test_what_is_needed_is_shown_with_units():
     found = fflin.equilibrium(robot)
     lines = str(found).splitlines()
     assert lines[0].startswith("u: ") and max(map(len, lines)) <= 80
-    assert f"F_b.z = {9.81 * robot.mass:.6g} N" in str(found) and "tau_b.x" not in str(found)
+    assert f"F_b.z = {9.81 * robot.mass:.6g} N" in str(found) and "tau_b.x" not in str(
+        found
+    )
     assert str(fflin.equilibrium(fflin.load("cubesat"))) == "u: all zero"
 
 
@@ -159,24 +168,36 @@ def test_nothing_to_balance_takes_nothing():
     rest = dict.fromkeys(robot.joint_names, 0.3)
     sprung = robot.replace(stiffness=1e3, rest=rest)
     slightly = {joint: 0.1 + 0.2 for joint in rest}  # 0.30000000000000004
-    assert np.abs(fflin.equilibrium(sprung, fflin.configuration(sprung, slightly)).u).max() < 1e-12
+    assert (
+        np.abs(fflin.equilibrium(sprung, fflin.configuration(sprung, slightly)).u).max()
+        < 1e-12
+    )
 
 
 def flexible(**fields):
     """A robot with motors in its arm and springs alone in its panels."""
-    return fflin.load("servicer_7dof", passive=["panel_*"], stiffness={"panel_*": 40.0}, **fields)
+    return fflin.load(
+        "servicer_7dof", passive=["panel_*"], stiffness={"panel_*": 40.0}, **fields
+    )
 
 
 def test_passive_joints_relax_on_their_springs():
     """As after a catch that leaves them beside their rest: nothing else pulls."""
     robot = flexible(rest={"panel_left": 0.2})
-    q = fflin.configuration(robot, {"joint_2": 0.4, "panel_left": 0.2 + 1e-6, "panel_right": 0.3})
+    q = fflin.configuration(
+        robot, {"joint_2": 0.4, "panel_left": 0.2 + 1e-6, "panel_right": 0.3}
+    )
     held = fflin.equilibrium(robot, q)
     at = StateMap(robot).joint_positions(held.q)
     expected = {"joint_2": 0.4, "panel_left": 0.2}
     assert np.array_equal(held.q[:7], q[:7]) and not held.u.any()
-    assert at == pytest.approx([expected.get(n, 0.0) for n in robot.joint_names], abs=1e-15)
-    assert str(held) == "u: all zero\ndeflections: panel_left = -1e-06 rad, panel_right = -0.3 rad"
+    assert at == pytest.approx(
+        [expected.get(n, 0.0) for n in robot.joint_names], abs=1e-15
+    )
+    assert (
+        str(held)
+        == "u: all zero\ndeflections: panel_left = -1e-06 rad, panel_right = -0.3 rad"
+    )
     fflin.lqr(fflin.linearize(robot, held.q, u=held.u))
     again = fflin.equilibrium(robot, held.q)
     assert again.q == pytest.approx(held.q, abs=1e-15) and str(again) == "u: all zero"
@@ -201,7 +222,9 @@ def test_passive_joints_sag_under_gravity(seed):
     q = fflin.configuration(robot, joints, random_pose(rng, 100.0))
     for frame in FRAMES:
         held = fflin.equilibrium(robot, q, frame=frame, reference=pin.SE3.Identity())
-        lin = fflin.linearize(robot, held.q, u=held.u, frame=frame, reference=pin.SE3.Identity())
+        lin = fflin.linearize(
+            robot, held.q, u=held.u, frame=frame, reference=pin.SE3.Identity()
+        )
         assert lin.is_equilibrium(1e-9)
         state = StateMap(robot)
         at = state.joint_positions(held.q)
@@ -212,7 +235,9 @@ def test_passive_joints_sag_under_gravity(seed):
         spring = 50.0 * tree.mass * at[soft]
         there = [robot.joint(name).idx_v for name in names]
         assert -spring == pytest.approx(pull[there], abs=1e-11 * np.abs(pull).max())
-        assert held.sag[soft] == pytest.approx(at[soft] - [joints[name] for name in names])
+        assert held.sag[soft] == pytest.approx(
+            at[soft] - [joints[name] for name in names]
+        )
         stiff = np.setdiff1d(range(robot.n), soft)
         assert np.array_equal(at[stiff], state.joint_positions(q)[stiff])
 
@@ -220,9 +245,13 @@ def test_passive_joints_sag_under_gravity(seed):
 def test_springs_that_give_no_hold_are_told():
     """A pendulum that stands on a spring weaker than its weight, and beside it."""
     for gravity, words in ((20.0, "hold"), (1e5, "hold|settle")):
-        robot = fflin.load("planar_detumble", gravity=(-gravity, 0, 0), passive=["joint_2"])
+        robot = fflin.load(
+            "planar_detumble", gravity=(-gravity, 0, 0), passive=["joint_2"]
+        )
         robot = robot.replace(stiffness={"joint_2": 0.01})
-        with pytest.raises(fflin.EquilibriumError, match=f"joint_2.*{words}|{words}.*joint_2"):
+        with pytest.raises(
+            fflin.EquilibriumError, match=f"joint_2.*{words}|{words}.*joint_2"
+        ):
             fflin.equilibrium(robot, fflin.configuration(robot, {"joint_2": 0.05}))
 
 
@@ -232,11 +261,15 @@ def test_in_orbit_panels_sag_against_the_gradient():
     for reference in (None, random_pose(np.random.default_rng(5), 40.0)):
         q = fflin.configuration(robot, base=turned)
         held = fflin.equilibrium(robot, q, reference=reference)
-        assert 1e-9 < np.abs(held.sag).max() < 1e-4 and "deflections: panel_left = " in str(held)
+        assert 1e-9 < np.abs(
+            held.sag
+        ).max() < 1e-4 and "deflections: panel_left = " in str(held)
         lin = fflin.linearize(robot, held.q, u=held.u, reference=reference)
         assert lin.is_equilibrium(1e-12)
         # The spring's torque on a panel is that of the gradient.
-        bare = fflin.linearize(robot.replace(stiffness={}), held.q, u=held.u, reference=reference)
+        bare = fflin.linearize(
+            robot.replace(stiffness={}), held.q, u=held.u, reference=reference
+        )
         index = robot.joint_names.index("panel_left")
         force = (bare.M @ bare.f0[-len(bare.M) :])[6 + index]
         assert 40.0 * held.sag[index] == pytest.approx(force, rel=1e-6)
@@ -246,8 +279,12 @@ def test_in_orbit_panels_sag_against_the_gradient():
 def test_steady_motion_of_random_trees(seed):
     """A turn about the vertical and a drift in body axes, joints at rest."""
     rng = np.random.default_rng(seed)
-    robot = random_tree(rng, 5).replace(gravity=(0.0, 3.0, -4.0), stiffness=2.0, damping=0.1)
-    q = fflin.configuration(robot, dict.fromkeys(robot.joint_names, 0.4), random_pose(rng, 120.0))
+    robot = random_tree(rng, 5).replace(
+        gravity=(0.0, 3.0, -4.0), stiffness=2.0, damping=0.1
+    )
+    q = fflin.configuration(
+        robot, dict.fromkeys(robot.joint_names, 0.4), random_pose(rng, 120.0)
+    )
     axis = pin.XYZQUATToSE3(q[:7]).rotation.T @ np.array(robot.gravity)
     v = np.zeros(robot.nv)
     v[:3], v[3:6] = rng.normal(size=3), 0.3 * axis

@@ -51,7 +51,9 @@ def relative(a, b):
 @pytest.mark.parametrize("case", CASES, ids=ids)
 @pytest.mark.parametrize("name", mostly([*BUNDLED, "tree"], "cubesat", "tree"))
 def test_there_and_back(name, case):
-    robot = random_tree(np.random.default_rng(3), 6) if name == "tree" else fflin.load(name)
+    robot = (
+        random_tree(np.random.default_rng(3), 6) if name == "tree" else fflin.load(name)
+    )
     q, v, u, how = point(robot, 7, case)
     lin, rng = fflin.linearize(robot, q, v, u, **how), np.random.default_rng(0)
     for tool in TOOLS:
@@ -73,8 +75,16 @@ def test_there_and_back(name, case):
         m = still.to(tool)
         A, B = m.A + m.T @ X @ m.T_left, m.B + m.T @ Y @ np.linalg.inv(m.T_u)
         back = fflin.from_tool(robot, tool, m.q, m.v, m.u0, A=A, B=B, **how)
-        assert relative(back.A, still.A + X) < least and relative(back.B, still.B + Y) < least
-        assert len(m.state_names) == len(set(m.state_names)) == len(m.state_units) == len(m.A)
+        assert (
+            relative(back.A, still.A + X) < least
+            and relative(back.B, still.B + Y) < least
+        )
+        assert (
+            len(m.state_names)
+            == len(set(m.state_names))
+            == len(m.state_units)
+            == len(m.A)
+        )
         assert len(m.A) == 12 + 2 * robot.n + (tool == "drake")
 
 
@@ -85,10 +95,13 @@ class Formulas:
         self.robot, self.tool, self.q0 = robot, tool, q0
         self.state = fflin.StateMap(robot)
         self.order = np.arange(robot.n)
-        if tool in ("drake", "mujoco", "spart"):  # none of these robots has a joint on two others
+        # none of these robots has a joint on two others
+        if tool in ("drake", "mujoco", "spart"):
             at = [robot.file_joints.index(name) for name in robot.joint_names]
             self.order = np.argsort(at)
-        link = next((f.name for f in robot.model.frames if f.type == pin.FrameType.BODY), None)
+        link = next(
+            (f.name for f in robot.model.frames if f.type == pin.FrameType.BODY), None
+        )
         known = robot.links.get(link)
         body = pin.SE3(np.eye(3), robot.model.inertias[1].lever)
         self.centre = known.placement if known else body
@@ -142,7 +155,9 @@ class Formulas:
 @pytest.mark.parametrize("name", ["inspector", *exhaustive("servicer_7dof")])
 def test_slopes_are_those_of_the_rates_in_the_tools_coordinates(name, tool):
     """A, B and f0 by differences of dx/dt: x by formulas, the motion by ABA."""
-    robot = fflin.load(name).replace(gravity=(0.3, -0.2, 0.5), stiffness=3.0, damping=0.2)
+    robot = fflin.load(name).replace(
+        gravity=(0.3, -0.2, 0.5), stiffness=3.0, damping=0.2
+    )
     q, v, u, _ = point(robot, 5, {}, degrees=60.0)
     lin = fflin.linearize(robot, q, v, u / np.abs(u).max())
     m = lin.to(tool)
@@ -151,7 +166,9 @@ def test_slopes_are_those_of_the_rates_in_the_tools_coordinates(name, tool):
 
     def rate(q, v, u):
         a = aba.acceleration(q, v, now.inputs(q, u)).copy()
-        return differences(lambda t: now.vectors(pin.integrate(robot.model, q, t * v), v + t * a))
+        return differences(
+            lambda t: now.vectors(pin.integrate(robot.model, q, t * v), v + t * a)
+        )
 
     assert relative(now.vectors(q, v), m.x0) < 1e-13
     assert relative(rate(q, v, m.u0), m.f0) < 1e-9
@@ -173,13 +190,18 @@ def test_a_moving_reference_changes_tangents_alone(tool):
     robot = fflin.load("servicer_7dof")
     q, v, u, _ = point(robot, 2, {})
     local = fflin.linearize(robot, q, v, u, frame="local")
-    fixed, moving = local.to(tool), fflin.linearize(robot, q, v, u, moving=True).to(tool)
+    fixed, moving = (
+        local.to(tool),
+        fflin.linearize(robot, q, v, u, moving=True).to(tool),
+    )
     assert moving.reference == "moving" and not moving.f0.any() and fixed.f0.any()
     assert relative(moving.B, fixed.B) < 1e-13
     expected, nv = np.zeros(fixed.A.shape), robot.nv
     if tool in ("pinocchio", "crocoddyl"):
         # Pinocchio's own transport of tangents, over a time of 0
-        ahead, behind = (pin.dIntegrate(robot.model, q, h * v)[0] for h in (1e-4, -1e-4))
+        ahead, behind = (
+            pin.dIntegrate(robot.model, q, h * v)[0] for h in (1e-4, -1e-4)
+        )
         expected[:nv, :nv] = 0.5 * (ahead - behind) / 2e-4
     elif tool in ("mujoco", "spart"):
         at = slice(3, 6) if tool == "mujoco" else slice(0, 3)
@@ -190,7 +212,9 @@ def test_a_moving_reference_changes_tangents_alone(tool):
 def differences(f, step=2e-3):
     """df/dt at 0, of order six."""
     weights = (45.0 / 60.0, -9.0 / 60.0, 1.0 / 60.0)
-    return sum(w * (f(k * step) - f(-k * step)) for k, w in enumerate(weights, 1)) / step
+    return (
+        sum(w * (f(k * step) - f(-k * step)) for k, w in enumerate(weights, 1)) / step
+    )
 
 
 def test_four_numbers_of_a_quaternion_have_a_direction_that_nothing_moves():
@@ -200,7 +224,10 @@ def test_four_numbers_of_a_quaternion_have_a_direction_that_nothing_moves():
     m = fflin.linearize(robot, q, v, u).to("drake")
     n = np.concatenate((m.q[:4], np.zeros(len(m.A) - 4)))
     assert np.abs(m.T_left @ n).max() < 1e-15
-    assert np.abs(m.A @ n - np.concatenate((m.f0[:4], np.zeros(len(m.A) - 4)))).max() < 1e-13
+    assert (
+        np.abs(m.A @ n - np.concatenate((m.f0[:4], np.zeros(len(m.A) - 4)))).max()
+        < 1e-13
+    )
     # d(n' dx)/dt = 0 as the point moves, and no input pushes along n.
     moving = np.concatenate((m.f0[:4], np.zeros(len(m.A) - 4)))
     assert np.abs(n @ m.A + moving).max() < 1e-12 * np.abs(m.A).max()
@@ -211,15 +238,25 @@ def test_four_numbers_of_a_quaternion_have_a_direction_that_nothing_moves():
 
 
 def test_outputs_and_the_feedback_of_a_gain_are_the_same():
-    sensors = [fflin.Accelerometer("base"), fflin.FrameVelocity("tool"), fflin.JointPositions()]
-    robot = fflin.load("servicer_7dof").replace(outputs=sensors, gravity=(0.0, 0.0, -1.0))
+    sensors = [
+        fflin.Accelerometer("base"),
+        fflin.FrameVelocity("tool"),
+        fflin.JointPositions(),
+    ]
+    robot = fflin.load("servicer_7dof").replace(
+        outputs=sensors, gravity=(0.0, 0.0, -1.0)
+    )
     q, v, u, how = point(robot, 8, CASES[3])
     lin = fflin.linearize(robot, q, v, u, **how)
     for tool in TOOLS:
         m = lin.to(tool)
-        assert m.output_names == lin.output_names and relative(m.D @ m.T_u, lin.D) < 1e-13
+        assert (
+            m.output_names == lin.output_names and relative(m.D @ m.T_u, lin.D) < 1e-13
+        )
         # By way of a model whose inputs are held in other axes.
-        other = fflin.from_tool(robot, tool, m.q, m.v, m.u0, **how | {"frame": "world"}).to(tool)
+        other = fflin.from_tool(
+            robot, tool, m.q, m.v, m.u0, **how | {"frame": "world"}
+        ).to(tool)
         assert relative(other.C, m.C) < 1e-12 and relative(other.D, m.D) < 1e-12
         assert relative(other.A, m.A) < 1e-12
     rest = fflin.linearize(robot.replace(gravity=(0.0, 0.0, 0.0)), q)
@@ -260,7 +297,9 @@ def test_the_step_of_mujoco_comes_back():
     changed = lin.A.copy()
     changed[-robot.nv :] *= 1.1  # of rates
     other = replace(lin, A=changed, B=1.1 * lin.B).to("mujoco", dt=2e-3)
-    back = fflin.from_tool(robot, "mujoco", m.q, m.v, m.u0, A=other.A, B=other.B, dt=2e-3)
+    back = fflin.from_tool(
+        robot, "mujoco", m.q, m.v, m.u0, A=other.A, B=other.B, dt=2e-3
+    )
     assert relative(back.A, changed) < 1e-11 and relative(back.B, 1.1 * lin.B) < 1e-11
     only = fflin.from_tool(robot, "mujoco", m.q, m.v, m.u0, B=m.B, dt=2e-3)
     assert relative(only.A, lin.A) < 1e-13 and relative(only.B, lin.B) < 1e-13
@@ -283,10 +322,14 @@ def test_mimic_joints_are_joints_to_tools(tmp_path):
     path = tmp_path / "gripper.urdf"
     mimic = '<mimic joint="b" multiplier="-2" offset="0.3"/>'
     path.write_text(
-        MIMIC.format(links=LINKS, a="revolute", b="continuous", parent="base", mimic=mimic)
+        MIMIC.format(
+            links=LINKS, a="revolute", b="continuous", parent="base", mimic=mimic
+        )
     )
     robot = fflin.load(path)
-    q = fflin.configuration(robot, {"b": 0.7}, random_pose(np.random.default_rng(0), 50.0))
+    q = fflin.configuration(
+        robot, {"b": 0.7}, random_pose(np.random.default_rng(0), 50.0)
+    )
     v = fflin.velocity(robot, {"b": 0.4, "omega_b.x": 0.3, "v_b.y": 0.2})
     lin = fflin.linearize(robot, q, v)
     for tool in TOOLS:
@@ -315,9 +358,20 @@ def test_inputs_and_joints_stand_in_the_tools_order():
         names = own if tool[:3] in ("pin", "cro", "eul") else order
         assert tuple(m.input_names[6:]) == tuple(f"tau_m.{name}" for name in names)
         joints = [name[4:] for name in m.state_names if name.startswith("q_m.")]
-        assert joints == [name[7:] for name in m.state_names if name[:7] == "qdot_m."] == [*names]
+        assert (
+            joints
+            == [name[7:] for name in m.state_names if name[:7] == "qdot_m."]
+            == [*names]
+        )
     m = lin.to("mujoco")
-    assert m.input_names[:6] == ("F_b.x", "F_b.y", "F_b.z", "tau_b.x", "tau_b.y", "tau_b.z")
+    assert m.input_names[:6] == (
+        "F_b.x",
+        "F_b.y",
+        "F_b.z",
+        "tau_b.x",
+        "tau_b.y",
+        "tau_b.z",
+    )
     assert m.state_units[:6] == ("m",) * 3 + ("rad",) * 3
     few = robot.replace(inputs=[fflin.JointTorque("joint_2"), fflin.BaseForce()])
     assert fflin.linearize(few).to("drake").input_names == (
@@ -338,7 +392,14 @@ def test_what_is_no_point_of_a_tool_is_refused_in_one_line():
     robot, rng = fflin.load("planar_detumble"), np.random.default_rng(0)
     lin, n = fflin.linearize(robot), robot.n
     to, back = fflin.transform, fflin.from_tool
-    refused(r"no tool named 'drak'; did you mean drake", to, robot, lin, "drak", kind=LookupError)
+    refused(
+        r"no tool named 'drak'; did you mean drake",
+        to,
+        robot,
+        lin,
+        "drak",
+        kind=LookupError,
+    )
     refused(r"no tool named 'None'", back, robot, None, np.zeros(3), kind=LookupError)
     refused(r"q has shape \(3,\), expected", back, robot, "drake", np.zeros(3))
     q = lin.to("drake").q.copy()
@@ -357,14 +418,30 @@ def test_what_is_no_point_of_a_tool_is_refused_in_one_line():
     refused(r"w, x, y, z has length 1.1, expected 1", back, robot, "drake", q)
     q = lin.to("spart").q.copy()
     q[0] = -1.0
-    refused(r"R0 \(q\[:9\] by columns\) is not a rotation matrix", back, robot, "spart", q)
+    refused(
+        r"R0 \(q\[:9\] by columns\) is not a rotation matrix", back, robot, "spart", q
+    )
     up = fflin.configuration(
         robot, {}, pin.SE3(pin.rpy.rpyToMatrix(0.3, np.pi / 2, 0.0), np.zeros(3))
     )
-    refused(r"the pitch is 90 deg", fflin.linearize(robot, up).to, "euler", kind=fflin.ChartError)
+    refused(
+        r"the pitch is 90 deg",
+        fflin.linearize(robot, up).to,
+        "euler",
+        kind=fflin.ChartError,
+    )
     q = lin.to("euler").q.copy()
     q[1] = np.pi / 2
-    refused(r"the pitch is 90 deg", back, robot, "euler", q, lin.v, A=lin.A, kind=fflin.ChartError)
+    refused(
+        r"the pitch is 90 deg",
+        back,
+        robot,
+        "euler",
+        q,
+        lin.v,
+        A=lin.A,
+        kind=fflin.ChartError,
+    )
     refused(r"dt is 0.1 s for drake", to, robot, lin, "drake", dt=0.1)
     refused(r"dt is -1 s for mujoco", to, robot, lin, "mujoco", dt=-1.0)
     refused(r"sampled", to, robot, lin.discretize(0.1), "mujoco", dt=0.1)
@@ -374,7 +451,9 @@ def test_what_is_no_point_of_a_tool_is_refused_in_one_line():
     refused(r"lin lacks some states", to, arm, reduced, "drake")
     servicer = fflin.load("servicer_7dof").replace(inputs=[fflin.BaseForce()])
     if np.abs(Formulas(servicer, "spart", servicer.neutral()).centre.translation).max():
-        refused(r"a BaseForce needs a BaseTorque", fflin.linearize(servicer).to, "spart")
+        refused(
+            r"a BaseForce needs a BaseTorque", fflin.linearize(servicer).to, "spart"
+        )
     assert rng and free_body((1.0, 2.0, 3.0)).n == 0
 
 
@@ -386,7 +465,11 @@ def test_a_body_without_joints_and_files(tmp_path):
         loaded = fflin.ToolModel.load(tmp_path / f"{tool}.mat")
         for key in ("A", "B", "T", "T_left", "T_u", "q", "v", "x0"):
             assert np.array_equal(getattr(loaded, key), getattr(m, key)), key
-        assert loaded.state_names == m.state_names and loaded.tool == tool and "nx=1" in repr(m)
+        assert (
+            loaded.state_names == m.state_names
+            and loaded.tool == tool
+            and "nx=1" in repr(m)
+        )
 
 
 def test_an_orbit_has_angles_and_no_other_tool():

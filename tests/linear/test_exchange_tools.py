@@ -18,7 +18,11 @@ def motion(request, tmp_path):
     path = tmp_path / "robot.urdf"
     path.write_text(plain_urdf(fflin.load(request.param)))
     robot = fflin.load(path)
-    return robot, path.read_text(), *random_point(robot, np.random.default_rng(11), degrees=80.0)
+    return (
+        robot,
+        path.read_text(),
+        *random_point(robot, np.random.default_rng(11), degrees=80.0),
+    )
 
 
 def relative(a, b):
@@ -79,7 +83,10 @@ def test_drake(motion):
         )
         mine = lin.to("drake")
         assert relative(mine.f0, rates) < 1e-11
-        assert relative(mine.A, theirs.A()) < 1e-11 and relative(mine.B, theirs.B()) < 1e-11
+        assert (
+            relative(mine.A, theirs.A()) < 1e-11
+            and relative(mine.B, theirs.B()) < 1e-11
+        )
         back = fflin.from_tool(
             robot, "drake", m.q, m.v, m.u0, A=theirs.A(), B=theirs.B(), frame=frame
         )
@@ -114,7 +121,9 @@ def test_mujoco(motion):
     assert np.abs(data.xmat[body].reshape(3, 3) - place.rotation).max() < 1e-12
     seen = np.zeros(6)
     mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_XBODY, body, seen, 0)
-    assert np.abs(seen - np.concatenate((velocity.angular, velocity.linear))).max() < 1e-12
+    assert (
+        np.abs(seen - np.concatenate((velocity.angular, velocity.linear))).max() < 1e-12
+    )
     # Theirs are differences, good to some 1e-6 of the accelerations; there is no B of qfrc_applied.
     A = np.zeros((2 * nv, 2 * nv))
     mujoco.mjd_transitionFD(model, data, 1e-6, True, A, None, None, None)
@@ -155,7 +164,8 @@ def test_pinocchio(motion):
     def rate(t, e):
         start = pin.integrate(model, m.q, t * e)
         ahead, behind = (
-            pin.difference(model, m.q, pin.integrate(model, start, s * m.v)) for s in (1e-3, -1e-3)
+            pin.difference(model, m.q, pin.integrate(model, start, s * m.v))
+            for s in (1e-3, -1e-3)
         )
         return (ahead - behind) / 2e-3
 
@@ -165,9 +175,13 @@ def test_pinocchio(motion):
 
 def test_the_order_of_joints_is_what_the_tool_says(tmp_path):
     """Pinocchio sorts siblings by name; Drake and MuJoCo take them as the file has them."""
-    body = '<mass value="1"/><inertia ixx=".2" ixy="0" ixz="0" iyy=".2" iyz="0" izz=".2"/>'
+    body = (
+        '<mass value="1"/><inertia ixx=".2" ixy="0" ixz="0" iyy=".2" iyz="0" izz=".2"/>'
+    )
     names = {"z": BASE, "zz": "z", "a": BASE, "aa": "a"}
-    links = "".join(f'<link name="{n}"><inertial>{body}</inertial></link>' for n in (BASE, *names))
+    links = "".join(
+        f'<link name="{n}"><inertial>{body}</inertial></link>' for n in (BASE, *names)
+    )
     joints = "".join(
         f'<joint name="to_{n}" type="{"prismatic" if n == "zz" else "revolute"}">'
         f'<parent link="{parent}"/><child link="{n}"/><origin xyz=".3 .1 .2" rpy=".1 .2 .3"/>'

@@ -16,7 +16,18 @@ from tests.support.robots import random_point
 LOADED = (".npz", ".mat", ".json")
 FORMATS = (*LOADED, ".csv")
 KEYS = {
-    *("A", "B", "C", "D", "f0", "x0", "u0", "state_names", "input_names", "output_names"),
+    *(
+        "A",
+        "B",
+        "C",
+        "D",
+        "f0",
+        "x0",
+        "u0",
+        "state_names",
+        "input_names",
+        "output_names",
+    ),
     *("state_units", "input_units", "output_units", "frame", "q", "v", "dt", "robot"),
     *("urdf_sha256", "fflin_version", "pinocchio_version", "certificate"),
 }
@@ -25,7 +36,9 @@ KEYS = {
 @pytest.fixture(scope="module", params=["cubesat", "planar_detumble", "astrobee_arm"])
 def lin(request):
     robot = fflin.load(request.param)
-    return fflin.linearize(robot, *random_point(robot, np.random.default_rng(1)), frame="world")
+    return fflin.linearize(
+        robot, *random_point(robot, np.random.default_rng(1)), frame="world"
+    )
 
 
 @pytest.mark.parametrize("ending", LOADED)
@@ -41,7 +54,9 @@ def test_round_trip_is_exact(lin, ending, dt, tmp_path):
             continue
         before, after = getattr(saved, field.name), getattr(loaded, field.name)
         if isinstance(before, np.ndarray):
-            assert before.shape == after.shape and before.tobytes() == after.tobytes(), field.name
+            assert (
+                before.shape == after.shape and before.tobytes() == after.tobytes()
+            ), field.name
         else:
             assert before == after and type(before) is type(after), field.name
     assert loaded.certificate == saved.certificate == lin.certificate
@@ -75,7 +90,9 @@ def test_csv_names_rows_and_columns(lin, tmp_path):
     lin.save(tmp_path / "m.csv")
     names = {"x": lin.state_names, "u": lin.input_names, "y": lin.output_names}
     names["v"] = lin.state_names[-len(lin.M) :]
-    for key, (of_rows, of_columns) in zip("ABCDM", ("xx", "xu", "yx", "yu", "vv"), strict=True):
+    for key, (of_rows, of_columns) in zip(
+        "ABCDM", ("xx", "xu", "yx", "yu", "vv"), strict=True
+    ):
         with (tmp_path / f"m.{key}.csv").open(newline="") as file:
             head, *rows = csv.reader(file)
         assert tuple(head[1:]) == names[of_columns]
@@ -193,4 +210,5 @@ def test_certificate_is_bound_to_its_matrices(lin, tmp_path):
 def test_path_may_be_a_string(lin, tmp_path):
     lin.save(str(tmp_path / "m.json"))
     assert fflin.LinearModel.load(str(tmp_path / "m.json")).robot == lin.robot
-    assert Path(tmp_path / "m.json").stat().st_mode & 0o044 == 0o044  # as the umask says
+    # as the umask says
+    assert Path(tmp_path / "m.json").stat().st_mode & 0o044 == 0o044

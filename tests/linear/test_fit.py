@@ -44,14 +44,18 @@ def test_a_joint_that_jammed_takes_its_row_and_columns_along(pair):
     K = fflin.line_up(gain, lin)
     rows = [gain.input_names.index(name) for name in lin.input_names]
     columns = [gain.state_names.index(name) for name in lin.state_names]
-    assert (K == gain.K[np.ix_(rows, columns)]).all() and len(rows) == len(gain.input_names) - 1
+    assert (K == gain.K[np.ix_(rows, columns)]).all() and len(rows) == len(
+        gain.input_names
+    ) - 1
 
 
 def test_gains_between_masses_of_a_payload(pair):
     """At a mass on the grid the gain is that mass's own, and between two it regulates."""
     robot = pair[0]
     heavy = [
-        fflin.capture(robot, "tool", pin.Inertia(x * 200.0, BODY.lever, x * BODY.inertia))
+        fflin.capture(
+            robot, "tool", pin.Inertia(x * 200.0, BODY.lever, x * BODY.inertia)
+        )
         for x in (0.5, 1.0)
     ]
     models = [fflin.linearize(each) for each in (robot, *(c.robot for c in heavy))]
@@ -65,7 +69,9 @@ def test_gains_between_masses_of_a_payload(pair):
 def lined_up(pair):
     """A schedule of the robot alone, bound to the one that holds the payload, and its point."""
     robot, held = pair
-    batch = fflin.sweep(robot, fflin.grid(robot, {"joint_2": np.linspace(-1.0, 1.0, 3)}))
+    batch = fflin.sweep(
+        robot, fflin.grid(robot, {"joint_2": np.linspace(-1.0, 1.0, 3)})
+    )
     gains = fflin.lqr_batch(batch, 1.0, 1.0)
     q = fflin.configuration(held, {"joint_2": 0.5})
     return gains, fflin.ScheduledFeedback(fflin.linearize(held, q), gains), q
@@ -73,7 +79,9 @@ def lined_up(pair):
 
 def test_a_schedule_over_joints_goes_on_after_the_catch(pair, lined_up):
     (robot, held), (gains, policy, q) = pair, lined_up
-    u = policy.bind(held)(0.0, q, fflin.velocity(held, {"omega_b.x": 0.01, "joint_3": 0.1}))
+    u = policy.bind(held)(
+        0.0, q, fflin.velocity(held, {"omega_b.x": 0.01, "joint_3": 0.1})
+    )
     own = fflin.configuration(robot, {"joint_2": 0.5})
     free = fflin.ScheduledFeedback(fflin.linearize(robot, own), gains)
     v = fflin.velocity(robot, {"omega_b.x": 0.01, "joint_3": 0.1})
@@ -83,8 +91,15 @@ def test_a_schedule_over_joints_goes_on_after_the_catch(pair, lined_up):
 @pytest.mark.compiled
 def test_a_schedule_that_goes_on_is_the_same_in_either_engine(pair, lined_up):
     (_, held), (_, policy, q) = pair, lined_up
-    start = {"q0": q, "v0": fflin.velocity(held, {"joint_3": 0.01}), "duration": 0.2, "dt": 0.02}
-    motions = [fflin.simulate(held, policy, **start, engine=x) for x in ("python", "compiled")]
+    start = {
+        "q0": q,
+        "v0": fflin.velocity(held, {"joint_3": 0.01}),
+        "duration": 0.2,
+        "dt": 0.02,
+    }
+    motions = [
+        fflin.simulate(held, policy, **start, engine=x) for x in ("python", "compiled")
+    ]
     assert motions[0].x == pytest.approx(motions[1].x, abs=1e-12)
 
 
@@ -96,7 +111,12 @@ def test_what_cannot_be_lined_up_is_one_line(pair):
     for call, said in [
         (lambda: fflin.line_up(gain, other), "lacks the"),
         (lambda: fflin.line_up(gain, mixed), "other"),
-        (lambda: fflin.line_up(fflin.lqr(held), fflin.linearize(pair[1], frame="local")), "frame"),
+        (
+            lambda: fflin.line_up(
+                fflin.lqr(held), fflin.linearize(pair[1], frame="local")
+            ),
+            "frame",
+        ),
         (lambda: fflin.line_up(gain, held.discretize(0.1)), "0.0"),
         (lambda: fflin.line_up(3, held), "Gain"),
         (lambda: fflin.line_up(gain, 3), "fflin.LinearModel"),

@@ -39,14 +39,22 @@ def gravity_gradient(R):
 def test_wheels_take_up_the_torque_of_the_gravity_gradient(massive, frame):
     mounted = wheels(*np.eye(3).tolist(), inertia=0.01 if massive else None)
     robot, q = hub(mounted)
-    to_hill = np.array(((0, 0, -1), (1, 0, 0), (0, -1, 0)))  # lvlh: x along, y -normal, z down
+    # lvlh: x along, y -normal, z down
+    to_hill = np.array(((0, 0, -1), (1, 0, 0), (0, -1, 0)))
     axes = np.eye(3) if frame == "lvlh" else to_hill
     placed = pin.SE3(axes @ TILTED, np.zeros(3))
     q = fflin.configuration(robot, base=placed)
     lin = held(fflin.linearize(robot, q, frame=frame))
-    torque = TILTED.T @ gravity_gradient(TILTED)  # in base axes, like the angular velocity
-    assert momentum_rate(lin) == pytest.approx(torque, rel=1e-9, abs=1e-9 * np.abs(torque).max())
-    at = [i for i, name in enumerate(lin.state_names) if name.startswith(("omega_b", "v_b"))]
+    # in base axes, like the angular velocity
+    torque = TILTED.T @ gravity_gradient(TILTED)
+    assert momentum_rate(lin) == pytest.approx(
+        torque, rel=1e-9, abs=1e-9 * np.abs(torque).max()
+    )
+    at = [
+        i
+        for i, name in enumerate(lin.state_names)
+        if name.startswith(("omega_b", "v_b"))
+    ]
     assert np.abs(lin.f0[at]).max() < 1e-15
 
 
@@ -57,18 +65,28 @@ def test_wheels_gain_in_flight_what_the_report_says():
     gain = fflin.lqr(lin)
     assert says(str(gain), "held at the operating point: u0")
     motion = fflin.simulate(
-        robot, fflin.StateFeedback(lin, gain.K), q0=q, duration=ORBIT.period, dt=ORBIT.period / 1e3
+        robot,
+        fflin.StateFeedback(lin, gain.K),
+        q0=q,
+        duration=ORBIT.period,
+        dt=ORBIT.period / 1e3,
     )
     speeds = motion.v[:, 6:]
-    turned = np.degrees(2.0 * np.arcsin(np.linalg.norm(motion.x[:, :3] - motion.x[0, :3], axis=1)))
+    turned = np.degrees(
+        2.0 * np.arcsin(np.linalg.norm(motion.x[:, :3] - motion.x[0, :3], axis=1))
+    )
     assert turned.max() < 0.05
-    gained = TILTED @ (0.01 * speeds).T  # along the axes of LVLH, whose y is minus the normal
+    # along the axes of LVLH, whose y is minus the normal
+    gained = TILTED @ (0.01 * speeds).T
     torque = gravity_gradient(TILTED)
     period, n = ORBIT.period, ORBIT.mean_motion
     across = 2.0 * np.hypot(torque[0], torque[2]) / n
     assert abs(gained[1, -1]) == pytest.approx(abs(torque[1]) * period, rel=2e-2)
     assert np.hypot(gained[0], gained[2]).max() == pytest.approx(across, rel=2e-2)
-    said = [f"gain {abs(torque[1]) * period:.3g} N m s per orbit", f"up to {across:.3g} N m s"]
+    said = [
+        f"gain {abs(torque[1]) * period:.3g} N m s per orbit",
+        f"up to {across:.3g} N m s",
+    ]
     assert says(" ".join(motion.notes), *said) and says(str(gain), *said)
 
 
@@ -102,7 +120,9 @@ def test_a_base_torque_holds_the_gravity_gradient(dt):
 
 def test_a_centre_of_mass_beside_the_origin_is_put_on_the_orbit():
     """No input pushes this robot, so its origin leaves the orbit instead of its centre of mass."""
-    robot = fflin.load("servicer_7dof", lock=["*"], inputs=wheels(*np.eye(3).tolist()), orbit=ORBIT)
+    robot = fflin.load(
+        "servicer_7dof", lock=["*"], inputs=wheels(*np.eye(3).tolist()), orbit=ORBIT
+    )
     gain = fflin.lqr(fflin.linearize(robot))
     q = robot.neutral()
     center = pin.centerOfMass(robot.model, robot.create_data(), q)
@@ -116,7 +136,11 @@ def test_a_centre_of_mass_beside_the_origin_is_put_on_the_orbit():
 def test_forces_below_the_tolerance_of_an_equilibrium_are_no_reason_to_refuse():
     """Springs deflect by 1e-9 rad, which leaves 1e-15 N m that nothing balances."""
     robot = fflin.load(
-        "servicer_7dof", lock=["joint_*"], passive=["panel_*"], stiffness=100.0, orbit=ORBIT
+        "servicer_7dof",
+        lock=["joint_*"],
+        passive=["panel_*"],
+        stiffness=100.0,
+        orbit=ORBIT,
     )
     robot = robot.replace(inputs=wheels(*np.eye(3).tolist()))
     for number in (0, 5, 13):

@@ -25,7 +25,9 @@ def wheeled(inertia=WHEEL, lever=(0.0, 0.0, 0.2), joint=None, tip=False, **field
     model.appendBodyToJoint(wheel, body, pin.SE3.Identity())
     if tip:
         on = model.addJoint(wheel, pin.JointModelRX(), random_pose(rng, 20.0), "tip")
-        model.appendBodyToJoint(on, pin.Inertia(0.1, np.ones(3), 0.01 * np.eye(3)), mount)
+        model.appendBodyToJoint(
+            on, pin.Inertia(0.1, np.ones(3), 0.01 * np.eye(3)), mount
+        )
     arm = model.addJoint(1, pin.JointModelRX(), random_pose(rng, 30.0), "arm")
     link = pin.Inertia(2.0, np.array([0.0, 0.3, 0.1]), 0.1 * np.eye(3))
     model.appendBodyToJoint(arm, link, pin.SE3.Identity())
@@ -42,7 +44,8 @@ def at_angle(robot, angle, base=None):
 def differs(one, other):
     """Largest difference of A and B, relative."""
     return max(
-        np.abs(getattr(one, key) - getattr(other, key)).max() / np.abs(getattr(one, key)).max()
+        np.abs(getattr(one, key) - getattr(other, key)).max()
+        / np.abs(getattr(one, key)).max()
         for key in "AB"
     )
 
@@ -60,13 +63,16 @@ def test_a_spinning_wheel_is_a_relative_equilibrium(frame):
     lin = fflin.linearize(robot, q, v, u, frame=frame)
     assert lin.ignorable == (*HOME, "q_m.wheel")
     assert lin.is_equilibrium(1e-9) and np.abs(lin.f0).max() == pytest.approx(50.0)
-    assert not fflin.linearize(robot, q, v, frame=frame).is_equilibrium()  # it slows down
+    # it slows down
+    assert not fflin.linearize(robot, q, v, frame=frame).is_equilibrium()
     later = fflin.linearize(robot, at_angle(robot, 1.9), v, u, frame=frame)
     assert differs(lin, later) < 1e-12
     # The gyroscopic block: M omega' = -omega x h, with the arm and the wheel's angle free.
     h = lin.M[:3, 6 + robot.joint_names.index("wheel")] * 50.0
     free = fflin.linearize(robot, q, fflin.velocity(robot, {"v_b.y": 3.0}), frame=frame)
-    assert (lin.M @ gyro(lin) - free.M @ gyro(free))[:3] == pytest.approx(skew(h), abs=1e-9)
+    assert (lin.M @ gyro(lin) - free.M @ gyro(free))[:3] == pytest.approx(
+        skew(h), abs=1e-9
+    )
 
 
 def gyro(lin):
@@ -99,7 +105,10 @@ def test_what_is_no_rotor_is_not_taken_for_one(changes):
 
 
 def test_rotors_of_other_kinds():
-    assert fflin.linearize(wheeled(joint=pin.JointModelRZ())).ignorable == (*HOME, "q_m.wheel")
+    assert fflin.linearize(wheeled(joint=pin.JointModelRZ())).ignorable == (
+        *HOME,
+        "q_m.wheel",
+    )
     tilted = np.array([0.6, 0.0, 0.8])
     turned = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), tilted).matrix()
     robot = wheeled(
@@ -107,7 +116,10 @@ def test_rotors_of_other_kinds():
         inertia=turned @ WHEEL @ turned.T,
         lever=0.2 * tilted,
         outputs=[fflin.FramePose("link")],
-        inputs=[fflin.Thruster("link", (0, 0, 0), (0, 1, 0)), fflin.JointTorque("wheel")],
+        inputs=[
+            fflin.Thruster("link", (0, 0, 0), (0, 1, 0)),
+            fflin.JointTorque("wheel"),
+        ],
     )
     assert fflin.linearize(robot).ignorable == (*HOME, "q_m.wheel")
     # What it carries turns with it.
@@ -125,7 +137,10 @@ JOINT = """<link name="l{k}"><inertial><mass value="1"/>
 
 
 def test_a_leader_turns_its_followers(tmp_path):
-    for mimic, names in (('<mimic joint="j1"/>', HOME), ("", (*HOME, "q_m.j1", "q_m.j2"))):
+    for mimic, names in (
+        ('<mimic joint="j1"/>', HOME),
+        ("", (*HOME, "q_m.j1", "q_m.j2")),
+    ):
         joints = JOINT.format(k=1, mimic="") + JOINT.format(k=2, mimic=mimic)
         (tmp_path / "r.urdf").write_text(MIMIC.format(joints=joints))
         robot = fflin.load(tmp_path / "r.urdf")
@@ -160,14 +175,18 @@ def test_a_tumbling_base_is_one_only_in_its_own_axes():
     for axis, steady in ((axes[:, 0], True), (axes[:, 0] + axes[:, 2], False)):
         w = 0.4 * axis
         v = np.concatenate((-np.cross(w, com), w))  # about the centre of mass
-        q = fflin.configuration(robot, None, random_pose(np.random.default_rng(2), 40.0))
+        q = fflin.configuration(
+            robot, None, random_pose(np.random.default_rng(2), 40.0)
+        )
         lin = fflin.linearize(robot, q, v, moving=True)
         assert lin.is_equilibrium() == steady and not lin.f0.any()
         assert lin.ignorable == ("q_b.x", "q_b.y", "q_b.z", *HOME)
         # Wherever the motion takes it, the error dynamics are the same, or they are not.
         a = pin.aba(robot.model, robot.create_data(), q, v, np.zeros(6))
         h = 0.5
-        ahead = fflin.linearize(robot, pin.integrate(robot.model, q, h * v), v + h * a, moving=True)
+        ahead = fflin.linearize(
+            robot, pin.integrate(robot.model, q, h * v), v + h * a, moving=True
+        )
         assert (differs(lin, ahead) < 1e-12) == steady
         static = fflin.linearize(robot, q, v)
         assert not static.is_equilibrium() and static.ignorable == HOME
@@ -180,7 +199,9 @@ def test_gravity_lets_a_base_turn_about_the_vertical_only():
     u = fflin.equilibrium(robot, v=v).u
     lin = fflin.linearize(robot, None, v, u, moving=True)
     assert lin.ignorable == HOME and lin.is_equilibrium()
-    tilted = fflin.configuration(robot, None, random_pose(np.random.default_rng(3), 40.0))
+    tilted = fflin.configuration(
+        robot, None, random_pose(np.random.default_rng(3), 40.0)
+    )
     free = fflin.linearize(robot, tilted, v, moving=True)
     # Whatever balances its velocities, gravity turns against it.
     u = free.M @ -free.drift[6:]
@@ -214,7 +235,9 @@ def test_a_rotor_that_is_looked_from_or_at_is_not_ignorable(reverse):
     frames = ["rim", "hub"][:: -1 if reverse else 1]
     model = robot.model.copy()
     for name, joint in (("rim", model.getJointId("wheel")), ("hub", 1)):
-        model.addFrame(pin.Frame(name, joint, pin.SE3.Identity(), pin.FrameType.OP_FRAME))
+        model.addFrame(
+            pin.Frame(name, joint, pin.SE3.Identity(), pin.FrameType.OP_FRAME)
+        )
     robot = fflin.from_model(model)
     assert "q_m.wheel" in fflin.linearize(robot).ignorable
     seen = robot.replace(outputs=[fflin.RelativePose(*frames)])

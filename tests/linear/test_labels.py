@@ -14,7 +14,9 @@ control = pytest.importorskip("control")
 
 def gripper(path, a, b):
     """A gripper whose joints have the given names."""
-    text = MIMIC.format(links=LINKS, a="revolute", b="revolute", parent="base", mimic="")
+    text = MIMIC.format(
+        links=LINKS, a="revolute", b="revolute", parent="base", mimic=""
+    )
     text = text.replace('joint name="a"', f'joint name="{a}"')
     path.write_text(text.replace('joint name="b"', f'joint name="{b}"'))
     return fflin.load(path)
@@ -27,7 +29,9 @@ def test_a_signal_picked_by_its_label_is_that_signal(tmp_path):
     for at, inputs in itertools.product((0, 6, 7, -1), (0, 6, 7)):
         output, name = system.output_labels[at], system.input_labels[inputs]
         assert output == lin.output_names[at].replace(".", "_")
-        np.testing.assert_allclose(system[output, name](s), system(s)[at, inputs], rtol=1e-12)
+        np.testing.assert_allclose(
+            system[output, name](s), system(s)[at, inputs], rtol=1e-12
+        )
 
 
 def test_signals_with_one_label_are_an_error_everywhere(tmp_path):
@@ -35,8 +39,17 @@ def test_signals_with_one_label_are_an_error_everywhere(tmp_path):
     lin = fflin.linearize(robot)
     gain, seen = fflin.lqr(lin), fflin.kalman(lin, 1e-3, 1e-3)
     uncertain = fflin.uncertain(robot, {"base.mass": 0.1}).lft()
-    for made in (lin, lin.discretize(0.1), gain, seen, fflin.lqg(gain, seen), uncertain):
-        with pytest.raises(fflin.InputError, match=r"'\w+\.a\.b' and '\w+\.a_b' .* rename"):
+    for made in (
+        lin,
+        lin.discretize(0.1),
+        gain,
+        seen,
+        fflin.lqg(gain, seen),
+        uncertain,
+    ):
+        with pytest.raises(
+            fflin.InputError, match=r"'\w+\.a\.b' and '\w+\.a_b' .* rename"
+        ):
             made.to_control()
     assert len({*lin.state_names}) == 16 and lin.to_scipy().A.shape == (16, 16)
 
@@ -66,7 +79,10 @@ def test_a_controller_whose_names_fit_two_signals_is_refused(tmp_path):
     for dotted in ("a.b", "a_b"):
         given = Named(gain, (f"q_m.{dotted}",), (f"tau_m.{dotted}",))
         D = fflin.LinearController(given, lin).system.D
-        at = lin.input_names.index(f"tau_m.{dotted}"), lin.output_names.index(f"q_m.{dotted}")
+        at = (
+            lin.input_names.index(f"tau_m.{dotted}"),
+            lin.output_names.index(f"q_m.{dotted}"),
+        )
         assert D[at] == -2.0 and np.count_nonzero(D) == 1
     system = control.ss([], [], [], gain, inputs=["q_b_x"], outputs=["tau_b_x"])
     assert fflin.LinearController(system, lin).system.D[0, 0] == -2.0

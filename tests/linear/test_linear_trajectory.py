@@ -56,9 +56,14 @@ def test_interpolation_is_on_the_manifold():
     errors = []
     for knots in (21, 41):
         t, fine, speed, _ = motion(robot, knots=2 * knots - 1)
-        coarse = fflin.Trajectory(robot, *(x[::2] for x in motion(robot, knots=2 * knots - 1)))
+        coarse = fflin.Trajectory(
+            robot, *(x[::2] for x in motion(robot, knots=2 * knots - 1))
+        )
         apart = [
-            np.r_[pin.difference(robot.model, coarse.point(at)[0], q), coarse.point(at)[1] - v]
+            np.r_[
+                pin.difference(robot.model, coarse.point(at)[0], q),
+                coarse.point(at)[1] - v,
+            ]
             for at, q, v in zip(t[1::2], fine[1::2], speed[1::2], strict=True)
         ]
         errors.append(np.abs(apart).max())
@@ -101,7 +106,9 @@ def test_what_is_no_motion_is_told_with_the_time_and_refused_where_asked():
         with pytest.raises(fflin.InputError, match=words):
             fflin.linearize_trajectory(robot, *arguments)
     with pytest.raises(fflin.InputError, match="q, v, u"):
-        fflin.linearize_trajectory(robot, fflin.Trajectory(robot, t, q, v, u), hold="linear")
+        fflin.linearize_trajectory(
+            robot, fflin.Trajectory(robot, t, q, v, u), hold="linear"
+        )
 
 
 def test_an_orbit_and_a_fast_wheel_hide_nothing():
@@ -115,7 +122,9 @@ def test_an_orbit_and_a_fast_wheel_hide_nothing():
     assert fflin.linearize_trajectory(robot, t, q, v, u).residual.max() < 1e-9
     for column in (2, robot.joints[0].idx_v):  # along z; a joint of the arm
         step = 0.01 * np.eye(robot.nv)[column]
-        jump = np.array([pin.integrate(robot.model, x, (k >= 3) * step) for k, x in enumerate(q)])
+        jump = np.array(
+            [pin.integrate(robot.model, x, (k >= 3) * step) for k, x in enumerate(q)]
+        )
         with pytest.raises(fflin.InputError, match=r"0\.04 to 0\.06 s"):
             fflin.linearize_trajectory(robot, t, jump, v, u, strict=True)
     drifting = v.copy()
@@ -150,7 +159,14 @@ def held_motion(robot, **options):
     q0, v0, _ = random_point(robot, np.random.default_rng(1))
     run = fflin.simulate(
         *(robot, lambda t, q, v: u[min(int(10.0 * t + 1e-9), 3)]),
-        **{"q0": q0, "v0": 0.3 * v0, "duration": 0.4, "dt": 0.002, "sample": 0.1, "every": 10},
+        **{
+            "q0": q0,
+            "v0": 0.3 * v0,
+            "duration": 0.4,
+            "dt": 0.002,
+            "sample": 0.1,
+            "every": 10,
+        },
         **options,
     )
     return run.trajectory()
@@ -169,7 +185,9 @@ def transition(along, start, end):
             held = np.eye(nx + nu)[nx:] + 0.0
             return (lin.A @ y.reshape(nx, -1) + lin.B @ held).ravel()
 
-        y = solve_ivp(rate, (first, last), y, method="DOP853", rtol=1e-12, atol=1e-14).y[:, -1]
+        y = solve_ivp(
+            rate, (first, last), y, method="DOP853", rtol=1e-12, atol=1e-14
+        ).y[:, -1]
     return y.reshape(nx, -1)
 
 
@@ -178,7 +196,9 @@ def along(request):
     robot = fflin.load("astrobee_arm", gravity=(0.0, 0.1, -0.2), damping=0.05)
     linear = request.param == "linear"
     given = (
-        fflin.Trajectory(robot, *motion(robot)) if linear else held_motion(robot, frame="hybrid")
+        fflin.Trajectory(robot, *motion(robot))
+        if linear
+        else held_motion(robot, frame="hybrid")
     )
     return fflin.linearize_trajectory(robot, given, strict=True)
 
@@ -195,7 +215,9 @@ def test_samples_are_those_of_the_variational_equation(along, dt):
         assert (np.abs(found - expected) / size).max() < 1e-8
         assert (sampled[k].A == sampled.A[k]).all()
         assert sampled[k].dt == dt
-        assert (sampled.matrices(float(sampled.t[k]) + 0.3 * dt)[1] == sampled.B[k]).all()
+        assert (
+            sampled.matrices(float(sampled.t[k]) + 0.3 * dt)[1] == sampled.B[k]
+        ).all()
 
 
 def test_periods_that_do_not_fit_and_sampled_models_are_refused(along):
@@ -218,15 +240,22 @@ def test_a_step_of_the_transition_is_of_order_four(monkeypatch):
         monkeypatch.setattr(linear_trajectory, "_MOST_PARTS", parts)
         found = next(linear_trajectory.transitions(along, 0.2))[1]
         errors.append(np.abs(found - exact).max())
-    assert np.log2(np.divide(errors[:-1], errors[1:])) == pytest.approx([4.0, 4.0], abs=0.5)
+    assert np.log2(np.divide(errors[:-1], errors[1:])) == pytest.approx(
+        [4.0, 4.0], abs=0.5
+    )
 
 
 def test_at_rest_samples_are_those_of_one_model():
     robot = fflin.load("ets_vii")
     t = np.linspace(0.0, 1.0, 3)
     q = np.tile(robot.neutral(), (3, 1))
-    along = fflin.linearize_trajectory(robot, t, q, np.zeros((3, 12)), np.zeros((3, 12)))
-    sampled, lin = along.discretize(0.25), fflin.linearize(robot, moving=True).discretize(0.25)
+    along = fflin.linearize_trajectory(
+        robot, t, q, np.zeros((3, 12)), np.zeros((3, 12))
+    )
+    sampled, lin = (
+        along.discretize(0.25),
+        fflin.linearize(robot, moving=True).discretize(0.25),
+    )
     for k in range(4):
         assert sampled.A[k] == pytest.approx(lin.A, abs=1e-15)
         assert sampled.B[k] == pytest.approx(lin.B, abs=1e-15)
@@ -234,7 +263,9 @@ def test_at_rest_samples_are_those_of_one_model():
 
 @pytest.fixture(scope="module")
 def watched():
-    robot = fflin.load("planar_detumble", outputs=[fflin.Gyroscope("base"), fflin.JointPositions()])
+    robot = fflin.load(
+        "planar_detumble", outputs=[fflin.Gyroscope("base"), fflin.JointPositions()]
+    )
     return robot, fflin.linearize_trajectory(robot, held_motion(robot))
 
 
@@ -245,7 +276,11 @@ def test_its_items_are_the_models_at_the_knots(watched):
     for name in "ABCD":
         assert (getattr(along, name)[3] == getattr(lin, name)).all()
     assert (along.y[3] == lin.y0).all()
-    assert [model.fingerprint for model in along][3] == lin.fingerprint == along[3].fingerprint
+    assert (
+        [model.fingerprint for model in along][3]
+        == lin.fingerprint
+        == along[3].fingerprint
+    )
     assert along[-1].fingerprint == along[20].fingerprint
     with pytest.raises(IndexError):
         along[21]

@@ -11,7 +11,14 @@ import pytest
 
 import fflin
 from fflin.base.rotation import skew
-from tests.support.robots import BUNDLED, FRAMES, mostly, random_point, random_pose, random_tree
+from tests.support.robots import (
+    BUNDLED,
+    FRAMES,
+    mostly,
+    random_point,
+    random_pose,
+    random_tree,
+)
 
 
 def blocks(lin, robot):
@@ -27,7 +34,9 @@ def test_fixed_point_has_the_structure_of_the_source(robots, name):
     lin = fflin.linearize(robot, q)
     n, nv = robot.n, 6 + robot.n
     N = np.diag([0.5] * 3 + [1.0] * (3 + n))
-    assert (lin.A == np.block([[np.zeros((nv, nv)), N], [np.zeros((nv, 2 * nv))]])).all()
+    assert (
+        lin.A == np.block([[np.zeros((nv, nv)), N], [np.zeros((nv, 2 * nv))]])
+    ).all()
     assert not (lin.A @ lin.A).any()
     assert not lin.B[:nv].any()
     assert not lin.f0.any()
@@ -68,7 +77,9 @@ def test_inertia_is_that_of_the_kinetic_energy(robots):
             state = fflin.StateMap(robot, frame=frame, reference=reference)
             nu = state.to_state(q, v)[6 + robot.n :]
             lin = fflin.linearize(robot, q, frame=frame, reference=reference)
-            energy = pin.computeKineticEnergy(robot.model, robot.model.createData(), q, v)
+            energy = pin.computeKineticEnergy(
+                robot.model, robot.model.createData(), q, v
+            )
             assert 0.5 * nu @ lin.M @ nu == pytest.approx(energy, rel=1e-12)
 
 
@@ -81,7 +92,9 @@ def test_rigid_body_closed_form(frame):
     J, m = inertia.inertia, inertia.mass
     w, v, tau, F = rng.normal(size=(4, 3))
     q = fflin.configuration(robot, base=random_pose(rng, 80.0))
-    lin = fflin.linearize(robot, q, np.concatenate((v, w)), np.concatenate((tau, F)), frame=frame)
+    lin = fflin.linearize(
+        robot, q, np.concatenate((v, w)), np.concatenate((tau, F)), frame=frame
+    )
     E, O = np.eye(3), np.zeros((3, 3))
     Jinv = np.linalg.inv(J)
     wdot = Jinv @ (tau - np.cross(w, J @ w))
@@ -157,7 +170,9 @@ def test_orbit_costs_no_digits(frame):
 
 
 @pytest.mark.parametrize("frame", FRAMES)
-@pytest.mark.parametrize("name", mostly(BUNDLED, "cubesat", "planar_detumble", "servicer_7dof"))
+@pytest.mark.parametrize(
+    "name", mostly(BUNDLED, "cubesat", "planar_detumble", "servicer_7dof")
+)
 def test_check_holds_at_random_points(robots, name, frame):
     robot = robots[name]
     rng = np.random.default_rng(7)
@@ -178,7 +193,10 @@ def test_check_holds_on_random_trees(frame):
     for n in (1, 5, 12):
         robot = random_tree(rng, n)
         lin = fflin.linearize(
-            robot, *random_point(robot, rng), frame=frame, reference=random_pose(rng, 20.0)
+            robot,
+            *random_point(robot, rng),
+            frame=frame,
+            reference=random_pose(rng, 20.0),
         )
         found = fflin.check(robot, lin)
         assert found.ok, found
@@ -279,7 +297,11 @@ def test_nothing_of_the_callers_is_changed_or_shared():
     for array, copy in zip((q, v, u), before, strict=True):
         assert (array == copy).all()
         array[:] = 0.0
-    assert (lin.q == before[0]).all() and (lin.v == before[1]).all() and (lin.u0 == before[2]).all()
+    assert (
+        (lin.q == before[0]).all()
+        and (lin.v == before[1]).all()
+        and (lin.u0 == before[2]).all()
+    )
     for array in (lin.A, lin.B, lin.M, lin.x0, lin.f0, lin.q, lin.v, lin.u0):
         with pytest.raises(ValueError, match="read-only"):
             array[0] = 1.0
@@ -291,7 +313,9 @@ def test_slightly_unnormalised_configuration_is_renormalised():
     rough = q.copy()
     rough[3:7] *= 1 + 3e-7
     rough[7:9] *= 1 - 3e-7
-    assert fflin.linearize(robot, rough).B == pytest.approx(fflin.linearize(robot, q).B, rel=1e-12)
+    assert fflin.linearize(robot, rough).B == pytest.approx(
+        fflin.linearize(robot, q).B, rel=1e-12
+    )
 
 
 @pytest.mark.parametrize("dtype", [">f8", "f4", "O"])

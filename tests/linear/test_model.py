@@ -29,7 +29,9 @@ def test_hold_at_rest_is_the_closed_form(rest):
     h = 0.25
     sampled = rest.discretize(h)
     assert (sampled.A == np.eye(24) + rest.A * h).all()
-    assert sampled.B == pytest.approx(rest.B * h + rest.A @ rest.B * h**2 / 2, rel=1e-15)
+    assert sampled.B == pytest.approx(
+        rest.B * h + rest.A @ rest.B * h**2 / 2, rel=1e-15
+    )
     assert sampled.dt == h and not sampled.f0.any()
 
 
@@ -83,16 +85,26 @@ def test_equilibrium_is_told_from_motion(rest, moving):
 
 
 def test_repr_says_what_it_is(rest):
-    assert repr(rest) == "LinearModel('ets_vii', nx=24, nu=12, ny=24, frame='hybrid', continuous)"
+    assert (
+        repr(rest)
+        == "LinearModel('ets_vii', nx=24, nu=12, ny=24, frame='hybrid', continuous)"
+    )
     assert "dt=0.1 s" in repr(rest.discretize(0.1))
 
 
 def test_what_is_made_when_asked_for_survives_copies_and_pickles(robots):
     robot = robots["servicer_7dof"]
-    q = fflin.configuration(robot, {"joint_2": 0.4}, pin.SE3(np.eye(3), np.array([1.0, 2.0, 3.0])))
+    q = fflin.configuration(
+        robot, {"joint_2": 0.4}, pin.SE3(np.eye(3), np.array([1.0, 2.0, 3.0]))
+    )
     expected = np.zeros(30)
     expected[6 + robot.joint_names.index("joint_2")] = 0.4
-    for again in (copy.copy, copy.deepcopy, replace, lambda lin: pickle.loads(pickle.dumps(lin))):
+    for again in (
+        copy.copy,
+        copy.deepcopy,
+        replace,
+        lambda lin: pickle.loads(pickle.dumps(lin)),
+    ):
         lin = again(fflin.linearize(robot, q))
         for name in ("x0", "y0"):
             assert getattr(lin, name) == pytest.approx(expected, abs=1e-15)

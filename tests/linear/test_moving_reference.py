@@ -29,7 +29,8 @@ def test_kinematics_are_those_of_a_turning_reference():
     w, linear = v[3:6], v[:3]
     E, O = np.eye(3), np.zeros((3, 3))
     assert lin.A[:6] == pytest.approx(
-        np.block([[-skew(w), O, E / 2, O], [-2 * skew(linear), -skew(w), O, E]]), abs=1e-15
+        np.block([[-skew(w), O, E / 2, O], [-2 * skew(linear), -skew(w), O, E]]),
+        abs=1e-15,
     )
 
 
@@ -51,7 +52,9 @@ def test_error_of_two_motions_follows_the_model():
         return pin.integrate(model, q, h * v + h * h / 2 * a_middle), v + h * a_middle
 
     def error(q, v, q1, v1):
-        relative = fflin.StateMap(robot, reference=pin.XYZQUATToSE3(q[:7]), frame="local")
+        relative = fflin.StateMap(
+            robot, reference=pin.XYZQUATToSE3(q[:7]), frame="local"
+        )
         return relative.to_state(q1, v1) - relative.to_state(q, v)
 
     lin = fflin.linearize(robot, q, v, u, moving=True)

@@ -19,7 +19,10 @@ CW = np.zeros((6, 6))
 CW[:3, 3:] = np.eye(3)
 CW[3:, :3] = np.diag((3.0 * N**2, 0.0, -(N**2)))
 CW[3, 4], CW[4, 3] = 2.0 * N, -2.0 * N
-HILL_OF = {"hill": np.eye(3), "lvlh": np.array(((0, 0, -1.0), (1.0, 0, 0), (0, -1.0, 0)))}
+HILL_OF = {
+    "hill": np.eye(3),
+    "lvlh": np.array(((0, 0, -1.0), (1.0, 0, 0), (0, -1.0, 0))),
+}
 
 
 def moved(robot, rng, speed=0.4, degrees=100.0):
@@ -66,7 +69,10 @@ def test_its_samples_are_the_closed_form_of_textbooks():
             [0, 0, -N * s, 0, 0, c],
         ]
     )
-    assert np.abs(translation(lin.discretize(h)) - expected).max() < 1e-14 * np.abs(expected).max()
+    assert (
+        np.abs(translation(lin.discretize(h)) - expected).max()
+        < 1e-14 * np.abs(expected).max()
+    )
 
 
 @pytest.mark.parametrize("name", ROBOTS)
@@ -75,7 +81,9 @@ def test_every_route_agrees_at_any_point(name, frame):
     robot = in_orbit(fflin.load(name))
     rng = np.random.default_rng(1)
     for speed, reference in ((0.0, None), (0.4, None), (0.4, random_pose(rng, 30.0))):
-        lin = fflin.linearize(robot, *moved(robot, rng, speed), frame=frame, reference=reference)
+        lin = fflin.linearize(
+            robot, *moved(robot, rng, speed), frame=frame, reference=reference
+        )
         found = fflin.check(robot, lin)
         assert found.ok, found
 
@@ -93,7 +101,11 @@ def test_and_with_springs_wheels_thrusters_and_sensors():
             fflin.ReactionWheel((1.0, 0.0, 0.0), inertia=0.1),
             fflin.ReactionWheel((0.0, 1.0, 0.0), momentum=2.0),
         ],
-        outputs=[fflin.Gyroscope(tool), fflin.FrameVelocity(tool), fflin.FramePose(tool)],
+        outputs=[
+            fflin.Gyroscope(tool),
+            fflin.FrameVelocity(tool),
+            fflin.FramePose(tool),
+        ],
     )
     for frame in ("hill", "lvlh"):
         lin = fflin.linearize(robot, *moved(robot, rng), frame=frame)
@@ -128,7 +140,9 @@ def test_a_root_that_stands_askew_in_the_world_changes_nothing():
     assert fflin.check(robot, lin).ok
     for one in fflin.relative_equilibria(robot)[::7]:
         about = model.jointPlacements[1] * pin.XYZQUATToSE3(one.q[:7])
-        assert np.abs(fflin.equilibrium(robot, one.q, reference=about).u[:6]).max() < 1e-12
+        assert (
+            np.abs(fflin.equilibrium(robot, one.q, reference=about).u[:6]).max() < 1e-12
+        )
 
 
 def test_a_base_that_flies_fast_is_seen_from_the_frame_that_turns():
@@ -163,20 +177,27 @@ def test_files_carry_the_orbit(tmp_path, ending):
 
 def test_a_sweep_has_the_same_models_and_its_file_the_orbit(tmp_path):
     robot = in_orbit(fflin.load("servicer_7dof"))
-    batch = fflin.sweep(robot, fflin.grid(robot, {"joint_2": np.linspace(-1, 1, 20)}), frame="hill")
+    batch = fflin.sweep(
+        robot, fflin.grid(robot, {"joint_2": np.linspace(-1, 1, 20)}), frame="hill"
+    )
     lin = fflin.linearize(robot, batch.q[3], frame="hill")
     for name in ("A", "B", "f0", "x0", "mean_motion"):
         assert np.array_equal(getattr(batch[3], name), getattr(lin, name))
     batch.save(tmp_path / "batch.npz")
     assert fflin.LinearBatch.load(tmp_path / "batch.npz")[3].mean_motion == N
-    assert fflin.LinearBatch.load(tmp_path / "batch.npz", robot)[3].certificate.route_A < 1e-10
+    assert (
+        fflin.LinearBatch.load(tmp_path / "batch.npz", robot)[3].certificate.route_A
+        < 1e-10
+    )
     with pytest.raises(fflin.InputError, match="'servicer_7dof'"):
         fflin.LinearBatch.load(tmp_path / "batch.npz", robot.replace(orbit=8e5))
 
 
 def test_an_equilibrium_holds_against_the_gradient():
     robot = fflin.load("servicer_7dof", orbit=800e3)
-    q = fflin.configuration(robot, {"joint_2": 0.7}, random_pose(np.random.default_rng(4), 40.0))
+    q = fflin.configuration(
+        robot, {"joint_2": 0.7}, random_pose(np.random.default_rng(4), 40.0)
+    )
     for frame in ("lvlh", "hill"):
         held = fflin.equilibrium(robot, q, frame=frame)
         lin = fflin.linearize(robot, q, u=held.u, frame=frame)
@@ -203,21 +224,35 @@ def test_an_equilibrium_holds_against_the_gradient():
     [
         (lambda robot: fflin.linearize(robot, frame="local"), "lvlh or hill"),
         (lambda robot: fflin.linearize(robot, moving=True), "moving=True"),
-        (lambda robot: fflin.linearize(fflin.load("cubesat"), frame="lvlh"), "orbit=..."),
-        (lambda robot: fflin.linearize(robot.replace(outputs=[fflin.Momentum()])), "output"),
         (
-            lambda robot: fflin.linearize(robot.replace(outputs=[fflin.Accelerometer("base")])),
+            lambda robot: fflin.linearize(fflin.load("cubesat"), frame="lvlh"),
+            "orbit=...",
+        ),
+        (
+            lambda robot: fflin.linearize(robot.replace(outputs=[fflin.Momentum()])),
+            "output",
+        ),
+        (
+            lambda robot: fflin.linearize(
+                robot.replace(outputs=[fflin.Accelerometer("base")])
+            ),
             "output",
         ),
         (lambda robot: fflin.uncertain(robot, {"base.mass": 0.1}).lft(), "orbit"),
         (lambda robot: fflin.capture(robot, "base", fflin.load("ets_vii")), "orbit"),
-        (lambda robot: fflin.acceleration_lqr(fflin.linearize(robot), 1, 1, 1), "fixed point|lqr"),
+        (
+            lambda robot: fflin.acceleration_lqr(fflin.linearize(robot), 1, 1, 1),
+            "fixed point|lqr",
+        ),
         (lambda robot: fflin.relative_equilibria(robot.replace(orbit=None)), "orbit"),
         (lambda robot: far(robot, 5000e3), "linear"),
     ],
 )
 def test_what_an_orbit_has_not_is_one_line(ask, words):
-    with pytest.raises(fflin.InputError, match=words) as refused, warnings.catch_warnings():
+    with (
+        pytest.raises(fflin.InputError, match=words) as refused,
+        warnings.catch_warnings(),
+    ):
         warnings.simplefilter("ignore")
         ask(fflin.load("cubesat", orbit=800e3))
     assert "\n" not in str(refused.value)

@@ -12,7 +12,12 @@ from tests.support.orbits import in_orbit
 from tests.support.robots import free_body
 
 LEO, GEO = 1.06e-3, 7.29e-5  # [rad/s]
-BODIES = ((3.0, 5.0, 4.0), (0.0062, 0.0146, 0.0152), (2000.0, 1000.0, 2800.0), (5.0, 5.0, 3.0))
+BODIES = (
+    (3.0, 5.0, 4.0),
+    (0.0062, 0.0146, 0.0152),
+    (2000.0, 1000.0, 2800.0),
+    (5.0, 5.0, 3.0),
+)
 
 
 def matched(found, expected):
@@ -67,9 +72,13 @@ def test_pitch_libration_of_a_stable_body_is_the_closed_form():
 
 
 def test_the_kinds_of_attitudes_are_told_and_margins_decide():
-    stable, *others = fflin.relative_equilibria(in_orbit(free_body((3.0, 5.0, 4.0)), LEO))[::4]
+    stable, *others = fflin.relative_equilibria(
+        in_orbit(free_body((3.0, 5.0, 4.0)), LEO)
+    )[::4]
     assert stable.stable and tuple(stable.moments) == pytest.approx((3.0, 4.0, 5.0))
-    assert all(one.stable is False and one.poles.real.max() > 1e-5 * LEO for one in others)
+    assert all(
+        one.stable is False and one.poles.real.max() > 1e-5 * LEO for one in others
+    )
     even = fflin.relative_equilibria(in_orbit(free_body((3.0, 3.0, 3.0)), LEO))
     assert all(one.stable is None for one in even)
     assert "undecided" in str(even) and "stable" not in str(even)
@@ -91,7 +100,9 @@ def test_what_has_no_such_attitudes_is_refused():
 
 def test_joints_hold_their_posture_in_a_relative_equilibrium():
     robot = fflin.load("servicer_7dof", orbit=800e3)
-    robot = robot.replace(inputs=[fflin.JointTorque(name) for name in robot.joint_names])
+    robot = robot.replace(
+        inputs=[fflin.JointTorque(name) for name in robot.joint_names]
+    )
     q = fflin.configuration(robot, {"joint_2": 0.5, "joint_4": -0.8})
     for one in fflin.relative_equilibria(robot, q)[:8:3]:
         assert np.array_equal(one.q[7:], q[7:])

@@ -54,7 +54,9 @@ def test_a_length_within_the_tolerance_is_normalised_and_another_is_refused(robo
             taken = robot.checked_configuration(near)
             np.testing.assert_allclose(taken, exact, rtol=0, atol=1e-15)
             assert np.array_equal(fflin.sweep(robot, near[None]).q[0], taken)
-            with pytest.raises(fflin.InputError, match=r"has length (0\.99998|1\.00001)"):
+            with pytest.raises(
+                fflin.InputError, match=r"has length (0\.99998|1\.00001)"
+            ):
                 robot.checked_configuration(far)
 
 
@@ -91,7 +93,9 @@ def test_placements_of_a_model_with_six_decimals_become_rotations():
         R = random_pose(np.random.default_rng(index), 90.0).rotation
         model.jointPlacements[index].rotation = R
         rough.jointPlacements[index].rotation = np.round(R, 6)
-    rough.addFrame(pin.Frame("eye", ROOT, 0, rough.jointPlacements[2], pin.FrameType.OP_FRAME))
+    rough.addFrame(
+        pin.Frame("eye", ROOT, 0, rough.jointPlacements[2], pin.FrameType.OP_FRAME)
+    )
     before = rough.copy()
     robot = fflin.from_model(rough)
     assert rough == before  # the model of the caller stays as it is
@@ -131,7 +135,9 @@ def test_poses_in_files_of_other_programs_are_normalised(robots, tmp_path):
         text[key] = np.round(text[key], 6).tolist()
         path.write_text(json.dumps(text))
         read = type(made).load(path)
-        assert np.linalg.norm(read.placement[3:]) == pytest.approx(1.0, rel=0, abs=3e-16)
+        assert np.linalg.norm(read.placement[3:]) == pytest.approx(
+            1.0, rel=0, abs=3e-16
+        )
         np.testing.assert_allclose(read.placement, lin.placement, rtol=0, atol=1.1e-6)
         text[key] = (1.1 * np.array(text[key])).tolist()
         path.write_text(json.dumps(text))
@@ -150,7 +156,9 @@ def test_the_reference_of_a_trajectory_file_is_normalised_or_refused(robots, tmp
         path.write_text(json.dumps(given | {"placement": placement.tolist()}))
         if factor == 1.0:
             found = fflin.Trajectory.load(path, robot).q[0]
-            expected = fflin.StateMap(robot, reference=pin.XYZQUATToSE3(exact)).to_pinocchio(x[0])
+            expected = fflin.StateMap(
+                robot, reference=pin.XYZQUATToSE3(exact)
+            ).to_pinocchio(x[0])
             np.testing.assert_allclose(found, expected[0], rtol=0, atol=TURN)
         else:
             with pytest.raises(fflin.InputError, match=r"placement.* has length 2"):

@@ -30,7 +30,9 @@ def rows_of(robot, frame, own):
     state = fflin.StateMap(robot, reference=reference, frame=frame)
     actuation = Actuation(state)
     source = Accelerations(state, actuation, robot.create_data())
-    q, v, u = map(np.array, zip(*(random_point(robot, rng) for _ in range(COUNT)), strict=True))
+    q, v, u = map(
+        np.array, zip(*(random_point(robot, rng) for _ in range(COUNT)), strict=True)
+    )
     if robot.orbit:
         q[:, :3] *= 0.1
     nv, nu = state.nx // 2, state.velocities(v)
@@ -41,13 +43,20 @@ def rows_of(robot, frame, own):
         for point in zip(q, v, nu, u, strict=True)
     ]
     charts = [Standing() if own else state.chart(row) for row in q]
-    return state, actuation, (chart, nu, u, rates), list(zip(charts, nu, u, rates, strict=True))
+    return (
+        state,
+        actuation,
+        (chart, nu, u, rates),
+        list(zip(charts, nu, u, rates, strict=True)),
+    )
 
 
 def assembled(state, actuation, chart, nu, u, rates, moving):
     """A, the lower half of B, and f0, of rates that are left as they are."""
     A = np.zeros((*nu.shape[:-1], state.nx, state.nx))
-    A[..., : state.nx // 2, :] = fflin.Linearizer(state.robot).prepared.rest["A"][: state.nx // 2]
+    A[..., : state.nx // 2, :] = fflin.Linearizer(state.robot).prepared.rest["A"][
+        : state.nx // 2
+    ]
     A[..., state.nx // 2 :, :] = rates.slopes
     own = AccelerationDerivatives(
         rates.c, A[..., state.nx // 2 :, :], rates.by_u.copy(), rates.gravity
@@ -57,14 +66,22 @@ def assembled(state, actuation, chart, nu, u, rates, moving):
 
 
 @pytest.mark.parametrize(("frame", "own", "moving", "fields"), CASES)
-def test_many_rows_are_the_same_as_one_after_the_other(robots, frame, own, moving, fields):
+def test_many_rows_are_the_same_as_one_after_the_other(
+    robots, frame, own, moving, fields
+):
     robot = robots["planar_detumble"].replace(**fields)
     state, actuation, (chart, nu, u, rates), points = rows_of(robot, frame, own)
-    many = AccelerationDerivatives(*(np.array(part) for part in zip(*rates, strict=True)))
+    many = AccelerationDerivatives(
+        *(np.array(part) for part in zip(*rates, strict=True))
+    )
     found = assembled(state, actuation, chart, nu, u, many, moving)
     for row, point in enumerate(points):
-        for all_rows, one in zip(found, assembled(state, actuation, *point, moving), strict=True):
-            assert np.abs(all_rows[row] - one).max() < 1e-13 * max(1.0, np.abs(one).max())
+        for all_rows, one in zip(
+            found, assembled(state, actuation, *point, moving), strict=True
+        ):
+            assert np.abs(all_rows[row] - one).max() < 1e-13 * max(
+                1.0, np.abs(one).max()
+            )
 
 
 def test_the_charts_of_rows_are_those_of_each(robots):
@@ -77,14 +94,20 @@ def test_the_charts_of_rows_are_those_of_each(robots):
     for row, point in enumerate(q):
         one = state.chart(point)
         for name in ("q_b", "R", "N", "J"):
-            assert getattr(charts, name)[row] == pytest.approx(getattr(one, name), abs=1e-14)
+            assert getattr(charts, name)[row] == pytest.approx(
+                getattr(one, name), abs=1e-14
+            )
         assert charts.q0[row, 0] == pytest.approx(one.q0, abs=1e-14) and one.q0 >= 0.0
         assert charts.rate(w)[row] == pytest.approx(one.rate(w[row]), abs=1e-14)
     # (1.2) and (1.3): N and J are inverse, R = exp of twice the angle of q_b about its axis.
-    assert charts.N @ charts.J == pytest.approx(np.tile(np.eye(3), (COUNT, 1, 1)), abs=1e-12)
+    assert charts.N @ charts.J == pytest.approx(
+        np.tile(np.eye(3), (COUNT, 1, 1)), abs=1e-12
+    )
     for q_b, R in zip(charts.q_b, charts.R, strict=True):
         size = np.linalg.norm(q_b)
-        assert R == pytest.approx(pin.exp3(2.0 * np.arcsin(size) * q_b / size), abs=1e-12)
+        assert R == pytest.approx(
+            pin.exp3(2.0 * np.arcsin(size) * q_b / size), abs=1e-12
+        )
 
 
 def test_a_body_that_turns_alone_has_its_closed_form(robots):
@@ -93,7 +116,9 @@ def test_a_body_that_turns_alone_has_its_closed_form(robots):
     rng = np.random.default_rng(7)
     q, v, _ = random_point(robot, rng)
     tau = rng.normal(size=3)
-    lin = fflin.linearize(robot, q, v, np.concatenate((tau, np.zeros(3))), frame="local")
+    lin = fflin.linearize(
+        robot, q, v, np.concatenate((tau, np.zeros(3))), frame="local"
+    )
     body, w = robot.model.inertias[1], v[3:]
     # About the base's origin, since M is.
     M = lin.M

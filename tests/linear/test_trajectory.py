@@ -44,12 +44,20 @@ def test_one_step_of_torque_holds_at_every_spacing(knots):
         return u[min(int(t / times[1] + 1e-9), knots - 1)]
 
     run = fflin.simulate(
-        *(robot, policy), duration=2.0, dt=0.005, sample=times[1], every=round(times[1] / 0.005)
+        *(robot, policy),
+        duration=2.0,
+        dt=0.005,
+        sample=times[1],
+        every=round(times[1] / 0.005),
     )
     held = fflin.Trajectory(robot, run.t, run.q, run.v, u[:-1], frame="hybrid")
     assert held.hold == "previous"
     assert held.residual.max() < 1e-8
-    assert fflin.linearize_trajectory(robot, held, strict=True).A.shape == (knots, 18, 18)
+    assert fflin.linearize_trajectory(robot, held, strict=True).A.shape == (
+        knots,
+        18,
+        18,
+    )
     # And only so: the step is no slope.
     assert replace(held, hold="linear").residual.max() > 1e-2
 
@@ -127,11 +135,17 @@ def test_intervals_are_integrated_once(monkeypatch):
     t, q, v, u = motion(robot)
     given, ends = fflin.Trajectory(robot, t, q, v, 1.1 * u), []
     end = fflin.Trajectory.end
-    monkeypatch.setattr(fflin.Trajectory, "end", lambda *each: ends.append(each[1]) or end(*each))
+    monkeypatch.setattr(
+        fflin.Trajectory, "end", lambda *each: ends.append(each[1]) or end(*each)
+    )
     with pytest.warns(fflin.FflinWarning, match="not a motion"):
         along = fflin.linearize_trajectory(robot, given)
     count = len(ends)
-    assert "not a motion" in str(along) and "not a motion" in str(given) and len(ends) == count
+    assert (
+        "not a motion" in str(along)
+        and "not a motion" in str(given)
+        and len(ends) == count
+    )
     assert 80 <= count <= 8 * 80
 
 
@@ -149,7 +163,9 @@ def test_what_overflows_is_refused_with_its_place(name, row, value, where, monke
     given = dict(zip("tqvu", map(np.array, motion(robot)), strict=True))
     given[name][row if name == "t" else (row, 2)] = value
     ends, end = [], fflin.Trajectory.end
-    monkeypatch.setattr(fflin.Trajectory, "end", lambda *each: ends.append(each[1]) or end(*each))
+    monkeypatch.setattr(
+        fflin.Trajectory, "end", lambda *each: ends.append(each[1]) or end(*each)
+    )
     with pytest.raises(fflin.InputError, match=re.escape(where)):
         fflin.linearize_trajectory(robot, *given.values())
     # An interval that overflows is left at once.
@@ -181,7 +197,10 @@ def test_resampled_is_the_same_motion(loop):
     assert fine.q[::2] == pytest.approx(along.q, abs=1e-15)
     assert fine.residual.max() < 1e-3  # what the cubics miss
     expected = run(sample=0.1, every=5)
-    apart = [pin.difference(robot.model, *pair) for pair in zip(fine.q, expected.q, strict=True)]
+    apart = [
+        pin.difference(robot.model, *pair)
+        for pair in zip(fine.q, expected.q, strict=True)
+    ]
     assert np.abs(apart).max() < 1e-5
     uneven = along.resampled(0.3)
     assert uneven.t == pytest.approx([0.0, 0.3, 0.6, 0.9, 1.2, 1.5, 1.8, 2.0])
@@ -209,10 +228,14 @@ def test_points_between_knots_are_of_order_four():
     def missed(every):
         along = fflin.Trajectory(robot, *(each[::every] for each in (t, q, v, u)))
         midway = range(every // 2, len(t), every)
-        apart = [pin.difference(robot.model, along.point(t[k])[0], q[k]) for k in midway]
+        apart = [
+            pin.difference(robot.model, along.point(t[k])[0], q[k]) for k in midway
+        ]
         return np.abs(apart).max(axis=0)
 
-    assert np.log2(missed(16) / missed(8)) == pytest.approx(np.full(robot.nv, 4.0), abs=0.5)
+    assert np.log2(missed(16) / missed(8)) == pytest.approx(
+        np.full(robot.nv, 4.0), abs=0.5
+    )
 
 
 def test_a_bad_interval_is_told_at_both_its_knots(loop):
@@ -235,7 +258,9 @@ def test_what_is_saved_is_read_to_the_last_bit(loop, tmp_path, ending):
     assert again.verified and "not verified" not in str(again)
 
 
-def test_a_changed_csv_is_refused_and_one_of_another_program_is_not_verified(loop, tmp_path):
+def test_a_changed_csv_is_refused_and_one_of_another_program_is_not_verified(
+    loop, tmp_path
+):
     robot, run = loop
     path = tmp_path / "a.csv"
     along = run(sample=0.1, every=10).trajectory()
@@ -278,7 +303,9 @@ def test_files_of_other_programs_are_read(loop, tmp_path):
     turned = replace(along, frame="world", u=_of_world(along))
 
     # An input that does nothing may be left out.
-    along, turned = (replace(each, u=each.u * (np.arange(9) != 7)) for each in (along, turned))
+    along, turned = (
+        replace(each, u=each.u * (np.arange(9) != 7)) for each in (along, turned)
+    )
 
     def same(path, **options):
         again = fflin.Trajectory.load(path, robot, **options)
@@ -295,7 +322,10 @@ def test_files_of_other_programs_are_read(loop, tmp_path):
 
     def write(columns, last=None):
         with path.open("w", newline="", encoding="utf-8-sig") as file:
-            rows = [list(map(repr, map(float, row))) for row in zip(*columns.values(), strict=True)]
+            rows = [
+                list(map(repr, map(float, row)))
+                for row in zip(*columns.values(), strict=True)
+            ]
             if last is not None:
                 rows[-1][19:] = [last] * (len(columns) - 19)
             csv.writer(file).writerows([columns, *rows])
@@ -305,15 +335,26 @@ def test_files_of_other_programs_are_read(loop, tmp_path):
     write(columns)
     same(path, frame="world", hold="previous")
 
-    savemat(tmp_path / "a.mat", {"t": along.t, "x": x, "u": turned.u[:-1], "frame": "world"})
+    savemat(
+        tmp_path / "a.mat", {"t": along.t, "x": x, "u": turned.u[:-1], "frame": "world"}
+    )
     same(tmp_path / "a.mat")
-    struct = {"t": along.t, "q": along.q, "v": along.v, "u": along.u_base, "hold": "previous"}
+    struct = {
+        "t": along.t,
+        "q": along.q,
+        "v": along.v,
+        "u": along.u_base,
+        "hold": "previous",
+    }
     savemat(tmp_path / "b.mat", {"traj": struct})
     same(tmp_path / "b.mat", frame="local")
     np.savez(tmp_path / "c.npz", t=along.t, q=along.q, v=along.v, u=along.u[:-1])
     same(tmp_path / "c.npz", frame="hybrid")
     plain = {"t": along.t, "x": x, "u": turned.u, "hold": "previous", "frame": "world"}
-    lists = {name: x.tolist() if isinstance(x, np.ndarray) else x for name, x in plain.items()}
+    lists = {
+        name: x.tolist() if isinstance(x, np.ndarray) else x
+        for name, x in plain.items()
+    }
     (tmp_path / "d.json").write_text(json.dumps(lists))
     same(tmp_path / "d.json")
 
@@ -322,7 +363,10 @@ def test_files_of_other_programs_are_read(loop, tmp_path):
     assert again.residual.max() < 1e-8
     with pytest.raises(fflin.InputError, match="file"):
         fflin.Motion.load(tmp_path / "motion.npz").trajectory()
-    assert fflin.Motion.load(tmp_path / "motion.npz").trajectory(robot).residual.max() < 1e-8
+    assert (
+        fflin.Motion.load(tmp_path / "motion.npz").trajectory(robot).residual.max()
+        < 1e-8
+    )
 
     write(columns | {"tau_m.nosuch": along.t})
     with pytest.raises(fflin.UnknownNameError, match=r"by_hand\.csv.*'tau_m"):
@@ -336,7 +380,9 @@ def test_files_of_other_programs_are_read(loop, tmp_path):
     with pytest.raises(fflin.InputError, match=r"column q_m.joint_2\[3\] is nan"):
         fflin.Trajectory.load(path, robot)
     path.write_text(path.read_text().replace("nan", "much"))
-    with pytest.raises(fflin.InputError, match=r"column q_m\.joint_2: .*'much'; expected"):
+    with pytest.raises(
+        fflin.InputError, match=r"column q_m\.joint_2: .*'much'; expected"
+    ):
         fflin.Trajectory.load(path, robot)
     path.write_text("t,tau_b.x\n1,2\n3\n")
     with pytest.raises(fflin.FileError, match="row 3"):
@@ -369,26 +415,35 @@ def test_rows_that_miss_the_samples_are_told():
     run = fflin.simulate(robot, lambda t, q, v: np.zeros(6), every=7, **options)
     assert says(run.notes[0], "7 steps", "10")
     for every in (1, 2, 5, 10, 20):
-        assert not fflin.simulate(robot, lambda t, q, v: np.zeros(6), every=every, **options).notes
+        assert not fflin.simulate(
+            robot, lambda t, q, v: np.zeros(6), every=every, **options
+        ).notes
 
 
 def test_a_base_that_turns_too_far_between_knots_is_told():
     robot = fflin.load("cubesat")
     for speed, far in ((3.3, True), (2.0, False)):
         v0 = fflin.velocity(robot, {"omega_b.z": speed})
-        spin = fflin.simulate(robot, v0=v0, duration=4.0, dt=0.01, every=100).trajectory()
+        spin = fflin.simulate(
+            robot, v0=v0, duration=4.0, dt=0.01, every=100
+        ).trajectory()
         assert ("the base rotates by 3.3 rad from t = 0 to 1 s" in str(spin)) == far
 
 
 @pytest.mark.parametrize("name", ["hinge ", " hinge", "hinge\rof", "a\nb"])
 def test_a_csv_with_odd_joint_names_is_read_back(name, tmp_path):
     model = pin.Model()
-    root = model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "root_joint")
+    root = model.addJoint(
+        0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "root_joint"
+    )
     model.appendBodyToJoint(root, pin.Inertia.Random(), pin.SE3.Identity())
     joint = model.addJoint(root, pin.JointModelRX(), pin.SE3.Identity(), name)
     model.appendBodyToJoint(joint, pin.Inertia.Random(), pin.SE3.Identity())
     robot = fflin.from_model(model)
-    rows = [np.tile(x, (2, 1)) for x in (robot.neutral(), np.zeros(robot.nv), np.arange(7.0))]
+    rows = [
+        np.tile(x, (2, 1))
+        for x in (robot.neutral(), np.zeros(robot.nv), np.arange(7.0))
+    ]
     before = fflin.Trajectory(robot, [0.0, 1.0], *rows)
     before.save(tmp_path / "a.csv")
     after = fflin.Trajectory.load(tmp_path / "a.csv", robot)

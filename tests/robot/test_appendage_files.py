@@ -74,7 +74,12 @@ def test_robot_file_gives_the_same_robot_as_python(tmp_path):
         ("[[slosh]]\nname", "[slosh]\nname", 22, "invalid TOML"),
         ("translation = [[0, 0], [0, 0], [0.5, 0.1]]", "translation = 3", 6, "shape"),
         ("[0.5, 0.1]", "[0.5, 5.1]", 4, "left_mode_2"),
-        ('frame = "panel_left_link"', 'frame = "base"\nop4 = "a.op4"', 8, "'frequency'"),
+        (
+            'frame = "panel_left_link"',
+            'frame = "base"\nop4 = "a.op4"',
+            8,
+            "'frequency'",
+        ),
         ("mass = 5.0", "mass = 5e6", 4, "base_slosh_x"),
         ("radius = 0.3\n", "", 13, "the key 'radius'"),
     ],

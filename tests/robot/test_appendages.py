@@ -76,7 +76,8 @@ def test_effective_masses_of_a_beam_are_the_published_shares():
 def test_the_arrays_of_the_bundled_inspector_are_uniform_beams_of_its_panels():
     robot = fflin.load("inspector_flexible.toml")
     assert robot.mass == pytest.approx(fflin.load("inspector").mass, rel=1e-12)
-    expected = beam(12.0, 2.1, 1.0, 2)  # 12 kg and 2.1 m, clamped 0.05 m from the hinge line
+    # 12 kg and 2.1 m, clamped 0.05 m from the hinge line
+    expected = beam(12.0, 2.1, 1.0, 2)
     bending = [0, 2]
     for side, sign in zip(robot.appendages, (1.0, -1.0), strict=True):
         across = expected.translation[2]
@@ -135,7 +136,9 @@ def participation(rigid, appendage, q):
     data = rigid.create_data()
     frame = rigid.model.getFrameId(appendage.frame, pin.FrameType.BODY)
     J = pin.computeFrameJacobian(rigid.model, data, q, frame, pin.ReferenceFrame.LOCAL)
-    return StateMap(rigid).columns(J).T @ np.vstack((appendage.translation, appendage.rotation))
+    return StateMap(rigid).columns(J).T @ np.vstack(
+        (appendage.translation, appendage.rotation)
+    )
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -143,7 +146,10 @@ def test_the_mass_matrix_is_the_rigid_one_bordered_by_the_participation(seed):
     rigid, appendages = servicer()
     robot = rigid.replace(appendages=appendages)
     q, q_rigid = postures(robot, rigid, seed)
-    old = [*range(6), *(6 + robot.joint_names.index(name) for name in rigid.joint_names)]
+    old = [
+        *range(6),
+        *(6 + robot.joint_names.index(name) for name in rigid.joint_names),
+    ]
     expected = np.eye(6 + robot.n)
     expected[np.ix_(old, old)] = symmetric(rigid, q_rigid)
     for appendage in appendages:
@@ -168,7 +174,9 @@ def test_the_linear_model_is_that_of_hybrid_coordinates():
         ):
             at, omega = 6 + robot.joint_names.index(name), 2.0 * math.pi * f
             K[at, at], D[at, at] = omega**2, 2.0 * ratio * omega
-    assert lin.A[6 + n :, 6 : 6 + n] == pytest.approx(-np.linalg.solve(M, K)[:, 6:], rel=1e-12)
+    assert lin.A[6 + n :, 6 : 6 + n] == pytest.approx(
+        -np.linalg.solve(M, K)[:, 6:], rel=1e-12
+    )
     assert lin.A[6 + n :, 6 + n :] == pytest.approx(-np.linalg.solve(M, D), rel=1e-12)
     units = dict(zip(lin.state_names, lin.state_units, strict=True))
     assert units["q_m.boom_mode_1"] == "kg^0.5 m"
@@ -179,11 +187,17 @@ def test_the_linear_model_is_that_of_hybrid_coordinates():
 def full():
     """Servicer with appendages, a tank on springs, a pendulum and a wheel."""
     rigid, appendages = servicer()
-    tank = fflin.Slosh("base", 30.0, (0.1, 0.0, 0.3), frequency=0.2, damping=0.02, name="tank")
-    swing = fflin.Slosh("base", 20.0, (0.0, 0.1, 0.0), length=0.4, axis=(1, 0, 0), name="swing")
+    tank = fflin.Slosh(
+        "base", 30.0, (0.1, 0.0, 0.3), frequency=0.2, damping=0.02, name="tank"
+    )
+    swing = fflin.Slosh(
+        "base", 20.0, (0.0, 0.1, 0.0), length=0.4, axis=(1, 0, 0), name="swing"
+    )
     wheel = fflin.ReactionWheel((0.0, 0.6, 0.8), inertia=0.1, name="wheel")
     return rigid.replace(
-        inputs=[*rigid.inputs, wheel], appendages=[*appendages, tank, swing], gravity=(0, 0, -0.01)
+        inputs=[*rigid.inputs, wheel],
+        appendages=[*appendages, tank, swing],
+        gravity=(0, 0, -0.01),
     )
 
 
@@ -209,8 +223,13 @@ def test_states_are_converted_both_ways():
     q, v = state.to_pinocchio(x)
     assert state.to_state(q, v) == pytest.approx(x, rel=1e-13, abs=1e-15)
     mode = robot.joint("boom_mode_2")
-    assert mode.value(q) == pytest.approx(x[state.names.index("q_m.boom_mode_2")], rel=1e-14)
-    assert fflin.configuration(robot, {"boom_mode_2": mode.value(q)})[mode.idx_q] == q[mode.idx_q]
+    assert mode.value(q) == pytest.approx(
+        x[state.names.index("q_m.boom_mode_2")], rel=1e-14
+    )
+    assert (
+        fflin.configuration(robot, {"boom_mode_2": mode.value(q)})[mode.idx_q]
+        == q[mode.idx_q]
+    )
 
 
 def test_momentum_and_energy_are_kept_without_damping():
@@ -243,7 +262,9 @@ def test_pendulum_under_thrust_swings_with_the_reduced_mass():
     model.addJointFrame(1)
     robot = fflin.from_model(model, name="tank")
     robot = robot.replace(
-        appendages=[fflin.Slosh("root_joint", m1, (0, 0, -length), length=length, name="fuel")]
+        appendages=[
+            fflin.Slosh("root_joint", m1, (0, 0, -length), length=length, name="fuel")
+        ]
     )
     lin = fflin.linearize(robot, u=fflin.effort(robot, {"F_b.z": thrust}), moving=True)
     expected = math.sqrt(thrust / (m0 + m1) / length * (m0 + m1) / m0)
@@ -253,7 +274,9 @@ def test_pendulum_under_thrust_swings_with_the_reduced_mass():
 
 def test_springs_of_a_tank_are_those_of_its_frequency():
     robot = hub_with_rod(1e9, 1e9, 10.0, 1.0)
-    tank = fflin.Slosh("root_joint", 5.0, (0.3, 0, 0), frequency=0.4, damping=0.1, name="tank")
+    tank = fflin.Slosh(
+        "root_joint", 5.0, (0.3, 0, 0), frequency=0.4, damping=0.1, name="tank"
+    )
     robot = robot.replace(appendages=[tank])
     assert robot.joint_names == ("tank_x", "tank_y")
     poles = np.linalg.eigvals(fflin.linearize(robot).A)
@@ -270,7 +293,9 @@ def test_liquid_in_a_cylinder_has_the_published_moment(fill):
     # convective pressures (1957): the first mode acts at h1, by the weight of the shifted mass too.
     radius, a = 0.6, 3.0
     h = fill * radius
-    tank = fflin.Slosh.cylinder("base", radius, h, 900.0, a, bottom=(1, 2, 3), axis=(0, 2, 0))
+    tank = fflin.Slosh.cylinder(
+        "base", radius, h, 900.0, a, bottom=(1, 2, 3), axis=(0, 2, 0)
+    )
     k = jnp_zeros(1, 1)[0] / radius
     liquid = 900.0 * math.pi * radius**2 * h
     omega = 2.0 * math.pi * tank.frequency
@@ -290,7 +315,9 @@ def test_liquid_in_a_cylinder_has_the_published_moment(fill):
 
 def test_a_mode_without_participation_swings_alone():
     robot = hub_with_rod(10.0, 1.0, 1.0, 1.0)
-    flexible = fflin.FlexibleAppendage("root_joint", 0.5, np.zeros((3, 1)), np.zeros((3, 1)))
+    flexible = fflin.FlexibleAppendage(
+        "root_joint", 0.5, np.zeros((3, 1)), np.zeros((3, 1))
+    )
     lin = fflin.linearize(robot.replace(appendages=[flexible]))
     rigid = fflin.linearize(robot)
     assert frequencies(lin) == pytest.approx([math.pi], rel=1e-4)
@@ -305,7 +332,9 @@ def test_wheels_and_modes_keep_each_other():
         name for name in robot.joint_names if name != "wheel"
     )
     assert robot.replace(appendages=[]).joint_names == tuple(
-        name for name in robot.joint_names if name not in {joint.name for joint in robot.modes}
+        name
+        for name in robot.joint_names
+        if name not in {joint.name for joint in robot.modes}
     )
     softer = robot.replace(stiffness={"boom_mode_1": 1.0, "joint_1": 5.0})
     assert softer.stiffness["boom_mode_1"] == 1.0
@@ -347,7 +376,10 @@ def test_wrong_numbers_are_refused_by_the_mode(change, message):
     [
         ({"mass": 0.0}, "mass of slosh"),
         ({"frequency": None}, "neither a frequency nor a length"),
-        ({"frequency": None, "length": 0.5, "damping": 0.1}, "to which the ratio refers"),
+        (
+            {"frequency": None, "length": 0.5, "damping": 0.1},
+            "to which the ratio refers",
+        ),
         ({"axis": (0, 0, 0)}, "axis of slosh 'base' is zero"),
         ({"damping": 2.0}, "ratio from 0 to 1"),
         ({"position": (0, 0)}, "three finite numbers"),
@@ -363,7 +395,9 @@ def test_what_the_link_cannot_have_is_refused():
     robot = hub_with_rod(1.0, 0.1, 1.0, 1.0)
     heavy = fflin.FlexibleAppendage("root_joint", [1.0, 2.0], [[0, 0], [0, 0], [0.5, 1.5]],
                                     np.zeros((3, 2)), name="array")  # fmt: skip
-    with pytest.raises(InputError, match="modes up to 'array_mode_2' exceed the inertia"):
+    with pytest.raises(
+        InputError, match="modes up to 'array_mode_2' exceed the inertia"
+    ):
         robot.replace(appendages=[heavy])
     liquid = fflin.Slosh("root_joint", 2.5, (0, 0, 0), frequency=0.1)
     with pytest.raises(InputError, match="'root_joint_slosh_x'"):
@@ -403,23 +437,36 @@ def test_all_of_a_link_may_be_its_modes():
 
 def test_slosh_and_modes_must_leave_mass_to_a_body():
     robot = hub_with_rod(9.0, 1.0, 1.0, 1.0)
-    all_liquid = fflin.Slosh("root_joint", 10.0, (0.05, 0, 0), frequency=0.1, name="tank")
-    along = fflin.FlexibleAppendage("root_joint", 1.0, [[0.0], [0.0], [1.0]], np.zeros((3, 1)))
-    with pytest.raises(InputError, match=r"without the sloshing liquid|exceed the inertia"):
+    all_liquid = fflin.Slosh(
+        "root_joint", 10.0, (0.05, 0, 0), frequency=0.1, name="tank"
+    )
+    along = fflin.FlexibleAppendage(
+        "root_joint", 1.0, [[0.0], [0.0], [1.0]], np.zeros((3, 1))
+    )
+    with pytest.raises(
+        InputError, match=r"without the sloshing liquid|exceed the inertia"
+    ):
         robot.replace(appendages=[all_liquid, along])
 
 
 @pytest.mark.parametrize("size", [1e160, 1e200, 1e300])
 def test_huge_participation_is_refused_by_the_mode(size):
-    huge = fflin.FlexibleAppendage("root_joint", 1.0, [[size], [0.0], [0.0]], np.zeros((3, 1)))
-    with np.errstate(over="ignore"), pytest.raises(InputError, match="'root_joint_mode_1'"):
+    huge = fflin.FlexibleAppendage(
+        "root_joint", 1.0, [[size], [0.0], [0.0]], np.zeros((3, 1))
+    )
+    with (
+        np.errstate(over="ignore"),
+        pytest.raises(InputError, match="'root_joint_mode_1'"),
+    ):
         hub_with_rod(9.0, 1.0, 1.0, 1.0).replace(appendages=[huge])
 
 
 @pytest.mark.parametrize("name", ["*", "a[1]", " ", "a\nb"])
 def test_names_that_are_none_are_refused(name):
     with pytest.raises(InputError, match="of an appendage is"):
-        fflin.FlexibleAppendage("base", 1.0, np.zeros((3, 1)), np.zeros((3, 1)), name=name)
+        fflin.FlexibleAppendage(
+            "base", 1.0, np.zeros((3, 1)), np.zeros((3, 1)), name=name
+        )
 
 
 def test_a_mode_far_from_its_frame_keeps_its_place():

@@ -35,7 +35,9 @@ def test_feedback_reads_modal_amplitudes_alike(robot):
         fflin.simulate(robot, policy, q0=q, v0=v, duration=10.0, dt=0.05, engine=engine)
         for engine in ("python", "compiled")
     ]
-    assert np.abs(motions[0].u - motions[1].u).max() < 1e-10 * np.abs(motions[0].u).max()
+    assert (
+        np.abs(motions[0].u - motions[1].u).max() < 1e-10 * np.abs(motions[0].u).max()
+    )
 
 
 def test_a_sweep_is_the_models_one_by_one(robot):

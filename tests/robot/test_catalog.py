@@ -27,7 +27,9 @@ NAMES = sorted(SUMMARY)
 # Published: link -> mass, centre of mass, (ixx, iyy, izz, ixy, ixz, iyz); absent products are zero
 ZERO = (0, 0, 0)
 BODIES = {
-    "cubesat": {"base": (3.5, ZERO, (0.01520407970002, 0.01462135261765, 0.0062377583131))},
+    "cubesat": {
+        "base": (3.5, ZERO, (0.01520407970002, 0.01462135261765, 0.0062377583131))
+    },
     "ets_vii": {
         "base": (2550, ZERO, (6200, 3540, 7090, 48.2, 78.5, -29.2)),
         "link_1": (35, ZERO, (0.25, 0.25, 1.69)),
@@ -120,7 +122,9 @@ def inertials(name):
         inertial = link.find("inertial")
         if inertial is not None:
             tag = inertial.find("inertia")
-            figures = [float(tag.get(k)) for k in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")]
+            figures = [
+                float(tag.get(k)) for k in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+            ]
             origin = inertial.find("origin")
             assert floats(origin, "rpy") == ZERO
             mass = float(inertial.find("mass").get("value"))
@@ -161,7 +165,9 @@ def test_model_carries_the_written_bodies(name):
     lumped = [pin.Inertia.Zero() for _ in model.joints]
     for link, (mass, com, inertia) in inertials(name).items():
         frame = model.frames[model.getFrameId(link, pin.FrameType.BODY)]
-        lumped[frame.parentJoint] += frame.placement * pin.Inertia(mass, np.array(com), inertia)
+        lumped[frame.parentJoint] += frame.placement * pin.Inertia(
+            mass, np.array(com), inertia
+        )
     for ours, theirs in zip(lumped[1:], list(model.inertias)[1:], strict=True):
         assert np.allclose(ours.matrix(), theirs.matrix(), rtol=1e-12, atol=1e-12)
 
@@ -217,9 +223,13 @@ def test_servicer_is_symmetric_and_not_singular():
     for side in ("left", "right"):
         q[model.joints[model.getJointId(f"panel_{side}")].idx_q] = 0.1
     # equal angles: the centre of mass rises and stays in the plane of symmetry
-    dz = pin.centerOfMass(model, data, q) - pin.centerOfMass(model, data, pin.neutral(model))
+    dz = pin.centerOfMass(model, data, q) - pin.centerOfMass(
+        model, data, pin.neutral(model)
+    )
     assert dz[2] > 1e-3 and abs(dz[1]) < 1e-12
-    J = pin.computeFrameJacobian(model, data, pin.neutral(model), model.getFrameId("tool"))
+    J = pin.computeFrameJacobian(
+        model, data, pin.neutral(model), model.getFrameId("tool")
+    )
     assert np.linalg.matrix_rank(J[:, 6:], tol=1e-3) == 6
 
 
@@ -246,7 +256,9 @@ def test_file_conventions(name):
     robot = root(name)
     assert robot.get("name") == name
     children = {j.find("child").get("link") for j in robot.iter("joint")}
-    assert [n for n in (e.get("name") for e in robot.iter("link")) if n not in children] == ["base"]
+    assert [
+        n for n in (e.get("name") for e in robot.iter("link")) if n not in children
+    ] == ["base"]
     assert "floating" not in {j.get("type") for j in robot.iter("joint")}
     for link in robot.iter("link"):
         # only frames of tools may be without mass
@@ -256,11 +268,15 @@ def test_file_conventions(name):
 @pytest.mark.parametrize("name", NAMES)
 def test_visuals(name):
     robot = root(name)
-    colours = {m.get("name") for m in robot.findall("material") if m.find("color") is not None}
+    colours = {
+        m.get("name") for m in robot.findall("material") if m.find("color") is not None
+    }
     visuals = list(robot.iter("visual"))
     assert len(visuals) > 10
     for visual in visuals:
         assert visual.find("material").get("name") in colours
         assert visual.find("geometry")[0].tag in {"box", "cylinder", "sphere"}
-    shapes = pin.buildGeomFromUrdf(build(name), str(path(name)), pin.GeometryType.VISUAL)
+    shapes = pin.buildGeomFromUrdf(
+        build(name), str(path(name)), pin.GeometryType.VISUAL
+    )
     assert shapes.ngeoms == len(visuals)

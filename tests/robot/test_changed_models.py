@@ -90,7 +90,11 @@ def test_a_model_of_a_changed_robot_is_refused_by_what_uses_it():
 def test_what_is_made_of_a_model_remembers_the_robot():
     robot = fflin.load("ets_vii", lock=["joint_6"])
     lin = fflin.linearize(robot)
-    made = [lin.discretize(0.1), fflin.momentum_reduction(lin), replace(lin, u0=lin.u0 + 1.0)]
+    made = [
+        lin.discretize(0.1),
+        fflin.momentum_reduction(lin),
+        replace(lin, u0=lin.u0 + 1.0),
+    ]
     heavier(robot.model)
     for each in made:
         with pytest.raises(fflin.ModelError, match=r"inertia .*'joint_1'"):

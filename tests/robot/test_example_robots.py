@@ -28,7 +28,9 @@ def test_names_are_those_of_the_package():
         fflin.load("cassie")
 
 
-@pytest.mark.parametrize("name", mostly(NAMES, *REFUSED, "panda", "solo12", "tiago_no_hand"))
+@pytest.mark.parametrize(
+    "name", mostly(NAMES, *REFUSED, "panda", "solo12", "tiago_no_hand")
+)
 def test_check_holds(name):
     if name in REFUSED:
         with pytest.raises(fflin.FflinError, match=REFUSED[name]):
@@ -49,8 +51,8 @@ def test_an_inertia_that_is_negative_by_rounding_is_that_of_a_link():
     robot = fflin.load("icub", lock=["neck_roll", "neck_yaw"])
     link = robot.links["r_hip_2"]
     assert -1e-18 < np.linalg.eigvalsh(link.inertia)[0] < 0.0 < link.mass
-    assert sum(each.mass for each in robot.pieces.values() if not each.whole) == pytest.approx(
-        robot.mass
-    )
+    assert sum(
+        each.mass for each in robot.pieces.values() if not each.whole
+    ) == pytest.approx(robot.mass)
     model = fflin.uncertain(robot, {"base.mass": 0.1})
     assert model.names == ("base.mass",)

@@ -60,7 +60,9 @@ def written(tmp_path):
     return write
 
 
-@pytest.mark.parametrize("start", [b"", b"\xef\xbb\xbf"], ids=["plain", "byte order mark"])
+@pytest.mark.parametrize(
+    "start", [b"", b"\xef\xbb\xbf"], ids=["plain", "byte order mark"]
+)
 @pytest.mark.parametrize("ending", ["\n", "\r\n"])
 def test_order_in_the_file_is_that_of_u(written, start, ending):
     path = written(start + WHOLE.replace("\n", ending).encode())
@@ -95,20 +97,29 @@ def test_bundled_sets_by_name_and_by_path():
     servicer = fflin.load("servicer_7dof", inputs=fflin.load_inputs("servicer_7dof"))
     names = fflin.linearize(servicer).input_names
     arm = tuple(f"tau_m.joint_{number}" for number in range(1, 8))
-    assert names[6:13] == arm and len(names) == 17 and not any("panel" in name for name in names)
+    assert (
+        names[6:13] == arm
+        and len(names) == 17
+        and not any("panel" in name for name in names)
+    )
 
 
 def test_thrusters_of_cubesat_push_and_turn_every_way():
     """Pulling is not needed: nonnegative thrusts give each direction, and nothing but it."""
-    thrusters = [x for x in fflin.load_inputs("cubesat") if isinstance(x, fflin.Thruster)]
+    thrusters = [
+        x for x in fflin.load_inputs("cubesat") if isinstance(x, fflin.Thruster)
+    ]
     lin = fflin.linearize(fflin.load("cubesat", inputs=thrusters))
     assert len(lin.input_names) == 12
     assert np.linalg.matrix_rank(lin.B) == 6
     wrenches = lin.M @ lin.B[6:]
     # By a pair: a newton is shared by two, a newton metre is two forces at each one's lever.
     least = (1 / 0.05, 1 / 0.095, 1 / 0.045, 1.0, 1.0, 1.0)
-    for total, direction in zip((*least, *least), (*np.eye(6), *-np.eye(6)), strict=True):
-        found = linprog(np.ones(12), A_eq=wrenches, b_eq=direction)  # thrusts of 0 or more
+    for total, direction in zip(
+        (*least, *least), (*np.eye(6), *-np.eye(6)), strict=True
+    ):
+        # thrusts of 0 or more
+        found = linprog(np.ones(12), A_eq=wrenches, b_eq=direction)
         assert found.success and found.fun == pytest.approx(total, rel=1e-9)
     # All at once cancel, so that every thrust can be raised by the same amount.
     np.testing.assert_allclose(wrenches @ np.ones(12), 0.0, atol=1e-15)
@@ -156,7 +167,9 @@ CASES = {
     WHEEL + "inertias = 1": ":4: 'inertias'",
     WHEEL.replace("axis = [0, 0, 1]\n", ""): ":1: 'axis'",
     # What looks like keys and tables in texts and comments is none.
-    "[[input]]\ntype = 'base_force'\nnote = '''\n[[input]]\nodd = 1\n'''": (":3: 'note'"),
+    "[[input]]\ntype = 'base_force'\nnote = '''\n[[input]]\nodd = 1\n'''": (
+        ":3: 'note'"
+    ),
     "[[input]]\ntype = 'base_force'\n[[input]]\ntype = 'joint_torque'\n"
     'joint = """\n[[input]]\nodd = 1"""  # \'\'\'\n# """\n\n odd = 1': (":10: 'odd'"),
     "\ninput = [{type = 'base_force'},\n  {type = 'odd'}]": ":2: 'odd'",

@@ -40,14 +40,25 @@ def test_limits_of_inputs_go_before_the_urdf_and_given_ones_before_both():
             fflin.JointTorque("joint_2"),
             fflin.Thruster(*AT, max=22.0),
             fflin.Thruster(*AT, name="main"),
-            fflin.ReactionWheel((0, 0, 1), inertia=0.03, max=0.2, max_speed=600.0, name="spin"),
+            fflin.ReactionWheel(
+                (0, 0, 1), inertia=0.03, max=0.2, max_speed=600.0, name="spin"
+            ),
             fflin.ReactionWheel((0, 1, 0), momentum=1.0, max=0.1),
         ],
-        limits={"q_m.joint_*": 1.0, "joint_2": (-5.0, 6.0), "omega_b": 0.1, "main": 4.0},
+        limits={
+            "q_m.joint_*": 1.0,
+            "joint_2": (-5.0, 6.0),
+            "omega_b": 0.1,
+            "main": 4.0,
+        },
     )
     found = limits_of(robot)
     assert found["tau_b.y"] == (-40.0, 40.0)
-    assert [found[f"F_b.{axis}"] for axis in "xyz"] == [(-0.5, 3.0), (-0.5, 2.0), (-0.5, 1.0)]
+    assert [found[f"F_b.{axis}"] for axis in "xyz"] == [
+        (-0.5, 3.0),
+        (-0.5, 2.0),
+        (-0.5, 1.0),
+    ]
     assert found["tau_m.joint_1"] == (-2.0, 7.0)
     assert found["tau_m.joint_2"] == (-5.0, 6.0)
     assert found["thruster_1"] == (0.0, 22.0)
@@ -84,7 +95,10 @@ def test_the_group_of_all_joints_leaves_wheels_out():
     assert found["qdot_m.panel_left"] == (-0.5, 0.5)
     assert found["qdot_m.joint_1"] == (-0.2, 0.2)
     assert found["qdot_m.spin"] == (-600.0, 600.0)
-    assert limits_of(robot.replace(limits={"qdot_m.spin": 50}))["qdot_m.spin"] == (-50.0, 50.0)
+    assert limits_of(robot.replace(limits={"qdot_m.spin": 50}))["qdot_m.spin"] == (
+        -50.0,
+        50.0,
+    )
 
 
 def test_limits_are_kept_in_files_of_models(tmp_path):
@@ -98,7 +112,9 @@ def test_limits_are_kept_in_files_of_models(tmp_path):
 
 def test_limits_make_no_second_input():
     with pytest.raises(fflin.InputError, match="twice"):
-        fflin.load("cubesat", inputs=[fflin.BaseForce(max=1.0), fflin.BaseForce(max=2.0)])
+        fflin.load(
+            "cubesat", inputs=[fflin.BaseForce(max=1.0), fflin.BaseForce(max=2.0)]
+        )
     assert fflin.Thruster(*AT, max=2) == fflin.Thruster(*AT, max=2.0)
     assert replace(fflin.Thruster(*AT), max=2.0, on_off=True).on_off
 
@@ -169,7 +185,9 @@ def test_efforts_and_velocities_of_zero_are_said_once_and_are_none(tmp_path):
     assert tuple(said) == robot.notes
     assert not {"tau_m.hinge", "tau_m.elbow", "qdot_m.hinge"} & set(limits_of(robot))
     assert limits_of(robot)["qdot_m.elbow"] == (-2.0, 2.0)
-    path.write_text(URDF.replace('effort="0"', 'effort="3"').replace('velocity="0"', ""))
+    path.write_text(
+        URDF.replace('effort="0"', 'effort="3"').replace('velocity="0"', "")
+    )
     assert not fflin.load(path).notes
 
 
@@ -244,7 +262,9 @@ def test_the_range_of_a_travel_may_be_open_or_one_sided(tmp_path):
 def test_one_side_of_a_motor_leaves_the_other_to_the_urdf():
     robot = fflin.load("servicer_7dof")
     effort = limits_of(robot)["tau_m.joint_1"][1]
-    own = robot.replace(inputs=[fflin.JointTorque("joint_1", min=-1.0), fflin.BaseTorque()])
+    own = robot.replace(
+        inputs=[fflin.JointTorque("joint_1", min=-1.0), fflin.BaseTorque()]
+    )
     assert limits_of(own)["tau_m.joint_1"] == (-1.0, effort)
 
 

@@ -32,7 +32,9 @@ def test_a_mass_alone_scales_a_body_and_leaves_the_others():
     before, after = robot.model.inertias[index], heavy.model.inertias[index]
     assert after.mass == 50.0 != before.mass
     np.testing.assert_array_equal(after.lever, before.lever)
-    np.testing.assert_allclose(after.inertia, before.inertia * 50.0 / before.mass, rtol=1e-14)
+    np.testing.assert_allclose(
+        after.inertia, before.inertia * 50.0 / before.mass, rtol=1e-14
+    )
     others = [i for i in range(ROOT, robot.model.njoints) if i != index]
     assert all(heavy.model.inertias[i] == robot.model.inertias[i] for i in others)
     assert heavy.mass == pytest.approx(robot.mass + 50.0 - before.mass)
@@ -43,9 +45,15 @@ def test_centre_and_inertia_are_taken_as_given_or_as_pinocchios():
     inertia = np.array([[3.0, 0.2, 0.0], [0.2, 4.0, 0.1], [0.0, 0.1, 5.0]])
     com = np.array([0.1, -0.2, 0.3])
     made = robot.with_mass_properties(
-        {"base": {"com": com, "inertia": inertia}, "joint_1": pin.Inertia(7.0, com, inertia)}
+        {
+            "base": {"com": com, "inertia": inertia},
+            "joint_1": pin.Inertia(7.0, com, inertia),
+        }
     )
-    base, first = made.model.inertias[ROOT], made.model.inertias[made.model.getJointId("joint_1")]
+    base, first = (
+        made.model.inertias[ROOT],
+        made.model.inertias[made.model.getJointId("joint_1")],
+    )
     assert base.mass == robot.model.inertias[ROOT].mass and first.mass == 7.0
     for body in (base, first):
         np.testing.assert_array_equal(body.lever, com)
@@ -68,8 +76,19 @@ def test_patterns_groups_of_names_and_links_are_bodies():
 def test_pictures_names_and_fields_stay_and_the_first_robot_too():
     robot = fflin.load("ets_vii", stiffness={"joint_1": 3.0}, gravity=(0, 0, -1.0))
     masses = [body.mass for body in robot.model.inertias]
-    for other in (robot.with_mass_properties({"base": {"mass": 1.0}}), robot.perturbed(seed=3)):
-        for key in ("name", "urdf", "joints", "inputs", "stiffness", "gravity", "package_dirs"):
+    for other in (
+        robot.with_mass_properties({"base": {"mass": 1.0}}),
+        robot.perturbed(seed=3),
+    ):
+        for key in (
+            "name",
+            "urdf",
+            "joints",
+            "inputs",
+            "stiffness",
+            "gravity",
+            "package_dirs",
+        ):
             assert getattr(other, key) == getattr(robot, key), key
         assert other.urdf_sha256 != robot.urdf_sha256 and len(other.urdf_sha256) == 64
         assert pickle.loads(pickle.dumps(other)).mass == other.mass
@@ -101,21 +120,33 @@ def test_perturbed_bodies_are_rigid_bodies_within_the_spread(name):
                 assert after.mass == 0.0
                 continue
             assert abs(after.mass / before.mass - 1.0) <= 0.3
-            was, now = (np.linalg.eigvalsh(pseudo_inertia(each)) for each in (before, after))
+            was, now = (
+                np.linalg.eigvalsh(pseudo_inertia(each)) for each in (before, after)
+            )
             # Consistent where it was, beyond rounding.
             if was[0] >= -1e-12 * was[-1]:
                 assert now[0] >= -1e-12 * now[-1]
-            ratio = np.diag(after.inertia) / after.mass / (np.diag(before.inertia) / before.mass)
+            ratio = (
+                np.diag(after.inertia)
+                / after.mass
+                / (np.diag(before.inertia) / before.mass)
+            )
             assert (np.abs(ratio - 1.0) <= 0.5 + 1e-12).all()
-            radii = np.sqrt(np.abs(0.5 * np.trace(before.inertia) - np.diag(before.inertia)))
+            radii = np.sqrt(
+                np.abs(0.5 * np.trace(before.inertia) - np.diag(before.inertia))
+            )
             shift = np.abs(after.lever - before.lever)
             assert (shift <= 0.2 * radii / np.sqrt(before.mass) + 1e-12).all()
 
 
 def test_the_spreads_are_reached_and_the_seed_decides():
     robot = fflin.load("ets_vii")
-    others = [robot.perturbed(mass=0.1, com=0.0, inertia=0.0, seed=s) for s in range(50)]
-    ratios = np.array([[b.mass for b in o.model.inertias.tolist()[ROOT:]] for o in others])
+    others = [
+        robot.perturbed(mass=0.1, com=0.0, inertia=0.0, seed=s) for s in range(50)
+    ]
+    ratios = np.array(
+        [[b.mass for b in o.model.inertias.tolist()[ROOT:]] for o in others]
+    )
     ratios /= [body.mass for body in robot.model.inertias.tolist()[ROOT:]]
     assert 0.095 < np.abs(ratios - 1.0).max() <= 0.1 and abs(ratios.mean() - 1.0) < 0.01
     again = robot.perturbed(mass=0.1, com=0.0, inertia=0.0, seed=7)
@@ -125,13 +156,17 @@ def test_the_spreads_are_reached_and_the_seed_decides():
     full = robot.perturbed(mass=0.1, com=0.1, inertia=0.1, seed=7)
     for i in range(ROOT, robot.model.njoints):
         assert full.model.inertias[i].mass == again.model.inertias[i].mass
-        assert not np.array_equal(full.model.inertias[i].lever, again.model.inertias[i].lever)
+        assert not np.array_equal(
+            full.model.inertias[i].lever, again.model.inertias[i].lever
+        )
 
 
 def test_bodies_are_shifted_either_way_and_a_plate_is_a_body():
     robot = fflin.load("ets_vii")
     before = robot.model.inertias[ROOT].lever
-    shifts = [robot.perturbed(com=0.1, seed=k).model.inertias[ROOT].lever for k in range(20)]
+    shifts = [
+        robot.perturbed(com=0.1, seed=k).model.inertias[ROOT].lever for k in range(20)
+    ]
     signs = np.sign(np.array(shifts) - before)
     assert (signs.min(axis=0) == -1.0).all() and (signs.max(axis=0) == 1.0).all()
     assert robot.with_mass_properties({"base": {"inertia": np.diag([1.0, 1.0, 2.0])}})

@@ -67,7 +67,9 @@ def test_light_and_point_like_bodies_count():
     robot = random_tree(np.random.default_rng(6), 5)
     model = robot.model.copy()
     for index in (2, 4):
-        model.inertias[index] = pin.Inertia(1e-9, np.array([0.1, 0.2, 0.3]), np.zeros((3, 3)))
+        model.inertias[index] = pin.Inertia(
+            1e-9, np.array([0.1, 0.2, 0.3]), np.zeros((3, 3))
+        )
     assert idle_coordinates(fflin.from_model(model)) == ()
 
 
@@ -110,7 +112,9 @@ def joint(name, kind, parent, child):
     )
 
 
-def test_a_file_with_a_massless_root_on_a_joint_says_so_and_loads_with_it_locked(tmp_path):
+def test_a_file_with_a_massless_root_on_a_joint_says_so_and_loads_with_it_locked(
+    tmp_path,
+):
     path = tmp_path / "craft.urdf"
     path.write_text(
         '<robot name="craft"><link name="world"/>'

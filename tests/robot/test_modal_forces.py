@@ -9,7 +9,13 @@ import pytest
 import fflin
 from fflin.dynamics.state import StateMap
 from fflin.robot.equipment.assembly import _mounted_modes
-from tests.robot.test_appendages import beam, clamped_roots, displaced, hub_with_rod, servicer
+from tests.robot.test_appendages import (
+    beam,
+    clamped_roots,
+    displaced,
+    hub_with_rod,
+    servicer,
+)
 
 EPS = float(np.finfo(float).eps)
 HUB_INERTIA, ROD, LENGTH, STIFFNESS, MODES = 1.0, 5.0, 4.0, 30.0, 3
@@ -74,7 +80,9 @@ def accelerations(robot, v, omega, eta, etadot):
     """f0 [6 + k:] of a hub with modes: its accelerations in base axes."""
     state = StateMap(robot, frame="local")
     x = np.concatenate((np.zeros(6), eta, omega, v, etadot))
-    return fflin.linearize(robot, *state.to_pinocchio(x), frame="local").f0[6 + len(eta) :]
+    return fflin.linearize(robot, *state.to_pinocchio(x), frame="local").f0[
+        6 + len(eta) :
+    ]
 
 
 @pytest.mark.parametrize("hub_mass", [1.0, 30.0, 3e3])
@@ -92,7 +100,10 @@ def test_a_straight_beam_in_motion_obeys_its_own_lagrangian(hub_mass, size):
 
 
 def test_the_axes_of_link_and_frame_do_not_change_the_forces_of_a_beam():
-    hub_mass, clamp = 30.0, pin.SE3(pin.rpy.rpyToMatrix(0.4, -1.1, 2.0), np.array([0.7, -0.2, 1.3]))
+    hub_mass, clamp = (
+        30.0,
+        pin.SE3(pin.rpy.rpyToMatrix(0.4, -1.1, 2.0), np.array([0.7, -0.2, 1.3])),
+    )
     model = hub_with_rod(hub_mass, HUB_INERTIA, ROD, LENGTH).model.copy()
     model.inertias[1] = clamp.act(model.inertias[1])
     model.addFrame(pin.Frame("clamp", 1, clamp, pin.FrameType.OP_FRAME))
@@ -122,7 +133,11 @@ def general(seed=1, count=4):
 def heavier(rigid, factor):
     """The rigid robot with another density of its base."""
     body = rigid.model.inertias[1]
-    given = {"mass": factor * body.mass, "com": body.lever, "inertia": factor * body.inertia}
+    given = {
+        "mass": factor * body.mass,
+        "com": body.lever,
+        "inertia": factor * body.inertia,
+    }
     return rigid.with_mass_properties({"base": given})
 
 
@@ -176,7 +191,9 @@ def momentum_of(ball):
     ball.motion.calc(data, np.zeros(1))
     S = ball.joint.scale * pin.Motion(np.ravel(data.S))
     momentum = ball.placement.act(ball.inertia * S)
-    return momentum.vector, S.dot(ball.inertia * S) + ball.armature * ball.joint.scale**2
+    return momentum.vector, S.dot(
+        ball.inertia * S
+    ) + ball.armature * ball.joint.scale**2
 
 
 @pytest.mark.parametrize("count", [30, pytest.param(400, marks=pytest.mark.exhaustive)])
@@ -196,7 +213,9 @@ def test_balls_of_columns_of_all_sizes_have_momentum_and_modal_mass(count):
         total = np.repeat([np.square(t).sum(), np.square(r).sum()], 3)
         allowed = 1.01e-12 * np.sqrt(np.maximum(total, 1e-6 * scales))
         for ball, column in zip(
-            _mounted_modes(link.model, bodies, [array]), np.vstack((t, r)).T, strict=True
+            _mounted_modes(link.model, bodies, [array]),
+            np.vstack((t, r)).T,
+            strict=True,
         ):
             momentum, modal_mass = momentum_of(ball)
             assert (np.abs(momentum - column) <= allowed).all()
@@ -235,7 +254,11 @@ def test_forces_do_not_jump_where_the_choice_of_the_ball_changes(part, size):
 
 def test_forces_are_continuous_in_the_translation_of_a_rotation():
     # Noise has an effect of its own size, and from a rotation to a translation no step is large.
-    rigid, found, sizes = hub_with_rod(30.0, 20.0, ROD, LENGTH), [], np.logspace(-14.0, -1.0, 27)
+    rigid, found, sizes = (
+        hub_with_rod(30.0, 20.0, ROD, LENGTH),
+        [],
+        np.logspace(-14.0, -1.0, 27),
+    )
     v, omega, eta, etadot = moving(0.1)
     for size in sizes:
         t, r = size * np.array([[0.3], [0.2], [1.0]]), [[1.5], [2.5], [0.3]]
@@ -255,9 +278,13 @@ def array_on_a_drive(noise=0.0, seed=0):
     t = array.translation + noise * rng.normal(size=(3, 2))
     r = array.rotation + noise * rng.normal(size=(3, 2))
     model = pin.Model()
-    base = model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "root_joint")
+    base = model.addJoint(
+        0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "root_joint"
+    )
     model.appendBodyToJoint(
-        base, pin.Inertia(200.0, np.zeros(3), np.diag([50.0, 40.0, 45.0])), pin.SE3.Identity()
+        base,
+        pin.Inertia(200.0, np.zeros(3), np.diag([50.0, 40.0, 45.0])),
+        pin.SE3.Identity(),
     )
     drive = pin.SE3(np.eye(3), np.array([0.6, 0.0, 0.0]))
     joint = model.addJoint(base, pin.JointModelRX(), drive, "drive")
@@ -284,15 +311,22 @@ def test_noise_in_place_of_zero_changes_a_model_by_noise():
             found = at(array_on_a_drive(noise, seed)[1])
             for key in ("A", "B", "f0"):
                 ours, theirs = getattr(expected, key), getattr(found, key)
-                assert np.abs(ours - theirs).max() <= (1e2 * noise + 1e-12) * np.abs(ours).max()
+                assert (
+                    np.abs(ours - theirs).max()
+                    <= (1e2 * noise + 1e-12) * np.abs(ours).max()
+                )
 
 
 def test_energies_of_links_include_their_modes():
     rigid, array = array_on_a_drive()
     # A third mode without participation, whose energy is only its own.
-    t, r = (np.column_stack((x, np.zeros(3))) for x in (array.translation, array.rotation))
+    t, r = (
+        np.column_stack((x, np.zeros(3))) for x in (array.translation, array.rotation)
+    )
     array = fflin.FlexibleAppendage("drive", [0.25, 1.567, 0.8], t, r, name="array")
-    robot = rigid.replace(appendages=[array], stiffness={"drive": 30.0}, rest={"drive": 0.7})
+    robot = rigid.replace(
+        appendages=[array], stiffness={"drive": 30.0}, rest={"drive": 0.7}
+    )
     q = fflin.configuration(robot, {"drive": 0.7})
     found = fflin.modes(fflin.linearize(robot, q, frame="local"))
     state = StateMap(robot, frame="local")
@@ -313,7 +347,9 @@ def test_energies_of_links_include_their_modes():
             etadot = part[-3:]
             momentum = link.vector @ np.vstack((t, r)) @ etadot
             energies[0] += rigid.model.inertias[1].vtiv(base)
-            energies[1] += rigid.model.inertias[2].vtiv(link) + 2.0 * momentum + etadot @ etadot
+            energies[1] += (
+                rigid.model.inertias[2].vtiv(link) + 2.0 * momentum + etadot @ etadot
+            )
         expected = energies / energies.sum()
         assert mode.energy["base"] == pytest.approx(expected[0], abs=1e-10)
         assert mode.energy["drive"] == pytest.approx(expected[1], abs=1e-10)
@@ -325,7 +361,9 @@ def test_a_mode_with_the_whole_mass_of_a_free_link_is_refused():
     com = rigid.model.inertias[1].lever
     t = np.array([[0.0], [0.0], [math.sqrt(rigid.mass)]])
     r = np.cross(com, t[:, 0])[:, None]
-    robot = rigid.replace(appendages=[fflin.FlexibleAppendage("root_joint", 0.3, t, r, name="all")])
+    robot = rigid.replace(
+        appendages=[fflin.FlexibleAppendage("root_joint", 0.3, t, r, name="all")]
+    )
     with pytest.raises(
         fflin.SingularInertiaError, match=r"'all_mode_1'.*give the link more inertia"
     ):
@@ -344,6 +382,10 @@ def test_a_mode_with_the_whole_mass_of_a_free_link_is_refused():
     # The mode that moves like the whole array on its drive takes all inertia about the drive.
     body = carried.model.inertias[2].matrix()
     column = body[:, 3] / math.sqrt(body[3, 3])
-    spins = fflin.FlexibleAppendage("drive", 0.3, column[:3, None], column[3:, None], name="spins")
-    with pytest.raises(fflin.SingularInertiaError, match="joint 'drive', joint 'spins_mode_1' can"):
+    spins = fflin.FlexibleAppendage(
+        "drive", 0.3, column[:3, None], column[3:, None], name="spins"
+    )
+    with pytest.raises(
+        fflin.SingularInertiaError, match="joint 'drive', joint 'spins_mode_1' can"
+    ):
         fflin.linearize(carried.replace(appendages=[spins]))

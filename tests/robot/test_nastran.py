@@ -15,8 +15,12 @@ with np.printoptions():  # which pyYeti changes
 
 GRIDS = np.array([[1.0, 0.2, 0.0], [1.0, -0.3, 0.4], [1.1, 0.0, -0.2]])
 # Output axes of the grids: basic, turned rectangular, and cylindrical about z.
-TURNED = np.array([[7, 1, 0], [0.3, 0.1, 0.0], [0.3, 1.1, 0.2], [1.2, 0.1, 0.0]], dtype=float)
-ROUND = np.array([[8, 2, 0], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]], dtype=float)
+TURNED = np.array(
+    [[7, 1, 0], [0.3, 0.1, 0.0], [0.3, 1.1, 0.2], [1.2, 0.1, 0.0]], dtype=float
+)
+ROUND = np.array(
+    [[8, 2, 0], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]], dtype=float
+)
 
 
 def structure(seed=1, modes=5):
@@ -28,18 +32,25 @@ def structure(seed=1, modes=5):
     """
     rng = np.random.default_rng(seed)
     rigid_mass = np.zeros((6, 6))
-    for mass, point in zip(rng.uniform(2.0, 4.0, 30), rng.normal(size=(30, 3)), strict=True):
+    for mass, point in zip(
+        rng.uniform(2.0, 4.0, 30), rng.normal(size=(30, 3)), strict=True
+    ):
         x, y, z = point
         at = np.hstack((np.eye(3), [[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]))
         rigid_mass += mass * at.T @ at
-    L = np.linalg.cholesky(rigid_mass) @ (0.3 * rng.normal(size=(6, modes)) / np.sqrt(modes))
+    L = np.linalg.cholesky(rigid_mass) @ (
+        0.3 * rng.normal(size=(6, modes)) / np.sqrt(modes)
+    )
     squares = np.sort(rng.uniform(1.0, 400.0, modes))
     # Modes of another basis, which need not have unit modal mass.
     basis = rng.normal(size=(modes, modes)) + 2.0 * np.eye(modes)
 
     def matrices(motions):
         size = len(motions)
-        M, K = np.zeros((size + modes, size + modes)), np.zeros((size + modes, size + modes))
+        M, K = (
+            np.zeros((size + modes, size + modes)),
+            np.zeros((size + modes, size + modes)),
+        )
         # Spread over the grids so that the rigid motions sum it up again.
         spread = motions @ np.linalg.inv(motions.T @ motions)
         M[:size, :size] = spread @ rigid_mass @ spread.T
@@ -96,7 +107,9 @@ def test_superelement_is_reduced_to_its_rigid_interface(files):
     assert "array_mode_5" in text and "clamped at frame 'base'" in text
     rows = {line.split()[0]: line.split() for line in text.splitlines() if line}
     residual = (array.inertia - found @ found.T).diagonal()
-    assert [float(x) for x in rows["residual"][1:]] == pytest.approx(residual, rel=1e-3, abs=1e-9)
+    assert [float(x) for x in rows["residual"][1:]] == pytest.approx(
+        residual, rel=1e-3, abs=1e-9
+    )
     assert max(map(len, text.splitlines())) <= 80
 
 
@@ -105,13 +118,31 @@ def test_units_origin_and_number_of_modes_are_as_told(files):
     read = fflin.FlexibleAppendage.from_nastran
     meters = read(op4, asm, frame="base", origin=(0.5, 0, 0), modes=2)
     millimeters = read(
-        op4, asm, frame="base", origin=(0.5e-3, 0, 0), length="mm", mass="tonne", modes=2
+        op4,
+        asm,
+        frame="base",
+        origin=(0.5e-3, 0, 0),
+        length="mm",
+        mass="tonne",
+        modes=2,
     )
     assert len(meters.frequency) == 2
-    assert millimeters.translation == pytest.approx(np.sqrt(1e3) * meters.translation, rel=1e-9)
-    assert millimeters.rotation == pytest.approx(np.sqrt(1e3) * 1e-3 * meters.rotation, rel=1e-9)
-    assert millimeters.inertia[3:, 3:] == pytest.approx(1e-3 * meters.inertia[3:, 3:], rel=1e-9)
-    for wrong in ({"length": "yd"}, {"mass": 3}, {"modes": 9}, {"modes": 0}, {"origin": (1, 2)}):
+    assert millimeters.translation == pytest.approx(
+        np.sqrt(1e3) * meters.translation, rel=1e-9
+    )
+    assert millimeters.rotation == pytest.approx(
+        np.sqrt(1e3) * 1e-3 * meters.rotation, rel=1e-9
+    )
+    assert millimeters.inertia[3:, 3:] == pytest.approx(
+        1e-3 * meters.inertia[3:, 3:], rel=1e-9
+    )
+    for wrong in (
+        {"length": "yd"},
+        {"mass": 3},
+        {"modes": 9},
+        {"modes": 0},
+        {"origin": (1, 2)},
+    ):
         with pytest.raises((InputError, fflin.UnknownNameError)):
             read(op4, asm, frame="base", **wrong)
 
@@ -120,9 +151,13 @@ def test_a_link_that_differs_from_the_file_is_told_and_may_be_replaced(files):
     op4, asm, (rigid_mass, _, _) = files
     robot = fflin.load("planar_detumble")
     read = fflin.FlexibleAppendage.from_nastran
-    with pytest.warns(FflinWarning, match="correct the URDF, or use the inertia of the file"):
+    with pytest.warns(
+        FflinWarning, match="correct the URDF, or use the inertia of the file"
+    ):
         robot.replace(appendages=[read(op4, asm, frame="base", name="array")])
-    taken = robot.replace(appendages=[read(op4, asm, frame="base", name="array", rigid=True)])
+    taken = robot.replace(
+        appendages=[read(op4, asm, frame="base", name="array", rigid=True)]
+    )
     base = robot.links["base"].mass
     assert taken.mass == pytest.approx(robot.mass - base + rigid_mass[0, 0], rel=1e-6)
     assert fflin.check(taken, fflin.linearize(taken)).ok
@@ -132,7 +167,9 @@ def test_a_link_that_differs_from_the_file_is_told_and_may_be_replaced(files):
     heavier = taken.with_mass_properties({"base": {"mass": 700.0}})
     others = sum(link.mass for name, link in robot.links.items() if name != "base")
     assert heavier.mass == pytest.approx(700.0 + others, rel=1e-9)
-    twice = [read(op4, asm, frame="base", name=name, rigid=True) for name in ("one", "two")]
+    twice = [
+        read(op4, asm, frame="base", name=name, rigid=True) for name in ("one", "two")
+    ]
     with pytest.raises(InputError, match="'two' is the second appendage"):
         robot.replace(appendages=twice)
 
@@ -195,10 +232,18 @@ def test_included_files_and_the_punch_file_are_inputs(files, tmp_path):
     assert (whole.frequency == parts.frequency).all()
     assert (whole.participation == parts.participation).all()
     link = tmp_path / "link.json"
-    for target in (tmp_path / "sub" / "rest.inc", split.with_suffix(".pch"), split, op4):
+    for target in (
+        tmp_path / "sub" / "rest.inc",
+        split.with_suffix(".pch"),
+        split,
+        op4,
+    ):
         link.unlink(missing_ok=True)
         link.symlink_to(target)
-        with files_of_command([], [link]), pytest.raises(FileError, match="is the input file"):
+        with (
+            files_of_command([], [link]),
+            pytest.raises(FileError, match="is the input file"),
+        ):
             read(op4, split, frame="base")
 
 

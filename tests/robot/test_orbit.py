@@ -24,7 +24,9 @@ def test_altitude_and_mean_motion_say_the_same():
 
 
 def test_other_bodies():
-    assert fflin.CircularOrbit(100e3, body="moon").period == pytest.approx(7066.0, rel=2e-3)
+    assert fflin.CircularOrbit(100e3, body="moon").period == pytest.approx(
+        7066.0, rel=2e-3
+    )
     own = fflin.CircularOrbit(1e3, body="bennu", mu=4.89, body_radius=245.0)
     assert own.mean_motion == pytest.approx(math.sqrt(4.89 / 1245.0**3))
     assert {"earth", "moon", "mars"} <= set(BODIES)
@@ -67,7 +69,8 @@ def test_a_doubtful_altitude_is_warned_of(altitude, body, said):
 
 @pytest.mark.filterwarnings("error::fflin.FflinWarning")
 def test_no_other_altitude_is_warned_of():
-    for altitude in (100e3, 400e3, 5860e3, 8062e3, 20200e3, 35786e3):  # of LAGEOS, O3b, GPS
+    # of LAGEOS, O3b, GPS
+    for altitude in (100e3, 400e3, 5860e3, 8062e3, 20200e3, 35786e3):
         fflin.CircularOrbit(altitude)
     fflin.CircularOrbit(2e3, body="moon"), fflin.CircularOrbit(6778e3, body="venus")
     fflin.CircularOrbit(680.0, body="bennu", mu=4.89, body_radius=245.0)
@@ -120,6 +123,10 @@ def test_frames_suit_the_orbit():
 
 @pytest.mark.process
 def test_an_orbit_loads_no_numpy_dynamics():
-    code = "import fflin, sys; fflin.CircularOrbit(7e5); print('pinocchio' in sys.modules)"
-    done = finished([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    code = (
+        "import fflin, sys; fflin.CircularOrbit(7e5); print('pinocchio' in sys.modules)"
+    )
+    done = finished(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
     assert done.stdout.strip() == "False"

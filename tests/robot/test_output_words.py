@@ -45,17 +45,27 @@ def test_mistakes_say_what_to_write():
 
 def test_patterns_of_joints_are_joints_of_the_robot():
     robot = fflin.load("servicer_7dof")
-    outputs = [fflin.JointPositions(("panel_*", "joint_3")), fflin.JointVelocities(("q_m",))]
+    outputs = [
+        fflin.JointPositions(("panel_*", "joint_3")),
+        fflin.JointVelocities(("q_m",)),
+    ]
     names = fflin.linearize(robot.replace(outputs=outputs)).output_names
     assert names[:3] == ("q_m.panel_left", "q_m.panel_right", "q_m.joint_3")
     assert names[3:] == tuple(f"qdot_m.{name}" for name in robot.joint_names)
     with pytest.raises(fflin.UnknownNameError, match=r"'hinge_\*'"):
         fflin.linearize(robot.replace(outputs=[fflin.JointPositions(("hinge_*",))]))
-    assert fflin.linearize(fflin.load("cubesat", outputs=[fflin.JointPositions()])).C.shape[0] == 0
+    assert (
+        fflin.linearize(
+            fflin.load("cubesat", outputs=[fflin.JointPositions()])
+        ).C.shape[0]
+        == 0
+    )
 
 
 def test_ranges_of_random_points_take_patterns():
     robot = fflin.load("servicer_7dof")
-    drawn = fflin.random_configurations(robot, 5, ranges={"panel_*": (0.1, 0.1), "q_m": (0, 0)})
+    drawn = fflin.random_configurations(
+        robot, 5, ranges={"panel_*": (0.1, 0.1), "q_m": (0, 0)}
+    )
     q = fflin.sweep(robot, drawn).q
     assert set(q[:, -2:].ravel()) == {0.1} and not q[:, 7:-2].any()

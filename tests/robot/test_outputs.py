@@ -35,7 +35,9 @@ def watched(robot, frame):
     )
 
 
-@pytest.mark.parametrize("turned", [False, True], ids=["own reference", "turned reference"])
+@pytest.mark.parametrize(
+    "turned", [False, True], ids=["own reference", "turned reference"]
+)
 @pytest.mark.parametrize("frame", FRAMES)
 @pytest.mark.parametrize(
     ("name", "link"),
@@ -66,7 +68,11 @@ def test_planted_error_is_found_in_every_row(matrix, first):
     robot = watched(bare, "hand")
     q, v, _ = random_point(bare, np.random.default_rng(2))
     lin = fflin.linearize(robot, q, v, np.ones(7))
-    rows = np.flatnonzero(np.abs(lin.D).max(axis=1)) if matrix == "D" else range(len(lin.y0))
+    rows = (
+        np.flatnonzero(np.abs(lin.D).max(axis=1))
+        if matrix == "D"
+        else range(len(lin.y0))
+    )
     assert len(rows) >= 3
     for row in rows[first::6]:
         wrong = getattr(lin, matrix).copy()
@@ -76,7 +82,9 @@ def test_planted_error_is_found_in_every_row(matrix, first):
             wrong[row, np.abs(wrong[row]).argmax()] *= -1.0
         found = fflin.check(robot, replace(lin, **{matrix: wrong}))
         (failure,) = found.failures
-        assert failure.block in {f"{matrix} ({output.WORD})" for output in robot.outputs}
+        assert failure.block in {
+            f"{matrix} ({output.WORD})" for output in robot.outputs
+        }
         assert str(found).startswith(f"{failure.block} is not verified: 1 of ")
 
 
@@ -108,7 +116,9 @@ def test_outputs_follow_their_laws():
         assert C[f"momentum.linear.{axis}"] @ lin.f0 == pytest.approx(
             u[3 + "xyz".index(axis)], abs=1e-8
         )
-        assert C[f"momentum.linear.{axis}"] @ lin.B[:, 6:] == pytest.approx(np.zeros(9), abs=1e-10)
+        assert C[f"momentum.linear.{axis}"] @ lin.B[:, 6:] == pytest.approx(
+            np.zeros(9), abs=1e-10
+        )
 
 
 def test_sampled_model_keeps_its_outputs(tmp_path):

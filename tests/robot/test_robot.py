@@ -39,7 +39,9 @@ def test_name_and_path_give_the_same_robot():
     for by_path in (fflin.load(path), fflin.load(str(path))):
         assert by_path.model == by_name.model
         assert by_path.urdf_sha256 == by_name.urdf_sha256
-    assert by_name.n == 6 and by_name.joint_names == tuple(f"joint_{i}" for i in range(1, 7))
+    assert by_name.n == 6 and by_name.joint_names == tuple(
+        f"joint_{i}" for i in range(1, 7)
+    )
     assert by_name.urdf == path
     assert not by_name.model.gravity.linear.any()
     assert by_name.mass == pytest.approx(2690.4)
@@ -73,7 +75,9 @@ def test_locked_joints_are_welded():
     assert locked.mass == pytest.approx(robot.mass)
     full = fflin.linearize(robot, fflin.configuration(robot, {"joint_2": 0.7})).M
     keep = [0, 1, 2, 3, 4, 5, 6, 8, 9, 11]
-    assert fflin.linearize(locked).M == pytest.approx(full[np.ix_(keep, keep)], rel=1e-12, abs=1e-9)
+    assert fflin.linearize(locked).M == pytest.approx(
+        full[np.ix_(keep, keep)], rel=1e-12, abs=1e-9
+    )
     assert fflin.load("ets_vii", lock=["joint_1"]).n == 5
     assert fflin.load("ets_vii", lock="joint_1").n == 5
 
@@ -139,7 +143,9 @@ def test_what_is_no_robot_is_refused():
         lambda: fflin.check(fflin.load("cubesat"), lin.A),
         lambda: fflin.configuration(fflin.load("cubesat"), base=np.eye(4)),
     ):
-        with pytest.raises(fflin.InputError, match=r"\b(str|NoneType|LinearModel|ndarray)\b"):
+        with pytest.raises(
+            fflin.InputError, match=r"\b(str|NoneType|LinearModel|ndarray)\b"
+        ):
             call()
     with pytest.raises(fflin.ModelError, match="pin"):
         fflin.from_model("cubesat")

@@ -87,7 +87,11 @@ def test_a_file_says_what_load_would_be_told(written):
             *(fflin.JointTorque(f"joint_{k}") for k in range(1, 7)),
             fflin.ReactionWheel((0, 0, 1), inertia=0.01, name="rw"),
         ],
-        outputs=[fflin.CenterOfMass(), fflin.FramePose("tool"), fflin.FrameVelocity("tool")],
+        outputs=[
+            fflin.CenterOfMass(),
+            fflin.FramePose("tool"),
+            fflin.FrameVelocity("tool"),
+        ],
         stiffness={"panel_left": 100.0, "panel_right": 80.0},
         damping=0.2,
         rest={"panel_left": 0.1},
@@ -100,7 +104,16 @@ def test_a_file_says_what_load_would_be_told(written):
     )
     assert robot.name == "sat" and robot.urdf == told.urdf
     for key in (
-        *("urdf_sha256", "joints", "locked", "inputs", "outputs", "stiffness", "damping", "rest"),
+        *(
+            "urdf_sha256",
+            "joints",
+            "locked",
+            "inputs",
+            "outputs",
+            "stiffness",
+            "damping",
+            "rest",
+        ),
         *("gravity", "weights", "passive", "wheels"),
     ):
         assert getattr(robot, key) == getattr(told, key), key
@@ -114,7 +127,9 @@ def test_a_file_says_what_load_would_be_told(written):
     }
 
 
-def test_urdf_lies_beside_the_file_wherever_that_is_named_from(written, tmp_path, monkeypatch):
+def test_urdf_lies_beside_the_file_wherever_that_is_named_from(
+    written, tmp_path, monkeypatch
+):
     (tmp_path / "deep").mkdir()
     (tmp_path / "deep" / "own.urdf").write_bytes(
         (bundled_directory() / "ets_vii.urdf").read_bytes()
@@ -122,7 +137,10 @@ def test_urdf_lies_beside_the_file_wherever_that_is_named_from(written, tmp_path
     path = written('urdf = "deep/own.urdf"\npackage_dirs = ["deep", "/x"]\n')
     robot = fflin.load(path)
     assert robot.urdf == tmp_path / "deep" / "own.urdf" and robot.n == 6
-    assert [str(folder) for folder in robot.package_dirs[:2]] == [str(tmp_path / "deep"), "/x"]
+    assert [str(folder) for folder in robot.package_dirs[:2]] == [
+        str(tmp_path / "deep"),
+        "/x",
+    ]
     monkeypatch.chdir(tmp_path / "deep")
     assert fflin.load("../sat.toml").n == 6
     one = 'urdf = "ets_vii"\npassive = "joint_1"\nlock = "joint_2"\noutputs = "com"\n'
@@ -142,12 +160,16 @@ def test_bundled_robot_files_are_asked_for_by_their_whole_name():
 
 def test_what_is_told_goes_before_the_file(written):
     path = written(WHOLE)
-    robot = fflin.load(path, stiffness={"panel_right": 9}, lock={"joint_1": 0.1}, gravity=(0, 0, 0))
+    robot = fflin.load(
+        path, stiffness={"panel_right": 9}, lock={"joint_1": 0.1}, gravity=(0, 0, 0)
+    )
     assert robot.locked == ("joint_7=0.5", "joint_1=0.1")
     assert robot.stiffness == {"panel_left": 100.0, "panel_right": 9.0}
     assert robot.gravity == (0.0, 0.0, 0.0)
     # What the file says of a joint that is locked by the caller is not missed.
-    assert "q_m.joint_1" not in robot.weights["q"] and robot.weights["q"] == {"q_b": 7.0}
+    assert "q_m.joint_1" not in robot.weights["q"] and robot.weights["q"] == {
+        "q_b": 7.0
+    }
     assert fflin.load(path, lock={"joint_7": 0.2}).locked == ("joint_7=0.2",)
     both = fflin.load(path, lock=["panel_*"])
     assert both.passive == () and both.stiffness == {} and both.rest == {}
@@ -157,7 +179,9 @@ def test_what_is_told_goes_before_the_file(written):
     # Other inputs, without the wheel that the start knows.
     base = robot.replace(inputs=[fflin.BaseTorque(), fflin.JointTorque("*")])
     assert base.start["velocity"] == {"omega_b.z": 0.01}
-    assert [item.joint for item in base.inputs[1:]] == [f"joint_{k}" for k in range(2, 7)]
+    assert [item.joint for item in base.inputs[1:]] == [
+        f"joint_{k}" for k in range(2, 7)
+    ]
 
 
 @pytest.mark.parametrize("inputs", [(), "named"])
@@ -168,7 +192,9 @@ def test_passive_joints_have_no_torque(inputs):
     assert names[-7:] == tuple(f"tau_m.joint_{k}" for k in range(1, 8))
     fewer = robot.replace(passive=["q_m.joint_1", "panel_right"])
     assert fewer.passive == ("joint_1", "panel_right")
-    assert fewer.inputs == tuple(x for x in robot.inputs if x != fflin.JointTorque("joint_1"))
+    assert fewer.inputs == tuple(
+        x for x in robot.inputs if x != fflin.JointTorque("joint_1")
+    )
 
 
 def test_passive_joints_and_inputs_do_not_contradict():
@@ -178,7 +204,9 @@ def test_passive_joints_and_inputs_do_not_contradict():
     with pytest.raises(fflin.InputError, match="'panel_left'"):
         fflin.load("servicer_7dof", lock=["panel_left"], passive=["panel_left"])
     with pytest.raises(fflin.InputError, match="input"):
-        fflin.load("ets_vii", inputs=[fflin.JointTorque("joint_1")]).replace(passive="joint_1")
+        fflin.load("ets_vii", inputs=[fflin.JointTorque("joint_1")]).replace(
+            passive="joint_1"
+        )
     with pytest.raises(fflin.UnknownNameError, match="'pannel'"):
         robot.replace(passive=["pannel"])
 
@@ -209,9 +237,10 @@ CASES = {
     URDF + "passive = ['panel_left', 3]": ":2: passive",
     URDF + "passive = ['panel_*', 'hinge']": ":2: 'hinge'",
     URDF + "passive = ['panel_left']\nlock = ['panel_left']": (":2: 'panel_left'"),
-    URDF + "passive = ['panel_left']\n" + INPUT + "'joint_torque'\njoint = 'panel_left'": (
-        ":5: 'panel_left'"
-    ),
+    URDF
+    + "passive = ['panel_left']\n"
+    + INPUT
+    + "'joint_torque'\njoint = 'panel_left'": (":5: 'panel_left'"),
     URDF + "outputs = ['com', 'frame:nosuch']": ":2: 'nosuch'",
     URDF + "outputs = ['comm']": ":2: 'comm'",
     URDF + "gravity = [0, 0]": ":2: [0, 0]",
@@ -264,7 +293,9 @@ def test_errors_of_the_caller_are_not_those_of_the_file(written):
         URDF + "a=" + "[" * 100_000,
         URDF + "lock." + "a." * 60_000 + "a=1",
         pytest.param(
-            URDF + "[stiffness]\n" + "".join(f"{'a.' * 900}b{k} = 1\n" for k in range(60)),
+            URDF
+            + "[stiffness]\n"
+            + "".join(f"{'a.' * 900}b{k} = 1\n" for k in range(60)),
             marks=pytest.mark.exhaustive,
         ),
         pytest.param(
@@ -334,9 +365,27 @@ def test_every_bundled_robot_in_a_file_is_itself(written, name):
 
 # Values whose structure is that of no key.
 STRANGE = (
-    *("[[1, 2, 3]]", "[[]]", "[1, [2], 3]", "[['joint_1']]", "[{a = 'x'}]", "[{a = 1}]"),
-    *("{a = [[1]]}", "{joint_1 = {a = {}}}", "true", "1979-05-27", "inf", "['\\u0000', []]"),
-    *("{q = {q_b = [[1]]}}", "{rpy = [[1], 2, 3]}", "{altitude = 5e5, body = ['earth']}"),
+    *(
+        "[[1, 2, 3]]",
+        "[[]]",
+        "[1, [2], 3]",
+        "[['joint_1']]",
+        "[{a = 'x'}]",
+        "[{a = 1}]",
+    ),
+    *(
+        "{a = [[1]]}",
+        "{joint_1 = {a = {}}}",
+        "true",
+        "1979-05-27",
+        "inf",
+        "['\\u0000', []]",
+    ),
+    *(
+        "{q = {q_b = [[1]]}}",
+        "{rpy = [[1], 2, 3]}",
+        "{altitude = 5e5, body = ['earth']}",
+    ),
 )
 
 

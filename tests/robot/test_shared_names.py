@@ -48,7 +48,10 @@ def test_a_robot_with_shared_names_is_the_robot_with_others(tmp_path, links, joi
         made = []
         for whole, link in ((shared, name), (other, twin)):
             robot = whole.replace(
-                inputs=[fflin.Thruster(link, (0.0, 0.2, 1.0), (1.0, 0.0, 0.0)), fflin.BaseTorque()],
+                inputs=[
+                    fflin.Thruster(link, (0.0, 0.2, 1.0), (1.0, 0.0, 0.0)),
+                    fflin.BaseTorque(),
+                ],
                 outputs=[fflin.FramePose(link)],
             )
             lin = fflin.linearize(robot, q)
@@ -57,7 +60,8 @@ def test_a_robot_with_shared_names_is_the_robot_with_others(tmp_path, links, joi
         for key in "ABCD":
             np.testing.assert_array_equal(getattr(made[0], key), getattr(made[1], key))
         np.testing.assert_array_equal(
-            fflin.generalized_jacobian(shared, q, name), fflin.generalized_jacobian(other, q, twin)
+            fflin.generalized_jacobian(shared, q, name),
+            fflin.generalized_jacobian(other, q, twin),
         )
 
 
@@ -73,12 +77,16 @@ def test_each_joint_of_a_robot_with_shared_names_can_be_locked(tmp_path, links, 
 
 
 @pytest.mark.parametrize(("links", "joints"), NAMES)
-def test_wheels_modes_and_payloads_are_mounted_on_links_with_shared_names(tmp_path, links, joints):
+def test_wheels_modes_and_payloads_are_mounted_on_links_with_shared_names(
+    tmp_path, links, joints
+):
     bare = fflin.load(write(tmp_path / "shared.urdf", links, joints))
     payload = fflin.load("planar_detumble")
     for link in links:
         wheel = fflin.ReactionWheel((0.0, 0.0, 1.0), frame=link, inertia=0.01)
-        array = fflin.FlexibleAppendage(link, 0.5, [[0.3], [0.0], [0.0]], [[0.0], [0.1], [0.0]])
+        array = fflin.FlexibleAppendage(
+            link, 0.5, [[0.3], [0.0], [0.0]], [[0.0], [0.1], [0.0]]
+        )
         robot = bare.replace(inputs=[wheel, fflin.BaseTorque()], appendages=[array])
         whole = fflin.capture(robot, link, payload).robot
         for made in (robot, whole):
@@ -91,7 +99,9 @@ def test_wheels_modes_and_payloads_are_mounted_on_links_with_shared_names(tmp_pa
 def test_a_robot_with_shared_names_is_shown(tmp_path, links, joints):
     robot = fflin.load(write(tmp_path / "shared.urdf", links, joints))
     robot = robot.replace(
-        inputs=[fflin.Thruster(link, (0.0, 0.0, 1.0), (1.0, 0.0, 0.0)) for link in links]
+        inputs=[
+            fflin.Thruster(link, (0.0, 0.0, 1.0), (1.0, 0.0, 0.0)) for link in links
+        ]
     )
     motion = fflin.simulate(robot, lambda t, q, v: np.ones(3), duration=0.1)
     for tool in (None, *links):
@@ -104,7 +114,9 @@ def test_the_world_is_no_tool(tmp_path):
     robot = fflin.load("planar_detumble")
     motion = fflin.simulate(robot, duration=0.1)
     with pytest.raises(fflin.UnknownNameError, match="'universe'"):
-        fflin.visualize(robot, motion, html=tmp_path / "a.html", open=False, tool="universe")
+        fflin.visualize(
+            robot, motion, html=tmp_path / "a.html", open=False, tool="universe"
+        )
 
 
 def test_info_names_a_link_called_universe(tmp_path, capsys):

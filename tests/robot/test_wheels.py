@@ -31,7 +31,10 @@ def spinning(robot, wheels=FOUR):
 
 def storing(robot, wheels=FOUR):
     """The same with the momentum only."""
-    added = [ReactionWheel(axis, frame, momentum=J * speed) for axis, frame, J, speed in wheels]
+    added = [
+        ReactionWheel(axis, frame, momentum=J * speed)
+        for axis, frame, J, speed in wheels
+    ]
     return robot.replace(inputs=[*robot.inputs, *added])
 
 
@@ -69,7 +72,9 @@ def everything(robot):
 def test_gyroscopic_block_has_its_closed_form(name, kind):
     """At rest but for the wheels, A[nu, nu] = M^-1 sum J^T [h]x J: M_red^-1 [h]x of one body."""
     bare = fflin.load(name)
-    wheels = [(a, f, J / 1e4, s) for a, f, J, s in FOUR[:2]] if name == "cubesat" else FOUR
+    wheels = (
+        [(a, f, J / 1e4, s) for a, f, J, s in FOUR[:2]] if name == "cubesat" else FOUR
+    )
     q = random_point(bare, np.random.default_rng(1), degrees=160.0)[0]
     if kind == "joints":
         robot, speeds = spinning(bare, wheels)
@@ -95,7 +100,9 @@ def test_gyroscopic_block_has_its_closed_form(name, kind):
     if name == "cubesat":
         reduced = np.array(bare.model.inertias[1].inertia)
         if kind == "joints":
-            reduced = reduced - sum(J * np.outer(unit(a), unit(a)) for a, _, J, _ in wheels)
+            reduced = reduced - sum(
+                J * np.outer(unit(a), unit(a)) for a, _, J, _ in wheels
+            )
         total = sum(J * s * unit(a) for a, _, J, s in wheels)
         block = np.linalg.solve(reduced, skew(total))
         g = fflin.StateMap(robot).groups
@@ -135,11 +142,17 @@ def test_check_holds_in_every_block(kind, frame, turned, moving):
         pose = random_pose(rng, degrees)
         q = fflin.configuration(robot, joints, pose)
         rates = {name: rng.normal() for name in robot.joint_names} | speeds
-        base = {f"{part}.{axis}": rng.normal() for part in ("omega_b", "v_b") for axis in "xyz"}
+        base = {
+            f"{part}.{axis}": rng.normal()
+            for part in ("omega_b", "v_b")
+            for axis in "xyz"
+        }
         v = fflin.velocity(robot, rates | base)
         u = 10.0 * rng.normal(size=len(fflin.linearize(robot).input_names))
         reference = pin.SE3.Identity() if turned else None
-        lin = fflin.linearize(robot, q, v, u, frame=frame, reference=reference, moving=moving)
+        lin = fflin.linearize(
+            robot, q, v, u, frame=frame, reference=reference, moving=moving
+        )
         found = fflin.check(robot, lin)
         assert found.ok, found
         assert any(row.block.endswith("wheel]") for row in found.rows)
@@ -160,7 +173,9 @@ def test_check_holds_on_random_trees_and_where_joints_mimic_others():
             ReactionWheel(rng.normal(size=3), frames[1], momentum=2.0),
             ReactionWheel(rng.normal(size=3), frames[2], momentum=-1.0),
         ]
-        robot = bare.replace(inputs=[fflin.BaseTorque(), *wheels], outputs=[fflin.Momentum()])
+        robot = bare.replace(
+            inputs=[fflin.BaseTorque(), *wheels], outputs=[fflin.Momentum()]
+        )
         q, v, _ = random_point(robot, rng)
         v[robot.joint("wheel_1").idx_v] = 200.0
         for frame in FRAMES:
@@ -174,7 +189,9 @@ def test_wheels_are_joints_as_if_built_by_hand():
     """A and B to the last digits of the model that has the wheel's rotor as a link of its own."""
     bare = fflin.load("dual_arm")
     axis, inertia = unit((1.0, -2.0, 0.5)), 0.02
-    robot = bare.replace(inputs=[*bare.inputs, ReactionWheel(axis, inertia=inertia, name="w")])
+    robot = bare.replace(
+        inputs=[*bare.inputs, ReactionWheel(axis, inertia=inertia, name="w")]
+    )
     model = bare.model.copy()
     hub = model.inertias[1]
     rest = hub.inertia - inertia * np.outer(axis, axis)
@@ -187,7 +204,10 @@ def test_wheels_are_joints_as_if_built_by_hand():
     assert robot.joint_names == by_hand.joint_names == (*bare.joint_names, "w")
     rng = np.random.default_rng(4)
     joints = {name: rng.uniform(-2.0, 2.0) for name in robot.joint_names}
-    rates = {name: rng.normal() for name in bare.joint_names} | {"w": 250.0, "omega_b.y": 0.3}
+    rates = {name: rng.normal() for name in bare.joint_names} | {
+        "w": 250.0,
+        "omega_b.y": 0.3,
+    }
     u = rng.normal(size=6 + robot.n)
     given, expected = (
         fflin.linearize(r, fflin.configuration(r, joints), fflin.velocity(r, rates), u)
@@ -203,14 +223,20 @@ def test_wheels_are_joints_as_if_built_by_hand():
 def test_stored_momentum_is_a_wheel_held_at_its_speed(name):
     """With its acceleration held at zero a wheel's row goes: the rest is the stored one's."""
     bare = fflin.load(name)
-    links = [frame.name for frame in bare.model.frames if frame.type == pin.FrameType.BODY]
-    wheels = [(axis, links[k], 0.1 * J, speed) for k, (axis, _, J, speed) in enumerate(FOUR)]
+    links = [
+        frame.name for frame in bare.model.frames if frame.type == pin.FrameType.BODY
+    ]
+    wheels = [
+        (axis, links[k], 0.1 * J, speed) for k, (axis, _, J, speed) in enumerate(FOUR)
+    ]
     robot, speeds = spinning(bare, wheels)
     stored = storing(bare, wheels)
     rng = np.random.default_rng(5)
     pose = random_pose(rng, 150.0)
     joints = {joint: rng.uniform(-2.0, 2.0) for joint in bare.joint_names}
-    base = {f"{part}.{axis}": rng.normal() for part in ("omega_b", "v_b") for axis in "xyz"}
+    base = {
+        f"{part}.{axis}": rng.normal() for part in ("omega_b", "v_b") for axis in "xyz"
+    }
     rates = {joint: rng.normal() for joint in bare.joint_names} | base
     u = np.append(rng.normal(size=6 + bare.n), np.zeros(4))
     with_joints, without = (
@@ -224,7 +250,9 @@ def test_stored_momentum_is_a_wheel_held_at_its_speed(name):
     # The motor torques that hold the speeds: they move nothing but the wheels' rows.
     held = fflin.linearize(*with_joints, u, frame="local")
     lower = held.B[nv:]
-    order = [held.input_names.index(name) for name in np.array(robot.joint_names)[wheel]]
+    order = [
+        held.input_names.index(name) for name in np.array(robot.joint_names)[wheel]
+    ]
     rows = 6 + np.flatnonzero(wheel)
     u[order] = -np.linalg.solve(lower[np.ix_(rows, order)], held.f0[nv + rows])
     held = fflin.linearize(*with_joints, u, frame="local")
@@ -237,12 +265,16 @@ def test_stored_momentum_is_a_wheel_held_at_its_speed(name):
     w, v_b = (held.x0[6 + n + k : 9 + n + k] for k in (0, 3))
     part[3:6, nv : nv + 3], part[3:6, nv + 3 : nv + 6] = skew(v_b), -skew(w)
     forces = forces - held.M @ part
-    expected = np.linalg.solve(M, forces[np.ix_(kept, columns)]) + part[np.ix_(kept, columns)]
+    expected = (
+        np.linalg.solve(M, forces[np.ix_(kept, columns)]) + part[np.ix_(kept, columns)]
+    )
     given = lin.A[6 + bare.n :]
     assert lin.M == pytest.approx(M, abs=1e-12 * np.abs(M).max())
     assert given == pytest.approx(expected, abs=1e-11 * np.abs(expected).max())
     rates_held = np.delete(held.f0[nv:], rows)
-    assert lin.f0[6 + bare.n :] == pytest.approx(rates_held, abs=1e-11 * np.abs(rates_held).max())
+    assert lin.f0[6 + bare.n :] == pytest.approx(
+        rates_held, abs=1e-11 * np.abs(rates_held).max()
+    )
 
 
 def test_stored_momentum_is_the_limit_of_small_fast_wheels():
@@ -258,7 +290,10 @@ def test_stored_momentum_is_the_limit_of_small_fast_wheels():
         robot, speeds = spinning(bare, momenta) if J else (bare, {})
         if not J:
             robot = storing(bare, [(axis, frame, 5.0, 1.0) for axis, frame, *_ in FOUR])
-        point = fflin.configuration(robot, joints), fflin.velocity(robot, rates | speeds)
+        point = (
+            fflin.configuration(robot, joints),
+            fflin.velocity(robot, rates | speeds),
+        )
         lin = fflin.linearize(robot, *point, u)
         kept = np.array([".wheel" not in name for name in lin.state_names])
         models.append((lin.A[np.ix_(kept, kept)], lin.B[kept], lin.f0[kept]))
@@ -299,7 +334,9 @@ def test_momentum_is_conserved_but_for_motors_of_stored_wheels(kind):
     joints = {name: rng.uniform(-2.0, 2.0) for name in robot.joint_names}
     rates = {name: rng.normal() for name in robot.joint_names} | speeds
     q = fflin.configuration(robot, joints, random_pose(rng, 140.0))
-    v = fflin.velocity(robot, rates | {"omega_b.x": 0.5, "omega_b.z": -1.0, "v_b.y": 0.4})
+    v = fflin.velocity(
+        robot, rates | {"omega_b.x": 0.5, "omega_b.z": -1.0, "v_b.y": 0.4}
+    )
     u = np.append(30.0 * rng.normal(size=bare.n), [1.0, 2.0, -3.0, 4.0])
     lin = momentum_at(robot, q, v, u)
     expected = np.zeros(6)
@@ -316,7 +353,10 @@ def test_momentum_is_conserved_but_for_motors_of_stored_wheels(kind):
     data = robot.create_data()
     pin.framesForwardKinematics(robot.model, data, q)
     total = sum(
-        J * speed * data.oMf[robot.model.getFrameId(frame or "base")].rotation @ unit(axis)
+        J
+        * speed
+        * data.oMf[robot.model.getFrameId(frame or "base")].rotation
+        @ unit(axis)
         for axis, frame, J, speed in FOUR
     )
     assert still.y0[:3] == pytest.approx(total, rel=1e-12)
@@ -325,7 +365,9 @@ def test_momentum_is_conserved_but_for_motors_of_stored_wheels(kind):
 def test_stored_momentum_does_no_work():
     bare = fflin.load("servicer_7dof")
     q, v, _ = random_point(bare, np.random.default_rng(8))
-    plain, turned = (fflin.linearize(r, q, v, frame="local") for r in (bare, storing(bare)))
+    plain, turned = (
+        fflin.linearize(r, q, v, frame="local") for r in (bare, storing(bare))
+    )
     nu = plain.x0[6 + bare.n :]
     force = plain.M @ (turned.f0 - plain.f0)[6 + bare.n :]
     assert np.abs(force).max() > 1.0
@@ -337,7 +379,14 @@ def test_wheels_come_and_go_with_the_inputs():
     robot, speeds = spinning(bare.replace(stiffness=2.0, damping={"joint_1": 1.0}))
     # After all that hangs on the carrier; two on one carrier in their own order.
     arm, panels = bare.joint_names[:7], bare.joint_names[7:]
-    assert robot.joint_names == (*arm, "wheel_3", "wheel_4", *panels, "wheel_1", "wheel_2")
+    assert robot.joint_names == (
+        *arm,
+        "wheel_3",
+        "wheel_4",
+        *panels,
+        "wheel_1",
+        "wheel_2",
+    )
     assert robot.mass == pytest.approx(bare.mass, rel=1e-15)
     assert bare.n == 9 and bare.model.njoints == 11
     damped = robot.replace(damping={"wheel_1": 1e-3, "joint_2": 0.5})
@@ -359,7 +408,10 @@ def test_wheels_come_and_go_with_the_inputs():
     for joint in bare.joints:
         moved = robot.joint(joint.name)
         for name in ("upperEffortLimit", "upperVelocityLimit", "armature", "damping"):
-            values = [getattr(r.model, name)[j.idx_v] for r, j in ((bare, joint), (robot, moved))]
+            values = [
+                getattr(r.model, name)[j.idx_v]
+                for r, j in ((bare, joint), (robot, moved))
+            ]
             assert values[0] == values[1]
         limits = [
             (r.model.lowerPositionLimit[j.idx_q], r.model.upperPositionLimit[j.idx_q])
@@ -369,19 +421,28 @@ def test_wheels_come_and_go_with_the_inputs():
     # Without those of the wheels, its frames are those of the bare model, in their order.
     frames, others = (
         [
-            (f.name, f.type, model.names[f.parentJoint], model.frames[f.parentFrame].name)
+            (
+                f.name,
+                f.type,
+                model.names[f.parentJoint],
+                model.frames[f.parentFrame].name,
+            )
             for f in model.frames
             if f.name not in robot.wheels
         ]
         for model in (bare.model, robot.model)
     )
     assert frames == others
-    assert fflin.load("servicer_7dof", lock=["panel_left"], inputs=robot.inputs[:6]).n == 8
+    assert (
+        fflin.load("servicer_7dof", lock=["panel_left"], inputs=robot.inputs[:6]).n == 8
+    )
 
 
 def test_a_q_or_v_from_before_the_inputs_were_replaced_names_the_wheels_that_left():
     robot = fflin.load("planar_detumble")
-    wheels = [ReactionWheel((1, 0, 0), inertia=0.01, name=name) for name in ("roll", "pitch")]
+    wheels = [
+        ReactionWheel((1, 0, 0), inertia=0.01, name=name) for name in ("roll", "pitch")
+    ]
     full = robot.replace(inputs=[*robot.inputs, *wheels])
     left = full.replace(inputs=robot.inputs)
     kept = full.replace(inputs=[*robot.inputs, wheels[1]])
@@ -402,7 +463,9 @@ def test_a_q_or_v_from_before_the_inputs_were_replaced_names_the_wheels_that_lef
         with pytest.raises(fflin.InputError, match=r"has shape") as error:
             fflin.linearize(other, wrong)
         assert "were removed" not in str(error.value)
-    assert fflin.linearize(left.replace(inputs=full.inputs), q).A.shape[0] == 2 * (6 + full.n)
+    assert fflin.linearize(left.replace(inputs=full.inputs), q).A.shape[0] == 2 * (
+        6 + full.n
+    )
 
 
 def test_wheels_are_shown_and_named():
@@ -411,7 +474,9 @@ def test_wheels_are_shown_and_named():
     shown = {row[0]: row[1] for row in rows if len(row) > 1}
     assert {shown[name] for name in speeds} == {"wheel"} and shown["joint_1"] != "wheel"
     lin = fflin.linearize(robot, None, fflin.velocity(robot, speeds))
-    assert lin.input_names[-4:] == tuple(speeds) and lin.input_units[-4:] == ("N m",) * 4
+    assert (
+        lin.input_names[-4:] == tuple(speeds) and lin.input_units[-4:] == ("N m",) * 4
+    )
     assert {f"qdot_m.{name}" for name in speeds} < set(lin.state_names)
     u = fflin.effort(robot, {"wheel_2": 0.5})
     assert np.flatnonzero(u).tolist() == [lin.input_names.index("wheel_2")]
@@ -449,16 +514,28 @@ def test_bad_wheels_are_told_in_a_line():
         "nan": lambda: ReactionWheel((0, 0, 1), inertia=float("nan")),
         "'a'": lambda: ReactionWheel((0, 0, 1), momentum="a"),
         "momentum": lambda: ReactionWheel((0, 0, 1), inertia=1.0, momentum=1.0),
-        "1000 kg m^2": (lambda: robot.replace(inputs=[ReactionWheel((0, 0, 1), inertia=1000.0)])),
-        "joint 'joint_3'": (
-            lambda: robot.replace(inputs=[ReactionWheel((0, 0, 1), "link_3", inertia=10.0)])
+        "1000 kg m^2": (
+            lambda: robot.replace(inputs=[ReactionWheel((0, 0, 1), inertia=1000.0)])
         ),
-        "'bas'": (lambda: robot.replace(inputs=[ReactionWheel((0, 0, 1), "bas", inertia=0.1)])),
-        "'too'": (lambda: fflin.linearize(robot.replace(inputs=[ReactionWheel((0, 0, 1), "too")]))),
+        "joint 'joint_3'": (
+            lambda: robot.replace(
+                inputs=[ReactionWheel((0, 0, 1), "link_3", inertia=10.0)]
+            )
+        ),
+        "'bas'": (
+            lambda: robot.replace(inputs=[ReactionWheel((0, 0, 1), "bas", inertia=0.1)])
+        ),
+        "'too'": (
+            lambda: fflin.linearize(
+                robot.replace(inputs=[ReactionWheel((0, 0, 1), "too")])
+            )
+        ),
         "'joint_3' has the name": lambda: robot.replace(
             inputs=[ReactionWheel((0, 0, 1), inertia=0.1, name="joint_3")]
         ),
-        "wheel_2": lambda: robot.replace(inputs=[ReactionWheel((0, 0, 1), name="wheel_2"), none]),
+        "wheel_2": lambda: robot.replace(
+            inputs=[ReactionWheel((0, 0, 1), name="wheel_2"), none]
+        ),
         "wheel 'wheel_1'": (
             lambda: fflin.velocity(robot.replace(inputs=[none]), {"wheel_1": 100.0})
         ),
@@ -469,7 +546,9 @@ def test_bad_wheels_are_told_in_a_line():
     for words, call in cases.items():
         with pytest.raises(fflin.FflinError) as caught:
             call()
-        assert words in str(caught.value) and "\n" not in str(caught.value), str(caught.value)
+        assert words in str(caught.value) and "\n" not in str(caught.value), str(
+            caught.value
+        )
     # All wheels of a carrier together count.
     pair = [ReactionWheel((0, 0, 1), "link_3", inertia=J) for J in (0.01, 10.0)]
     with pytest.raises(fflin.InputError, match="'wheel_2'"):

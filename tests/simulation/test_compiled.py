@@ -17,7 +17,15 @@ from fflin.simulation.run import Plant
 from tests.support.measured import POSITIONS, designed
 from tests.support.motions import HOME, displaced
 from tests.support.motions import motion as trajectory
-from tests.support.robots import BUNDLED, FRAMES, LINKS, MIMIC, free_body, random_point, random_tree
+from tests.support.robots import (
+    BUNDLED,
+    FRAMES,
+    LINKS,
+    MIMIC,
+    free_body,
+    random_point,
+    random_tree,
+)
 from tests.support.weights import unit_weights
 
 pytest.importorskip("numba")
@@ -26,7 +34,9 @@ from fflin.kernel import loop, tree
 
 pytestmark = pytest.mark.compiled
 
-WHEEL = fflin.ReactionWheel((0, 0, 1), name="spin", inertia=0.02, max_speed=300.0, max=0.5)
+WHEEL = fflin.ReactionWheel(
+    (0, 0, 1), name="spin", inertia=0.02, max_speed=300.0, max=0.5
+)
 STORING = fflin.ReactionWheel((1, 2, 2), name="storing", momentum=3.0)
 
 
@@ -36,7 +46,8 @@ def both(robot, policy=None, tolerance=1e-10, rounding=2e-14, **options):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", fflin.FflinWarning)
         python, motion = (
-            fflin.simulate(robot, policy, **options, engine=engine) for engine in ENGINES
+            fflin.simulate(robot, policy, **options, engine=engine)
+            for engine in ENGINES
         )
     assert (python.engine, motion.engine) == ENGINES
     assert motion.stopped == python.stopped
@@ -46,7 +57,9 @@ def both(robot, policy=None, tolerance=1e-10, rounding=2e-14, **options):
         size = np.maximum(1.0, np.abs(expected).max(axis=0))
         assert (np.abs(found - expected) <= tolerance * size).all(), name
     if options.get("project", True):
-        assert motion.momentum_drift.max() <= rounding + 2.0 * python.momentum_drift.max()
+        assert (
+            motion.momentum_drift.max() <= rounding + 2.0 * python.momentum_drift.max()
+        )
         assert motion.com_drift.max() <= rounding + 2.0 * python.com_drift.max()
     return motion
 
@@ -89,7 +102,9 @@ PASSIVE = {
         ]
     },
 }
-PASSIVE["all"] = {key: value for each in PASSIVE.values() for key, value in each.items()}
+PASSIVE["all"] = {
+    key: value for each in PASSIVE.values() for key, value in each.items()
+}
 
 
 @pytest.mark.parametrize("fields", PASSIVE.values(), ids=PASSIVE)
@@ -124,10 +139,19 @@ def test_samples_delay_and_limits(robots, delay):
     policy = sampled(robots["ets_vii"])
     limits = {"tau_b": (-0.5, 0.7), "tau_m": 2.0}
     x0 = displaced(policy.lin)
-    motion = both(robots["ets_vii"], policy, x0=x0, delay=delay, limits=limits, duration=5.0)
+    motion = both(
+        robots["ets_vii"], policy, x0=x0, delay=delay, limits=limits, duration=5.0
+    )
     assert motion.u[:, :3].min() == -0.5
     both(robots["ets_vii"], policy, x0=x0, delay=delay, every=7, duration=5.0)
-    both(robots["ets_vii"], feedback(robots["ets_vii"]), sample=0.03, delay=delay, x0=x0, dt=0.01)
+    both(
+        robots["ets_vii"],
+        feedback(robots["ets_vii"]),
+        sample=0.03,
+        delay=delay,
+        x0=x0,
+        dt=0.01,
+    )
 
 
 def test_wheels_that_saturate():
@@ -146,7 +170,9 @@ def test_wheels_that_saturate():
 @pytest.mark.parametrize("on_off", [False, True])
 def test_thrusters_that_fire_in_pulses(on_off, least):
     jets = [
-        fflin.Thruster("base", place, way, f"jet_{k}", max=0.3, on_off=on_off, least_impulse=least)
+        fflin.Thruster(
+            "base", place, way, f"jet_{k}", max=0.3, on_off=on_off, least_impulse=least
+        )
         for k, (place, way) in enumerate(
             itertools.product(((0.1, 0, 0), (-0.1, 0, 0)), ((0, 1, 0), (0, -1, 0)))
         )
@@ -158,7 +184,9 @@ def test_thrusters_that_fire_in_pulses(on_off, least):
     held = replace(lin.discretize(0.1), u0=0.1 + 0.0 * lin.u0)
     policy = fflin.StateFeedback(held, 0.3 * K)
     for delay in (0.04, 0.24):
-        motion = both(robot, policy, x0=displaced(lin), dt=0.02, delay=delay, duration=4.0)
+        motion = both(
+            robot, policy, x0=displaced(lin), dt=0.02, delay=delay, duration=4.0
+        )
         assert (motion.u[: round(delay / 0.02), :4] > 0.0).any(axis=0).all()
 
 
@@ -183,12 +211,16 @@ def schedule():
     robot = fflin.load("ets_vii")
     lin = fflin.linearize(robot)
     x0 = displaced(lin, degrees=50.0)
-    slew = fflin.simulate(robot, feedback(robot), x0=x0, duration=6.0, dt=0.1, engine="python")
+    slew = fflin.simulate(
+        robot, feedback(robot), x0=x0, duration=6.0, dt=0.1, engine="python"
+    )
     path = fflin.Trajectory(robot, slew.t + 2.0, slew.q, slew.v, slew.u, frame="hybrid")
     return fflin.tvlqr(fflin.linearize_trajectory(robot, path), *unit_weights(lin))
 
 
-@pytest.mark.parametrize("case", [{}, {"duration": 3.0}, {"sample": 0.05, "delay": 0.05}])
+@pytest.mark.parametrize(
+    "case", [{}, {"duration": 3.0}, {"sample": 0.05, "delay": 0.05}]
+)
 def test_feedback_along_a_trajectory(robots, schedule, case):
     q = schedule.q[0].copy()
     q[:3] += 0.1
@@ -202,7 +234,9 @@ def test_a_trajectory_is_followed_from_sample_to_sample(robots):
     t, q, v, u = trajectory(robot, duration=0.4, knots=9)
     for inputs in (u, u[:-1]):
         along = fflin.linearize_trajectory(robot, t, q, v, inputs)
-        gains = fflin.tvlqr(along, *unit_weights(fflin.linearize(robot, q[0])), sample=0.05)
+        gains = fflin.tvlqr(
+            along, *unit_weights(fflin.linearize(robot, q[0])), sample=0.05
+        )
         both(robot, gains, dt=0.01, duration=0.4, v0=1.1 * v[0], q0=q[0])
 
 
@@ -219,7 +253,9 @@ def test_an_orbit_costs_no_digits(robots):
     robot = robots["canadarm2"]
     reference = pin.SE3(HOME.rotation, np.array([7e6, 1e5, -2e5]))
     lin = fflin.linearize(
-        robot, np.array([*reference.translation, *robot.neutral()[3:]]), reference=reference
+        robot,
+        np.array([*reference.translation, *robot.neutral()[3:]]),
+        reference=reference,
     )
     policy = fflin.StateFeedback(lin, fflin.lqr(lin).K)
     x0 = displaced(lin)
@@ -235,7 +271,9 @@ def test_ctrl_c_keeps_what_is_done(robots, monkeypatch):
             raise KeyboardInterrupt
 
     monkeypatch.setattr(lanes.Progress, "__call__", update)
-    motion = fflin.simulate(robots["cubesat"], duration=500.0, dt=0.01, engine="compiled")
+    motion = fflin.simulate(
+        robots["cubesat"], duration=500.0, dt=0.01, engine="compiled"
+    )
     assert motion.stopped == f"interrupted at t = {motion.t[-1] + 0.01:g} s"
     assert 4 * 16 <= len(motion.t) < 1e6
 
@@ -245,7 +283,12 @@ def test_ctrl_c_keeps_what_is_done(robots, monkeypatch):
 def test_recorded_rows_do_not_depend_on_the_slices(robots, monkeypatch, every, memory):
     robot, calls = robots["cubesat"], []
     policy = feedback(robot)
-    options = {"x0": displaced(policy.lin), "duration": 1.0, "dt": 0.01, "linear": False}
+    options = {
+        "x0": displaced(policy.lin),
+        "duration": 1.0,
+        "dt": 0.01,
+        "linear": False,
+    }
     motion = fflin.simulate(robot, policy, **options, engine="compiled")
     kernel = lanes.kernel
     counted = lambda *names: lambda *a: [calls.append(a), kernel(*names)(*a)]  # noqa: E731
@@ -254,7 +297,9 @@ def test_recorded_rows_do_not_depend_on_the_slices(robots, monkeypatch, every, m
     found = fflin.simulate(robot, policy, **options, every=every, engine="compiled")
     chosen = np.append(np.arange(0, 100, every), 100)
     for name in ("t", "q", "v", "u"):
-        np.testing.assert_array_equal(getattr(found, name), getattr(motion, name)[chosen])
+        np.testing.assert_array_equal(
+            getattr(found, name), getattr(motion, name)[chosen]
+        )
     # Each call fills its memory: one row, or all rows of the run.
     assert len(calls) == (-(-100 // every) if memory == 1 else 1)
 
@@ -265,7 +310,9 @@ def test_limits_of_modal_rates_are_scaled_like_the_rates():
     stop = run.stop_conditions(plan)
     limits = plan.plant.state.velocities(np.sqrt(stop.squares))
     assert limits.min() < 0.5 * limits.max()
-    np.testing.assert_allclose(lanes.packed(plan, stop).stop.squares, limits**2, rtol=1e-15)
+    np.testing.assert_allclose(
+        lanes.packed(plan, stop).stop.squares, limits**2, rtol=1e-15
+    )
 
 
 def nothing(t, q, v):
@@ -283,7 +330,10 @@ def test_what_cannot_be_compiled_says_why(robots):
     for more, words in cases:
         with pytest.raises(fflin.InputError, match=words):
             fflin.simulate(robot, **options, **more)
-        assert fflin.simulate(robot, **(options | {"engine": None}), **more).engine == "python"
+        assert (
+            fflin.simulate(robot, **(options | {"engine": None}), **more).engine
+            == "python"
+        )
     with pytest.raises(fflin.UnknownNameError, match="compiled"):
         fflin.simulate(robot, duration=0.1, engine="compile")
     monkeypatched = pytest.MonkeyPatch()
@@ -293,7 +343,9 @@ def test_what_cannot_be_compiled_says_why(robots):
             fflin.simulate(robot, **options)
 
 
-def test_a_long_run_goes_compiled_if_its_machine_code_is_there(robots, monkeypatch, tmp_path):
+def test_a_long_run_goes_compiled_if_its_machine_code_is_there(
+    robots, monkeypatch, tmp_path
+):
     robot = robots["cubesat"]
     for kept, longest, engine in (
         (True, 10, "python"),
@@ -323,7 +375,12 @@ def test_eight_lanes_are_eight_runs(robots):
                 mass * model.inertias[joint].toDynamicParameters()
             )
         own = fflin.from_model(model, inputs=robot.inputs)
-        options = {"x0": share * displaced(lin), "duration": 2.0, "dt": 0.01, "linear": False}
+        options = {
+            "x0": share * displaced(lin),
+            "duration": 2.0,
+            "dt": 0.01,
+            "linear": False,
+        }
         plan = Plan(SimulationOptions(robot=own, policy=policy, **options))
         plant = plan.plant
         faults = plant.faults._replace(gain=np.full(len(plant.faults.gain), gain))
@@ -332,7 +389,9 @@ def test_eight_lanes_are_eight_runs(robots):
         runs.append(start | {"bodies": batch_tree(own).bodies} | faults._asdict())
     together, kept = lanes.LaneLoop(plans[0]), Kept()
     out = {"end": np.empty(8)}
-    together.fly(kept, out, {key: np.array([each[key] for each in runs]) for key in runs[0]})
+    together.fly(
+        kept, out, {key: np.array([each[key] for each in runs]) for key in runs[0]}
+    )
     assert (out["end"] == 200.0).all()
     first, second, third = together.ends[:3]
     rows = np.concatenate(kept.slices).transpose(0, 2, 1)
@@ -340,7 +399,9 @@ def test_eight_lanes_are_eight_runs(robots):
     for lane, plan in enumerate(plans):
         motion = run.go(plan)
         np.testing.assert_allclose(q[:20, lane], motion.q[:200:10], rtol=0, atol=1e-12)
-        np.testing.assert_allclose(u[:20, lane], motion.u[:200:10], rtol=1e-11, atol=1e-11)
+        np.testing.assert_allclose(
+            u[:20, lane], motion.u[:200:10], rtol=1e-11, atol=1e-11
+        )
         np.testing.assert_allclose(q[-1, lane], motion.q[-1], rtol=0, atol=1e-12)
     assert np.ptp(q[-1, :, :7], axis=0).min() > 1e-4
 
@@ -384,7 +445,9 @@ def test_a_command_that_is_no_number_is_told(robots):
     assert "tau_b.x" in said[0]
 
 
-def test_a_long_run_in_python_says_what_the_compiled_loop_would_take(robots, monkeypatch, caplog):
+def test_a_long_run_in_python_says_what_the_compiled_loop_would_take(
+    robots, monkeypatch, caplog
+):
     monkeypatch.setattr("fflin.simulation.simulate.LONG_RUN", 0.0)
     options = {"duration": 0.1, "linear": False}
     fflin.simulate(robots["cubesat"], **options, engine="python")
@@ -394,7 +457,9 @@ def test_a_long_run_in_python_says_what_the_compiled_loop_would_take(robots, mon
     assert len(caplog.records) == 1  # which the compiled loop does not do
 
 
-def test_a_run_in_python_names_the_compiled_loop_if_it_can_run_there(robots, monkeypatch):
+def test_a_run_in_python_names_the_compiled_loop_if_it_can_run_there(
+    robots, monkeypatch
+):
     hints = []
 
     class Bar:

@@ -21,7 +21,8 @@ def apart(robot, policy, **options):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", fflin.FflinWarning)
         python, motion = (
-            fflin.simulate(robot, policy, **options, engine=engine) for engine in ENGINES
+            fflin.simulate(robot, policy, **options, engine=engine)
+            for engine in ENGINES
         )
     assert (python.engine, motion.engine) == ENGINES
     assert motion.stopped == python.stopped == ""
@@ -42,7 +43,13 @@ def test_both_loops_agree(robots, name, make):
     robot, policy, options = make(plain(robots[name]))
     x0 = displaced(fflin.linearize(robot), degrees=20.0)
     method = ("cf4", "semi_implicit_euler")[BUNDLED.index(name) % 2]
-    options = {"x0": x0, "duration": 10.0, "dt": 0.02, "linear": False, "method": method} | options
+    options = {
+        "x0": x0,
+        "duration": 10.0,
+        "dt": 0.02,
+        "linear": False,
+        "method": method,
+    } | options
     motion, sizes = apart(robot, policy, **options)
     # Thrusts that do the same are told apart by rows of 1e-7: rounding is 1e7 times as large.
     assert sizes.pop("u") < (1e-8 if make is shared else 1e-10)

@@ -95,11 +95,15 @@ def test_the_centre_of_mass_falls_as_gravity_and_a_constant_force_say(every):
     com, t = centers(robot, motion), motion.t[:, None]
     acceleration = np.array(robot.gravity) + force / robot.mass
     start = motion.momentum[0, 3:] / robot.mass
-    np.testing.assert_allclose(com, com[0] + t * start + t**2 / 2.0 * acceleration, atol=1e-13)
+    np.testing.assert_allclose(
+        com, com[0] + t * start + t**2 / 2.0 * acceleration, atol=1e-13
+    )
     assert motion.com_drift.max() < 1e-13
 
 
-@pytest.mark.parametrize(("method", "order"), [("cf4", 4.0), ("semi_implicit_euler", 1.0)])
+@pytest.mark.parametrize(
+    ("method", "order"), [("cf4", 4.0), ("semi_implicit_euler", 1.0)]
+)
 def test_the_line_of_the_centre_of_mass_is_of_the_order_of_the_method(method, order):
     # A force cos(3 t) in the world: r = (1 - cos 3 t) / (9 m).
     robot = free_body((20.0, 30.0, 40.0))
@@ -111,7 +115,12 @@ def test_the_line_of_the_centre_of_mass_is_of_the_order_of_the_method(method, or
     errors = []
     for dt in (0.04, 0.02, 0.01):
         motion = fflin.simulate(
-            robot, v0=[0, 0, 0, 0.3, 0.2, 0.1], duration=2.0, dt=dt, disturbance=push, method=method
+            robot,
+            v0=[0, 0, 0, 0.3, 0.2, 0.1],
+            duration=2.0,
+            dt=dt,
+            disturbance=push,
+            method=method,
         )
         assert motion.com_drift.max() < 1e-14
         errors.append(abs(motion.q[-1, 1] - (1.0 - math.cos(6.0)) / 9.0))
@@ -126,7 +135,9 @@ SAMPLED = {"sample": 0.1, "delay": 0.05}
     [
         ("hybrid", {}),
         ("local", SAMPLED),
-        *exhaustive(("hybrid", SAMPLED), ("local", {}), ("world", {}), ("world", SAMPLED)),
+        *exhaustive(
+            ("hybrid", SAMPLED), ("local", {}), ("world", {}), ("world", SAMPLED)
+        ),
     ],
 )
 def test_the_line_is_kept_where_everything_acts_and_the_order_too(frame, options):
@@ -140,7 +151,9 @@ def test_the_line_is_kept_where_everything_acts_and_the_order_too(frame, options
             duration=0.4,
             dt=dt,
             frame=frame,
-            reference=pin.SE3(pin.exp3(np.array([0.3, -0.2, 0.5])), np.array([1.0, 2.0, 3.0])),
+            reference=pin.SE3(
+                pin.exp3(np.array([0.3, -0.2, 0.5])), np.array([1.0, 2.0, 3.0])
+            ),
             project=project,
         )
 
@@ -170,7 +183,10 @@ def test_the_root_may_be_placed_and_the_robot_far_away():
     fall = t**2 / 2.0 * np.array(robot.gravity)
     np.testing.assert_allclose(com, com[0] + t * start + fall, atol=1e-13)
     q0[:3] += 7e6, 1e6, -2e6
-    assert fflin.simulate(robot, q0=q0, v0=v0, duration=1.0, dt=0.02).com_drift.max() < 1e-8
+    assert (
+        fflin.simulate(robot, q0=q0, v0=v0, duration=1.0, dt=0.02).com_drift.max()
+        < 1e-8
+    )
 
 
 def test_events_and_a_regulator_see_the_robot_on_its_line():
@@ -182,7 +198,9 @@ def test_events_and_a_regulator_see_the_robot_on_its_line():
         return 0.305 - t
 
     policy = fflin.StateFeedback(lin, gain.K)
-    motion = fflin.simulate(robot, policy, x0=displaced(lin), duration=1.0, events=[fence])
+    motion = fflin.simulate(
+        robot, policy, x0=displaced(lin), duration=1.0, events=[fence]
+    )
     assert motion.stopped == "fence at t = 0.31 s"
     np.testing.assert_array_equal(motion.q[1:], seen)
     assert motion.com_drift.max() < 1e-14
@@ -194,10 +212,15 @@ def test_the_drift_of_a_balanced_spin_is_rounding():
     for name, hinge, center in (("left", 0.6, 0.7), ("right", -0.4, -0.9)):
         place = pin.SE3(np.eye(3), np.array([hinge, 0.0, 0.0]))
         panel = model.addJoint(1, pin.JointModelRX(), place, name)
-        inertia = pin.Inertia(7.0, np.array([center, 0.0, 0.0]), np.diag([1.0, 2.0, 1.5]))
+        inertia = pin.Inertia(
+            7.0, np.array([center, 0.0, 0.0]), np.diag([1.0, 2.0, 1.5])
+        )
         model.appendBodyToJoint(panel, inertia, pin.SE3.Identity())
     motion = fflin.simulate(
-        fflin.from_model(model), v0=[0, 0, 0, 0.3, 0.2, 0.1, 0, 0], duration=5.0, dt=0.05
+        fflin.from_model(model),
+        v0=[0, 0, 0, 0.3, 0.2, 0.1, 0, 0],
+        duration=5.0,
+        dt=0.05,
     )
     assert 0.0 < np.abs(motion.momentum[:, 3:]).max() < 1e-14
     assert motion.momentum_drift.max() < 1e-14
@@ -232,7 +255,9 @@ def test_what_is_lost_is_shown_relative_to_mass_speed_and_extent(part, monkeypat
     momenta = robot.mass * np.array(speed)
     linear = np.linalg.norm(p - p[0], axis=1) / momenta.max()
     angular = np.linalg.norm(h - h[0], axis=1) / (momenta * extent).max()
-    np.testing.assert_allclose(motion.momentum_drift, np.maximum(linear, angular), atol=1e-13)
+    np.testing.assert_allclose(
+        motion.momentum_drift, np.maximum(linear, angular), atol=1e-13
+    )
     assert motion.momentum_drift[-1] > 1e-4
 
 

@@ -16,14 +16,25 @@ def robot():
 def flown(robot, disturbance, **options):
     v0 = fflin.velocity(robot, SPIN)
     return fflin.simulate(
-        robot, v0=v0, duration=1.0, dt=0.02, project=False, disturbance=disturbance, **options
+        robot,
+        v0=v0,
+        duration=1.0,
+        dt=0.02,
+        project=False,
+        disturbance=disturbance,
+        **options,
     )
 
 
 @pytest.mark.parametrize("frame", ["hybrid", "local", "world"])
 def test_forces_act_in_the_axes_of_the_inputs(robot, frame):
     """A constant input and a disturbance of the same name are the same force."""
-    given = {"tau_b": (0.02, -0.01, 0.03), "F_b.x": 0.3, "F_b.z": -0.1, "tau_m.arm_distal": 0.01}
+    given = {
+        "tau_b": (0.02, -0.01, 0.03),
+        "F_b.x": 0.3,
+        "F_b.z": -0.1,
+        "tau_m.arm_distal": 0.01,
+    }
     values = dict(zip(("tau_b.x", "tau_b.y", "tau_b.z"), given["tau_b"], strict=True))
     u = fflin.effort(robot, values | {key: given[key] for key in list(given)[1:]})
     v0 = fflin.velocity(robot, SPIN)
@@ -65,10 +76,15 @@ def test_a_function_in_a_mapping_is_refused_with_the_form_that_varies_in_time(ro
     assert np.ptp(motion.energy) > 0.0
 
 
-@pytest.mark.parametrize("option, arguments", [("disturbance", 3), ("callback", 4), ("policy", 3)])
+@pytest.mark.parametrize(
+    "option, arguments", [("disturbance", 3), ("callback", 4), ("policy", 3)]
+)
 def test_a_function_of_other_arguments_is_refused(robot, option, arguments):
     names = "(t, q, v, u)" if arguments == 4 else "(t, q, v)"
     options = {"duration": 0.1, "dt": 0.05, option: lambda t: None}
     with pytest.raises(fflin.InputError) as error:
         fflin.simulate(robot, **options)
-    assert str(error.value) == f"{option} is a function of (t), expected a function of {names}"
+    assert (
+        str(error.value)
+        == f"{option} is a function of (t), expected a function of {names}"
+    )

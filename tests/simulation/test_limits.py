@@ -29,7 +29,9 @@ def test_limits_of_the_robot_cut_and_given_ones_go_first():
     u = np.full(15, 1e3)
 
     def acting(limits):
-        motion = fflin.simulate(robot, lambda t, q, v: u, duration=2e-4, dt=1e-4, limits=limits)
+        motion = fflin.simulate(
+            robot, lambda t, q, v: u, duration=2e-4, dt=1e-4, limits=limits
+        )
         known = dict(zip(motion.limit_names, motion.limits.tolist(), strict=True))
         assert motion.limits.shape == (len(known), 2)
         return dict(zip(motion.input_names, motion.u[0], strict=True)), known
@@ -44,7 +46,11 @@ def test_limits_of_the_robot_cut_and_given_ones_go_first():
     assert (acted["tau_b.x"], acted["F_b.x"]) == (40.0, 1e3)
     assert (acted["tau_m.joint_1"], acted["tau_m.panel_left"]) == (300.0, 50.0)
     acted, known = acting(["urdf", {"joint_1": 7.0, "F_b": (-1.0, 2.0)}])
-    assert (acted["tau_m.joint_1"], acted["tau_m.joint_2"], acted["F_b.y"]) == (7.0, 300.0, 2.0)
+    assert (acted["tau_m.joint_1"], acted["tau_m.joint_2"], acted["F_b.y"]) == (
+        7.0,
+        300.0,
+        2.0,
+    )
     assert known["F_b.z"] == [-1.0, 2.0]
     assert known["tau_m.joint_1"] == [-7.0, 7.0]
     acted, known = acting({"joint_1": 7.0})
@@ -91,9 +97,13 @@ def test_a_wheel_saturates_and_no_momentum_is_lost(sign, sample, method):
     assert motion.momentum_drift.max() < 1e-14
     # All that the body has is the wheel's: H = 0.
     body = motion.x[-1, motion.state_names.index("omega_b.z")]
-    assert (40.0 - INERTIA) * body == pytest.approx(-INERTIA * (sign * SPEED + body), rel=1e-9)
+    assert (40.0 - INERTIA) * body == pytest.approx(
+        -INERTIA * (sign * SPEED + body), rel=1e-9
+    )
     told = {each.name: each for each in motion.saturated}
-    assert told["spin"].limit == 0.5 * sign and told["qdot_m.spin"].limit == SPEED * sign
+    assert (
+        told["spin"].limit == 0.5 * sign and told["qdot_m.spin"].limit == SPEED * sign
+    )
     assert told["spin"].share == pytest.approx(full.mean(), abs=1e-3)
     assert told["qdot_m.spin"].share == pytest.approx(1.0 - full.mean(), abs=2e-3)
     assert not motion.passed
@@ -102,7 +112,9 @@ def test_a_wheel_saturates_and_no_momentum_is_lost(sign, sample, method):
 @pytest.mark.parametrize("torque", [0.0, 8.0])
 def test_a_wheel_that_other_inputs_drive_beyond_its_limit_is_in_the_headline(torque):
     """The motor does not brake the wheel, so the body turns under it."""
-    wheel = fflin.ReactionWheel((0, 0, 1), name="spin", inertia=INERTIA, max_speed=2.0, max=0.5)
+    wheel = fflin.ReactionWheel(
+        (0, 0, 1), name="spin", inertia=INERTIA, max_speed=2.0, max=0.5
+    )
     robot = free_body((20.0, 30.0, 40.0)).replace(inputs=[fflin.BaseTorque(), wheel])
     v0 = fflin.velocity(robot, {"spin": 1.9})
 
@@ -139,7 +151,9 @@ def test_the_attitude_is_lost_where_the_wheel_is_full():
         )
         for limits in (None, "urdf")
     }
-    angle = {limits: 2.0 * np.degrees(np.arcsin(run.x[:, 2])) for limits, run in runs.items()}
+    angle = {
+        limits: 2.0 * np.degrees(np.arcsin(run.x[:, 2])) for limits, run in runs.items()
+    }
     early = runs["urdf"].t < 55.0
     np.testing.assert_allclose(angle["urdf"][early], angle[None][early], atol=1e-9)
     assert np.abs(angle[None]).max() < 0.1
@@ -184,7 +198,12 @@ def test_a_wheel_that_begins_too_fast_takes_no_torque_but_what_brakes_it(asked):
     )
     np.testing.assert_array_equal(motion.u[:, 0], min(asked, 0.0))
     told = motion.passed[0]
-    assert (told.name, told.value, told.time, told.limit) == ("qdot_m.spin", 301.0, 0.0, SPEED)
+    assert (told.name, told.value, told.time, told.limit) == (
+        "qdot_m.spin",
+        301.0,
+        0.0,
+        SPEED,
+    )
 
 
 def test_a_wheel_without_a_limit_of_its_torque_stops_at_its_largest_speed():
@@ -198,11 +217,15 @@ def test_a_wheel_without_a_limit_of_its_torque_stops_at_its_largest_speed():
 def test_each_of_three_wheels_stops_at_its_own_largest_speed():
     speeds, axes = (100.0, 200.0, 300.0), ((1, 0, 0), (0, 1, 0), (0, 0, 1))
     wheels = [
-        fflin.ReactionWheel(axis, name=f"w_{speed:.0f}", inertia=INERTIA, max_speed=speed)
+        fflin.ReactionWheel(
+            axis, name=f"w_{speed:.0f}", inertia=INERTIA, max_speed=speed
+        )
         for axis, speed in zip(axes, speeds, strict=True)
     ]
     robot = free_body((20.0, 30.0, 40.0)).replace(inputs=wheels)
-    motion = fflin.simulate(robot, lambda t, q, v: [0.5] * 3, duration=15.0, limits="urdf")
+    motion = fflin.simulate(
+        robot, lambda t, q, v: [0.5] * 3, duration=15.0, limits="urdf"
+    )
     rates = motion.x[:, [motion.state_names.index(f"qdot_m.w_{x:.0f}") for x in speeds]]
     # The body turns, so that each torque also changes the speeds of the other wheels a little.
     assert rates.max(axis=0) == pytest.approx(speeds, rel=1e-4)
@@ -211,7 +234,9 @@ def test_each_of_three_wheels_stops_at_its_own_largest_speed():
 def test_a_least_impulse_of_a_whole_sample_is_fired():
     thruster = fflin.Thruster(*AT, max=2.0, on_off=True, least_impulse=0.2)
     robot = free_body((20.0, 30.0, 40.0)).replace(inputs=[thruster])
-    motion = fflin.simulate(robot, lambda t, q, v: [1.0], duration=0.4, dt=0.01, sample=0.1)
+    motion = fflin.simulate(
+        robot, lambda t, q, v: [1.0], duration=0.4, dt=0.01, sample=0.1
+    )
     assert motion.u[:-1, 0].tolist() == [*[0.0] * 10, *[2.0] * 10] * 2
 
 
@@ -221,7 +246,11 @@ def test_an_on_off_thruster_gives_its_own_thrust_whatever_the_run_allows():
     )
     for limits, given in ((5.0, 2.0), (1.0, 1.0)):
         motion = fflin.simulate(
-            robot, lambda t, q, v: [9.0, 0, 0, 0], duration=1.0, sample=0.1, limits=limits
+            robot,
+            lambda t, q, v: [9.0, 0, 0, 0],
+            duration=1.0,
+            sample=0.1,
+            limits=limits,
         )
         assert motion.u[:-1, 0].max() == given
 
@@ -275,7 +304,9 @@ def test_pulses_are_late_where_there_is_a_delay_and_begin_with_what_the_model_as
     motion = fflin.simulate(
         robot, fflin.StateFeedback(lin, K), duration=1.0, dt=0.01, delay=0.2, x0=lin.x0
     )
-    np.testing.assert_array_equal(motion.u[:-1, 0].reshape(10, 10)[:, 4:6], [[1.0, 0.0]] * 10)
+    np.testing.assert_array_equal(
+        motion.u[:-1, 0].reshape(10, 10)[:, 4:6], [[1.0, 0.0]] * 10
+    )
     late = fflin.simulate(
         robot, lambda t, q, v: [0.4], duration=1.0, dt=0.01, sample=0.1, delay=0.15
     )
@@ -295,7 +326,9 @@ def test_the_linear_model_foresees_pulses():
     for model in (lin.discretize(0.1), lin):
         options = {} if model.dt else {"sample": 0.1}
         policy = fflin.StateFeedback(model, K)
-        motion = fflin.simulate(robot, policy, x0=x0, duration=5.0, limits="urdf", **options)
+        motion = fflin.simulate(
+            robot, policy, x0=x0, duration=5.0, limits="urdf", **options
+        )
         assert set(motion.u[:, 0]) > {0.0, 1.0}
         np.testing.assert_allclose(motion.linear, motion.x, atol=1e-9)
 
@@ -316,7 +349,9 @@ def test_pulses_without_samples_are_refused_in_a_line(thruster, options, said):
     robot = free_body((20.0, 30.0, 40.0))
     robot = robot.replace(inputs=[fflin.Thruster(*AT, max=2.0, **thruster)])
     with pytest.raises(fflin.InputError, match=said):
-        fflin.simulate(robot, lambda t, q, v: [1.0], duration=1.0, limits="urdf", **options)
+        fflin.simulate(
+            robot, lambda t, q, v: [1.0], duration=1.0, limits="urdf", **options
+        )
     fflin.simulate(robot, duration=0.1)
 
 
@@ -362,7 +397,9 @@ def test_what_was_passed_is_told_with_value_time_and_limit():
     at = math.acos(0.75) / math.pi
     assert high.share == pytest.approx(at, abs=0.011)
     assert low.share == pytest.approx(at, abs=0.011)
-    assert re.fullmatch(r"tau_m\.joint_3 at its limit of 3000 N m for 2\d % of the run", str(high))
+    assert re.fullmatch(
+        r"tau_m\.joint_3 at its limit of 3000 N m for 2\d % of the run", str(high)
+    )
 
 
 def test_travel_is_a_limit_too():
@@ -424,7 +461,11 @@ def test_allocation_keeps_within_the_thrusters_and_shares_what_one_alone_cannot_
     body = free_body((20.0, 30.0, 40.0))
     thrusters = [fflin.Thruster(*AT, max=1.0), fflin.Thruster(*AT, max=9.0)]
     design = body.replace(inputs=[fflin.BaseForce()])
-    asked = fflin.Allocation(lambda t, q, v: [5.0 if t < 0.05 else 20.0, 0.0, 0.0], design)
-    motion = fflin.simulate(body.replace(inputs=thrusters), asked, duration=0.1, dt=0.01)
+    asked = fflin.Allocation(
+        lambda t, q, v: [5.0 if t < 0.05 else 20.0, 0.0, 0.0], design
+    )
+    motion = fflin.simulate(
+        body.replace(inputs=thrusters), asked, duration=0.1, dt=0.01
+    )
     np.testing.assert_allclose(motion.u[:4], [[1.0, 4.0]] * 4, rtol=1e-6)
     np.testing.assert_allclose(motion.u[6:], [[1.0, 9.0]] * 5, rtol=1e-6)

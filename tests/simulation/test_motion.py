@@ -39,7 +39,9 @@ def test_a_plain_policy_has_no_target_unless_one_is_given(settled):
     # What is given goes before the policy's own.
     other = lin.x0 + 0.1 * np.eye(len(lin.x0))[6]
     moved = fflin.simulate(robot, feedback, target=other, **options)
-    np.testing.assert_allclose(seen.error - moved.error, np.tile(other - lin.x0, (len(moved.t), 1)))
+    np.testing.assert_allclose(
+        seen.error - moved.error, np.tile(other - lin.x0, (len(moved.t), 1))
+    )
 
 
 def test_a_free_robot_has_no_target():

@@ -12,13 +12,17 @@ from tests.support.marks import exhaustive
 from tests.support.robots import free_body, random_point
 
 N = 0.05  # [rad/s]: some revolutions take minutes
-ORBIT = fflin.CircularOrbit(mean_motion=N, body="dwarf", mu=N**2 * 1e18, body_radius=9e5)
+ORBIT = fflin.CircularOrbit(
+    mean_motion=N, body="dwarf", mu=N**2 * 1e18, body_radius=9e5
+)
 
 
 def moving(name, seed=3, speed=0.3):
     """A robot in orbit and a random point of it."""
     robot = fflin.load(name)
-    q, v, _ = random_point(robot, np.random.default_rng(seed), speed=speed, degrees=40.0)
+    q, v, _ = random_point(
+        robot, np.random.default_rng(seed), speed=speed, degrees=40.0
+    )
     return robot.replace(orbit=ORBIT), q, v
 
 
@@ -59,7 +63,10 @@ def test_a_body_flies_as_clohessy_and_wiltshire_say():
     expected = np.column_stack(
         (
             (4 - 3 * c) * x + s * dx / N + 2 * (1 - c) * dy / N,
-            6 * (s - N * t) * x + y - 2 * (1 - c) * dx / N + (4 * s - 3 * N * t) * dy / N,
+            6 * (s - N * t) * x
+            + y
+            - 2 * (1 - c) * dx / N
+            + (4 * s - 3 * N * t) * dy / N,
             c * z + s * dz / N,
         )
     )
@@ -71,7 +78,10 @@ def test_a_body_flies_as_clohessy_and_wiltshire_say():
     v0 = np.concatenate((R @ speed, np.zeros(3)))
     same = fflin.simulate(robot, q0=q0, v0=v0, duration=200.0, dt=0.2)
     assert same.frame == "lvlh"
-    assert np.abs(same.x[:, 3:6] - motion.x[:, 3:6] @ R.T).max() < 1e-9 * np.abs(expected).max()
+    assert (
+        np.abs(same.x[:, 3:6] - motion.x[:, 3:6] @ R.T).max()
+        < 1e-9 * np.abs(expected).max()
+    )
 
 
 @pytest.mark.parametrize("degrees", [60.0, *exhaustive(20.0, 85.0)])
@@ -84,7 +94,9 @@ def test_pitch_swings_with_the_period_of_the_elliptic_integral(degrees):
     tilted = pin.SE3(pin.rpy.rpyToMatrix(0.0, np.radians(degrees), 0.0), np.zeros(3))
     q0 = fflin.configuration(robot, base=tilted)
     motion = fflin.simulate(robot, q0=q0, duration=2.0 * period, dt=period / 1000.0)
-    assert np.abs(motion.q[[500, 1000, 2000], 3:7] - q0[3:7] * [1, -1, 1, 1]).max() > 0.1
+    assert (
+        np.abs(motion.q[[500, 1000, 2000], 3:7] - q0[3:7] * [1, -1, 1, 1]).max() > 0.1
+    )
     assert np.abs(motion.q[[1000, 2000]] - q0).max() < 1e-7
     assert np.abs(motion.q[500, 3:7] - q0[3:7] * [1, -1, 1, 1]).max() < 1e-7
     assert motion.momentum_drift.max() < 1e-8
@@ -102,7 +114,9 @@ def test_work_is_counted():
 
     drifts = []
     for dt in (0.04, 0.02):
-        motion = fflin.simulate(robot, policy, q0=q, v0=v, duration=2.0, dt=dt, disturbance=push)
+        motion = fflin.simulate(
+            robot, policy, q0=q, v0=v, duration=2.0, dt=dt, disturbance=push
+        )
         drifts.append(motion.momentum_drift.max())
     assert np.ptp(motion.energy) > 0.1
     assert drifts[1] < 1e-6 and drifts[0] / drifts[1] == pytest.approx(16.0, rel=0.4)
@@ -116,7 +130,9 @@ def test_files_and_words(tmp_path):
         read = fflin.Motion.load(tmp_path / f"motion.{ending}")
         assert read.orbit == motion.orbit and read.frame == "lvlh"
     assert motion.orbit.radius == pytest.approx(1e6)
-    assert "Jacobi integral drift" in str(motion) and "Jacobi integral drift" in repr(motion)
+    assert "Jacobi integral drift" in str(motion) and "Jacobi integral drift" in repr(
+        motion
+    )
     assert "100 km over dwarf" in str(motion)
     assert fflin.simulate(robot.replace(orbit=None), duration=0.1).orbit is None
 
@@ -135,7 +151,9 @@ def test_a_target_in_the_other_frame_is_no_target():
     target = fflin.linearize(robot, frame="hill")
     with pytest.raises(fflin.InputError, match=r"'hill'.*'lvlh'"):
         fflin.simulate(robot, target=target, duration=0.1)
-    assert fflin.simulate(robot, target=target, duration=0.1, frame="hill").frame == "hill"
+    assert (
+        fflin.simulate(robot, target=target, duration=0.1, frame="hill").frame == "hill"
+    )
 
 
 def test_what_wheels_store_counts_in_the_jacobi_integral():

@@ -5,7 +5,11 @@ import pytest
 from scipy.linalg import expm
 
 import fflin
-from fflin.dynamics.integrators import CommutatorFree4, SemiImplicitEuler, integrated_hold
+from fflin.dynamics.integrators import (
+    CommutatorFree4,
+    SemiImplicitEuler,
+    integrated_hold,
+)
 from fflin.simulation.pace import Pace, Poles, Signal, rotation, shorter, step_error
 from tests.support.robots import free_body
 
@@ -44,18 +48,23 @@ def test_growth_is_the_growth_of_a_step_of_the_method(pole):
         A = np.array([[pole.real]])
     step, _ = integrated_hold(A, np.zeros((len(A), 0)), h)
     exact = np.log(np.abs(np.linalg.eigvals(step)).max())
-    assert CommutatorFree4.growth(np.array([pole * h]))[0] == pytest.approx(exact, rel=1e-9)
+    assert CommutatorFree4.growth(np.array([pole * h]))[0] == pytest.approx(
+        exact, rel=1e-9
+    )
     if pole.imag:
         v = np.eye(2)[1] + h * A[1]  # the new velocity
         step = np.array([np.eye(2)[0] + h * v, v])
         exact = np.log(np.abs(np.linalg.eigvals(step)).max())
-        assert SemiImplicitEuler.growth(np.array([pole * h]))[0] == pytest.approx(exact, rel=1e-9)
+        assert SemiImplicitEuler.growth(np.array([pole * h]))[0] == pytest.approx(
+            exact, rel=1e-9
+        )
 
 
 def test_the_step_error_of_an_undamped_mode_is_its_loss_over_the_run():
     z, h, duration = 0.3, 0.01, 5.0
     pole = Poles("loop", np.array([1j * z / h]))
-    loss = z**6 / 144.0 * duration / h  # leading term of |ln|R|| per step, times the steps
+    # leading term of |ln|R|| per step, times the steps
+    loss = z**6 / 144.0 * duration / h
     demand = pole.demand(CommutatorFree4, h, duration)
     assert demand.error == pytest.approx(loss / 0.01, rel=0.02)
     # With damping, the larger of the two tolerances counts.
@@ -93,7 +102,11 @@ def test_a_given_step_that_is_too_long_is_in_the_notes():
     v[6] = 1.0
     motion = fflin.simulate(robot, v0=v, duration=0.5, dt=0.005)
     (note,) = motion.notes
-    assert "0.005 s is too long" in note and "q_m.array_mode_1" in note and "dt=0.002" in note
+    assert (
+        "0.005 s is too long" in note
+        and "q_m.array_mode_1" in note
+        and "dt=0.002" in note
+    )
     assert not fflin.simulate(robot, v0=v, duration=0.5, dt=0.002).notes
 
 
@@ -130,7 +143,9 @@ def test_a_sampled_loop_that_is_unstable_by_the_exact_model_grows():
     x = motion.x[:, lin.state_names.index("q_m.array_mode_1")]
     growth = peak(motion.t, x, 7.0, 8.0) / peak(motion.t, x, 2.0, 3.0)
     assert growth == pytest.approx(radius**100, rel=0.06)
-    coarse = fflin.simulate(robot, fflin.StateFeedback(lin, K), x0=x0, duration=1.0, dt=0.025)
+    coarse = fflin.simulate(
+        robot, fflin.StateFeedback(lin, K), x0=x0, duration=1.0, dt=0.025
+    )
     assert any("too long" in note for note in coarse.notes)
 
 
@@ -227,17 +242,23 @@ def test_a_jump_of_a_disturbance_at_a_step_is_exact():
         motion = fflin.simulate(robot, disturbance=push, duration=1.0, project=False)
         after = np.maximum(motion.t - jump, 0.0)
         np.testing.assert_allclose(motion.v[:, 0], after / robot.mass, atol=1e-14)
-        np.testing.assert_allclose(motion.q[:, 0], after**2 / 2.0 / robot.mass, atol=1e-14)
+        np.testing.assert_allclose(
+            motion.q[:, 0], after**2 / 2.0 / robot.mass, atol=1e-14
+        )
 
 
 def test_a_random_disturbance_is_in_the_notes():
     rng = np.random.default_rng(0)
-    motion = fflin.simulate(free_body(HUB), disturbance=Push(lambda t: rng.normal()), duration=0.1)
+    motion = fflin.simulate(
+        free_body(HUB), disturbance=Push(lambda t: rng.normal()), duration=0.1
+    )
     assert "random" in motion.notes[0] and motion.t[1] == 0.01
 
 
 def test_a_constant_disturbance_has_no_note():
-    motion = fflin.simulate(free_body(HUB), disturbance=Push(lambda t: 1.0), duration=0.5)
+    motion = fflin.simulate(
+        free_body(HUB), disturbance=Push(lambda t: 1.0), duration=0.5
+    )
     assert not motion.notes
     assert Signal.of("x", lambda t: np.ones(1), 5.0, 100.0).step == 5.0
 
@@ -256,7 +277,9 @@ def test_the_prediction_is_the_exact_exponential():
         np.testing.assert_allclose(motion.linear[-1], exact, atol=1e-13)
     # Limits that are never reached do not change the prediction.
     limited = fflin.simulate(robot, policy, x0=x0, duration=0.5, dt=0.005, limits=1e6)
-    np.testing.assert_allclose(limited.linear[-1], exact, atol=1e-4 * np.abs(exact).max())
+    np.testing.assert_allclose(
+        limited.linear[-1], exact, atol=1e-4 * np.abs(exact).max()
+    )
 
 
 @pytest.mark.exhaustive
@@ -267,7 +290,9 @@ def test_a_schedule_with_a_large_final_weight_ends_on_its_trajectory():
     along = fflin.linearize_trajectory(robot, motion.trajectory())
     nx = along.A.shape[1]
     schedule = fflin.tvlqr(along, np.eye(nx), 1e-2 * np.eye(9), np.eye(nx))
-    q0, _ = fflin.TrajectoryFeedback(motion.trajectory(), schedule).beside({"r_b.x": 0.05})
+    q0, _ = fflin.TrajectoryFeedback(motion.trajectory(), schedule).beside(
+        {"r_b.x": 0.05}
+    )
     default = fflin.simulate(robot, schedule, q0=q0, v0=v0)
     fine = fflin.simulate(robot, schedule, q0=q0, v0=v0, dt=default.t[1] / 4.0)
     error, reference = default.x[-1] - default.target[-1], fine.x[-1] - fine.target[-1]
@@ -280,7 +305,9 @@ def test_campaigns_use_the_same_step():
     lin = fflin.linearize(robot)
     policy = fflin.StateFeedback(lin, fflin.lqr(lin).K)
     motion = fflin.simulate(robot, policy, duration=0.5)
-    runs = fflin.monte_carlo(robot, policy, {"q_b": 0.01}, runs=2, duration=0.5, engine="python")
+    runs = fflin.monte_carlo(
+        robot, policy, {"q_b": 0.01}, runs=2, duration=0.5, engine="python"
+    )
     assert runs.dt == motion.t[1] < 0.01
     assert runs.notes == motion.notes and "array_mode_1" in str(runs)
 
@@ -306,7 +333,9 @@ def test_a_continuous_controller_with_a_sample_time_is_judged_as_it_is_flown():
     K = fflin.lqr(lin).K
     # First-order filters of the state feedback, whose poles at -5 1/s are continuous.
     filters = (-5.0 * np.eye(12), 5.0 * np.eye(12), -K, np.zeros((6, 12)))
-    motion = fflin.simulate(robot, fflin.LinearController(filters, lin), duration=1.0, sample=0.1)
+    motion = fflin.simulate(
+        robot, fflin.LinearController(filters, lin), duration=1.0, sample=0.1
+    )
     assert motion.step == 0.01 and not motion.notes
 
 

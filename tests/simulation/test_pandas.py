@@ -16,7 +16,9 @@ def robot():
 def test_frames_are_the_tables_of_the_files(robot, tmp_path):
     v0 = fflin.velocity(robot, {"omega_b.z": 0.3})
     motion = fflin.simulate(robot, v0=v0, duration=0.5, dt=0.05)
-    campaign = fflin.monte_carlo(robot, None, {"q_b.x": 0.01}, runs=3, duration=0.2, dt=0.05)
+    campaign = fflin.monte_carlo(
+        robot, None, {"q_b.x": 0.01}, runs=3, duration=0.2, dt=0.05
+    )
     for made, index in ((motion, "t [s]"), (motion.trajectory(), "t")):
         made.save(tmp_path / "made.csv")
         table = pandas.read_csv(tmp_path / "made.csv")

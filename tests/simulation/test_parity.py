@@ -25,7 +25,9 @@ from tests.support.robots import free_body
 # largest term. Over 200 steps, this adds up to some 200 times that.
 TOLERANCE = 2e3 * np.finfo(float).eps
 
-WHEELS = [fflin.ReactionWheel(axis, inertia=0.05, max=0.2) for axis in np.eye(3).tolist()]
+WHEELS = [
+    fflin.ReactionWheel(axis, inertia=0.05, max=0.2) for axis in np.eye(3).tolist()
+]
 
 
 def body(**fields):
@@ -84,8 +86,12 @@ def as_function(policy, robot):
 def roads(policy, robot, delay):
     """Return {road: (policy, options)} of the roads in Python."""
     found = {"controller": (fflin.LinearController(-policy.K, policy.lin), {})}
-    if not (delay and policy.lin.u0.any()):  # a function has no u0 that acts before its commands
-        found["function"] = (as_function(policy, robot), {"sample": policy.lin.dt or None})
+    # a function has no u0 that acts before its commands
+    if not (delay and policy.lin.u0.any()):
+        found["function"] = (
+            as_function(policy, robot),
+            {"sample": policy.lin.dt or None},
+        )
     return found
 
 
@@ -106,7 +112,9 @@ QUICK = [
     ("arm", "past half a turn, continuous"),
     ("heavy", "delay and limits"),
 ]
-OTHERS = [(robot, case) for robot in ROBOTS for case in CASES if (robot, case) not in QUICK]
+OTHERS = [
+    (robot, case) for robot in ROBOTS for case in CASES if (robot, case) not in QUICK
+]
 
 
 def prepared(name, case):
@@ -153,7 +161,9 @@ def test_a_law_flies_the_same_motion_in_each_form(name, case):
 
 
 @needs_compiler
-@pytest.mark.parametrize(("name", "case"), [*QUICK[::3], *exhaustive(*QUICK[1:3], *OTHERS)])
+@pytest.mark.parametrize(
+    ("name", "case"), [*QUICK[::3], *exhaustive(*QUICK[1:3], *OTHERS)]
+)
 def test_exported_c_flies_the_same_motion(tmp_path, name, case):
     robot, policy, options = prepared(name, case)
     code = fflin.CLaw(fflin.write_c(policy, tmp_path))
@@ -191,18 +201,22 @@ def test_a_rotation_is_measured_from_a_moving_attitude_of_either_sign():
     run = SimpleNamespace(t=t, q=np.hstack((np.zeros((len(t), 3)), turned)))
     signs = np.random.default_rng(0).choice([-1.0, 1.0], (len(t), 1))
     assert past_half_turn(run, signs * turned) is None
-    assert past_half_turn(run, turned[0]) == past_half_turn(run, -turned[0]) == t[32]  # pi s
+    # pi s
+    assert past_half_turn(run, turned[0]) == past_half_turn(run, -turned[0]) == t[32]
     slower = np.column_stack((none, np.sin(0.2 * t), np.cos(0.2 * t)))
     assert past_half_turn(run, signs * slower) == t[53]  # pi / 0.6 s
 
 
-EDGE = pin.Quaternion(0.0, 0.6, 0.0, 0.8).coeffs()  # exactly half a turn: its scalar part is 0
+# exactly half a turn: its scalar part is 0
+EDGE = pin.Quaternion(0.0, 0.6, 0.0, 0.8).coeffs()
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_law_is_defined_at_exactly_half_a_turn(sign):
     """The sign of the quaternion selects one of the two shortest rotations, by every road."""
-    robot = fflin.load("cubesat", outputs=[fflin.BasePose(), fflin.Accelerometer("base")])
+    robot = fflin.load(
+        "cubesat", outputs=[fflin.BasePose(), fflin.Accelerometer("base")]
+    )
     robot = robot.replace(inputs=[fflin.BaseTorque(), fflin.BaseForce()])
     lin = fflin.linearize(robot).discretize(0.1)
     q0 = np.array([0.0, 0.0, 0.0, *(sign * EDGE)])
@@ -215,7 +229,9 @@ def test_a_law_is_defined_at_exactly_half_a_turn(sign):
     output = fflin.LinearController(seen, lin)
     assert lin.output_names[:3] == lin.state_names[:3]
     for policy in (state, output, fflin.Allocation(state, robot)):
-        np.testing.assert_allclose(policy.bind(robot)(0.0, q0, v), expected, rtol=1e-12, atol=1e-15)
+        np.testing.assert_allclose(
+            policy.bind(robot)(0.0, q0, v), expected, rtol=1e-12, atol=1e-15
+        )
         motion = fflin.simulate(robot, policy, q0=q0, duration=0.2, engine="python")
         assert not motion.stopped
     y = fflin.outputs(robot, lin, q0, v)
@@ -224,7 +240,9 @@ def test_a_law_is_defined_at_exactly_half_a_turn(sign):
 
 def test_predictive_control_within_limits_is_its_regulator():
     robot, _, options = prepared("body", "past half a turn")
-    policy = fflin.mpc(fflin.linearize(robot), horizon=10, dt=0.1, limits={"tau_b": 1e3})
+    policy = fflin.mpc(
+        fflin.linearize(robot), horizon=10, dt=0.1, limits={"tau_b": 1e3}
+    )
     regulator = fflin.StateFeedback(policy.lin, policy.gain.K)
     options["duration"] = 1.0
     motion = flown(robot, regulator, **options)
@@ -236,7 +254,9 @@ def test_a_run_of_a_campaign_is_the_motion_of_its_law():
     robot, policy, options = prepared("body", "past half a turn")
     motion = flown(robot, policy, **options)
     given = {"omega_b.x": 0.0}
-    campaign = fflin.monte_carlo(robot, policy, given, runs=2, **options, engine="python")
+    campaign = fflin.monte_carlo(
+        robot, policy, given, runs=2, **options, engine="python"
+    )
     assert not campaign.stopped.any()
     np.testing.assert_array_equal(campaign.q, np.tile(motion.q[-1], (2, 1)))
     largest = motion.attitude_error.max()
@@ -248,7 +268,9 @@ def test_a_trajectory_is_followed_from_beyond_half_a_turn():
     """A law along a motion at rest is the law about the point at which it rests."""
     robot = body()
     t, q = np.array([0.0, 4.0]), np.tile(robot.neutral(), (2, 1))
-    rest = fflin.Trajectory(robot, t, q, np.zeros((2, 6)), np.zeros((2, 6)), frame="local")
+    rest = fflin.Trajectory(
+        robot, t, q, np.zeros((2, 6)), np.zeros((2, 6)), frame="local"
+    )
     along = fflin.linearize_trajectory(robot, rest)
     schedule = fflin.tvlqr(along, sample=0.1)
     # A constant gain, as the regulator about the point has.
@@ -261,12 +283,18 @@ def test_a_trajectory_is_followed_from_beyond_half_a_turn():
     q0, v0 = policy.beside({"roll": 175.0})
     v0[3] = 3.0
     options |= {"q0": q0, "v0": v0, "duration": 3.0}
-    motion, other = (flown(robot, by, **options, engine="python") for by in (steady, policy))
+    motion, other = (
+        flown(robot, by, **options, engine="python") for by in (steady, policy)
+    )
     assert_same(motion, other, "trajectory")
-    assert motion.notes[0].startswith("the base rotated past 180 deg from the reference at t = ")
+    assert motion.notes[0].startswith(
+        "the base rotated past 180 deg from the reference at t = "
+    )
     assert (
         other.notes[0]
-        == motion.notes[0].replace("reference", "trajectory").partition("; the linear")[0]
+        == motion.notes[0]
+        .replace("reference", "trajectory")
+        .partition("; the linear")[0]
     )
 
 
@@ -295,14 +323,18 @@ def test_a_wheel_of_the_urdf_moves_as_the_same_reaction_wheel(tmp_path):
         one, other = (getattr(lin, key) for lin in models)
         np.testing.assert_allclose(one, other, atol=1e-12, err_msg=key)
     x0 = start(of_object, 170.0, 1.0)
-    x0[-1] = 100.0  # speed of the wheel [rad/s], whose momentum of 5 N m s turns the body
+    # speed of the wheel [rad/s], whose momentum of 5 N m s turns the body
+    x0[-1] = 100.0
     options = {"x0": x0, "dt": 0.02, "duration": 4.0}
     free = [fflin.simulate(each, **options) for each in (of_object, of_urdf)]
     assert_same(*free, "free")
     K = np.zeros(models[0].B.T.shape)
     K[:3, :3], K[:3, 7:10] = 4.0 * np.eye(3), 3.0 * np.eye(3)
     pairs = zip((of_object, of_urdf), models, strict=True)
-    laws = [fflin.simulate(each, fflin.StateFeedback(lin, K), **options) for each, lin in pairs]
+    laws = [
+        fflin.simulate(each, fflin.StateFeedback(lin, K), **options)
+        for each, lin in pairs
+    ]
     assert_same(*laws, "law")
     assert laws[0].notes == laws[1].notes != ()
 
@@ -312,7 +344,11 @@ def in_python(call):
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always")
         call()
-    return {str(each.message) for each in found if issubclass(each.category, fflin.FflinWarning)}
+    return {
+        str(each.message)
+        for each in found
+        if issubclass(each.category, fflin.FflinWarning)
+    }
 
 
 def test_the_command_line_flies_the_motion_of_python(tmp_path):
@@ -327,7 +363,14 @@ def test_the_command_line_flies_the_motion_of_python(tmp_path):
         options = {"q0": q0, "v0": v0, "duration": 6.0, "dt": 0.05, "limits": "urdf"}
         motion = fflin.simulate(robot, policy, **options, linear=lin)
         file = tmp_path / f"{rate}.npz"
-        given = ("--joint", "joint_1=0.3", "--velocity", f"omega_b.z={rate}", "--sample", 0.1)
+        given = (
+            "--joint",
+            "joint_1=0.3",
+            "--velocity",
+            f"omega_b.z={rate}",
+            "--sample",
+            0.1,
+        )
         with any_wording():
             times = ("--duration", 6, "--dt", 0.05)
             code, *_ = run("simulate", robot.name, *given, *times, "-o", file)
@@ -336,7 +379,9 @@ def test_the_command_line_flies_the_motion_of_python(tmp_path):
         assert loaded.notes == motion.notes
         assert bool(loaded.notes) == (rate > 1.0)
         for key in ("t", "q", "v", "u", "x", "prediction"):
-            np.testing.assert_array_equal(getattr(loaded, key), getattr(motion, key), key)
+            np.testing.assert_array_equal(
+                getattr(loaded, key), getattr(motion, key), key
+            )
 
 
 def jets():
@@ -365,7 +410,16 @@ WARNINGS = {
         "negative thrust",
     ),
     "margin": (
-        ("lqr", "planar_detumble", "--sample", 0.5, "--weights", "identity", "--q", "q_b=1e9"),
+        (
+            "lqr",
+            "planar_detumble",
+            "--sample",
+            0.5,
+            "--weights",
+            "identity",
+            "--q",
+            "q_b=1e9",
+        ),
         fragile,
         "phase margin",
     ),
@@ -405,6 +459,8 @@ def test_a_joint_is_warned_of_only_beyond_its_limits(tmp_path):
     file.write_text(URDF.format(m=20, x=2.0, y=3.0, z=2.5, more=limited))
     robot = fflin.load(file)
     for value, beyond in ((-0.5, False), (1.0, False), (-0.6, True), (1.1, True)):
-        found = in_python(lambda value=value: fflin.configuration(robot, {"spin": value}))
+        found = in_python(
+            lambda value=value: fflin.configuration(robot, {"spin": value})
+        )
         said = {f"joint 'spin' at {value:g} rad is outside -0.5 to 1 rad"}
         assert found == (said if beyond else set())

@@ -17,37 +17,51 @@ def flown():
 
 def test_the_rows_are_those_of_the_phases_one_after_the_other(flown):
     robot, approach, _, held, _, after, whole = flown
-    assert whole.phases == ("servicer_7dof", "payload of 500 kg caught", "joint_3 jammed")
+    assert whole.phases == (
+        "servicer_7dof",
+        "payload of 500 kg caught",
+        "joint_3 jammed",
+    )
     assert whole.starts == pytest.approx([0.0, 4.0, 10.0])
     ends = np.cumsum([len(each.t) for each in (approach, held, after)])
     assert len(whole.t) == ends[-1] and whole.t[-1] == pytest.approx(13.0)
     assert (np.diff(whole.t) >= 0.0).all()
-    assert (whole.q[: ends[0]] == approach.q).all() and (whole.q[ends[0] : ends[1]] == held.q).all()
+    assert (whole.q[: ends[0]] == approach.q).all() and (
+        whole.q[ends[0] : ends[1]] == held.q
+    ).all()
     # In the chart of the first phase, whose reference is another than that of the second.
     assert not held.reference.isApprox(whole.reference, 1e-3)
     state = fflin.StateMap(robot, reference=whole.reference)
     for k in (10, ends[0] + 7, ends[1] + 3):
-        assert whole.x[k] == pytest.approx(state.to_state(whole.q[k], whole.v[k]), abs=1e-14)
+        assert whole.x[k] == pytest.approx(
+            state.to_state(whole.q[k], whole.v[k]), abs=1e-14
+        )
     # A joint that jammed stands still, without a torque.
     column = robot.joint_names.index("joint_3")
-    assert (np.ptp(whole.x[ends[1] :, 6 + column]), *np.abs(whole.u[ends[1] :, 6 + column])) == (
-        *(0.0,) * (1 + len(after.t)),
+    assert (
+        np.ptp(whole.x[ends[1] :, 6 + column]),
+        *np.abs(whole.u[ends[1] :, 6 + column]),
+    ) == (*(0.0,) * (1 + len(after.t)),)
+    assert whole.x[ends[1], 6 + column] == pytest.approx(
+        held.x[-1, 6 + column], abs=1e-12
     )
-    assert whole.x[ends[1], 6 + column] == pytest.approx(held.x[-1, 6 + column], abs=1e-12)
 
 
 def test_forces_are_turned_into_the_axes_of_the_first_phase(flown):
     *_, held, _, _, whole = flown
     k = len(flown.approach.t) + 20
     force, there = (
-        each.reference.rotation @ each.u[row, 3:6] for each, row in ((whole, k), (held, 20))
+        each.reference.rotation @ each.u[row, 3:6]
+        for each, row in ((whole, k), (held, 20))
     )
     assert np.abs(there).max() > 1e-3 and force == pytest.approx(there, abs=1e-14)
 
 
 def test_errors_are_counted_from_the_target_of_each_phase(flown):
     whole = flown.whole
-    rows = np.cumsum([0, *(len(each.t) for each in (flown.approach, flown.held, flown.after))])
+    rows = np.cumsum(
+        [0, *(len(each.t) for each in (flown.approach, flown.held, flown.after))]
+    )
     for k, part in enumerate((flown.approach, flown.held, flown.after)):
         own = whole.attitude_error[rows[k] : rows[k + 1]]
         assert own == pytest.approx(part.attitude_error, abs=1e-9)
@@ -62,7 +76,9 @@ def test_momentum_and_energy_across_the_phases(flown):
     # Of the combined robot, before and after the joint jams, row to row.
     k = len(approach.t) + len(held.t)
     assert whole.momentum[k] == pytest.approx(whole.momentum[k - 1], rel=1e-12)
-    assert whole.energy[k - 1] - whole.energy[k] == pytest.approx(jammed.energy_lost, rel=1e-6)
+    assert whole.energy[k - 1] - whole.energy[k] == pytest.approx(
+        jammed.energy_lost, rel=1e-6
+    )
     came = 0.5 * caught.payload_v @ DEBRIS.matrix() @ caught.payload_v
     lost = approach.energy[-1] + came - held.energy[0]
     assert lost == pytest.approx(caught.energy_lost, rel=1e-9)
@@ -94,22 +110,46 @@ def test_the_table_has_energy_and_momentum_at_both_ends_of_each_phase(flown):
     ]
     rows = [line.split()[-5:] for line in lines[first + 1 : first + 9]]
     assert [row[0] for row in rows] == ["start", "end", *("before", "after", "end") * 2]
-    assert [float(row[1]) for row in rows] == [0.0, 4.0, 4.0, 4.0, 10.0, 10.0, 10.0, 13.0]
-    ends = np.cumsum([len(each.t) for each in (flown.approach, flown.held, flown.after)])
-    for row, k in ((0, 0), (1, ends[0] - 1), (3, ends[0]), (4, ends[1] - 1), (7, ends[2] - 1)):
+    assert [float(row[1]) for row in rows] == [
+        0.0,
+        4.0,
+        4.0,
+        4.0,
+        10.0,
+        10.0,
+        10.0,
+        13.0,
+    ]
+    ends = np.cumsum(
+        [len(each.t) for each in (flown.approach, flown.held, flown.after)]
+    )
+    for row, k in (
+        (0, 0),
+        (1, ends[0] - 1),
+        (3, ends[0]),
+        (4, ends[1] - 1),
+        (7, ends[2] - 1),
+    ):
         own = (
             whole.energy[k],
-            *(np.linalg.norm(whole.momentum[k, part]) for part in ([3, 4, 5], [0, 1, 2])),
+            *(
+                np.linalg.norm(whole.momentum[k, part])
+                for part in ([3, 4, 5], [0, 1, 2])
+            ),
         )
         assert [*map(float, rows[row][2:])] == pytest.approx(own, rel=1e-3), row
     for before, impact in ((2, flown.caught), (5, flown.jammed)):
         assert rows[before][3:] == rows[before + 1][3:]
         lost = float(rows[before][2]) - float(rows[before + 1][2])
-        assert lost == pytest.approx(impact.energy_lost, abs=2e-3 * float(rows[before][2]))
+        assert lost == pytest.approx(
+            impact.energy_lost, abs=2e-3 * float(rows[before][2])
+        )
     # The robot alone had another momentum than it has with what it caught.
     assert rows[1][3:] != rows[2][3:]
     # What the momentum before has, the momenta of both impacts tell, not the motion.
-    object.__setattr__(changed := replace(flown.caught), "momentum", 2.0 * flown.caught.momentum)
+    object.__setattr__(
+        changed := replace(flown.caught), "momentum", 2.0 * flown.caught.momentum
+    )
     other = str(flown.approach.then(changed, flown.held)).splitlines()
     at = next(k for k, line in enumerate(other) if " before " in line)
     assert other[at].split()[-2:] != other[at + 1].split()[-2:]
@@ -123,7 +163,9 @@ def test_it_is_saved_and_drawn(flown, tmp_path):
         assert read.phases == whole.phases and (read.starts == whole.starts).all()
         assert (read.x == whole.x).all()
     figure = whole.plot()
-    marks = [x.get_xdata()[0] for x in figure.axes[0].get_lines() if x.get_label() == "_rest"]
+    marks = [
+        x.get_xdata()[0] for x in figure.axes[0].get_lines() if x.get_label() == "_rest"
+    ]
     assert {*marks} == {4.0, 10.0}
     with pytest.raises(fflin.InputError, match="robot"):
         read.then(flown.held)
@@ -133,11 +175,16 @@ def test_it_goes_on_step_by_step_and_under_another_policy(flown):
     robot, approach, caught, held, jammed, after, whole = flown
     again = approach.then(caught, held).then(jammed, after)
     assert (again.x == whole.x).all() and again.notes == whole.notes
-    free = fflin.simulate(robot, None, q0=approach.q[-1], v0=approach.v[-1], duration=1.0)
+    free = fflin.simulate(
+        robot, None, q0=approach.q[-1], v0=approach.v[-1], duration=1.0
+    )
     both = approach.then(free)
     assert both.phases == ("servicer_7dof", "servicer_7dof") and not both.target.size
     # A joint that goes limp makes no impact; the other motors go on as they did.
-    limp, end = robot.replace(passive=["joint_3"]), {"q0": approach.q[-1], "v0": approach.v[-1]}
+    limp, end = (
+        robot.replace(passive=["joint_3"]),
+        {"q0": approach.q[-1], "v0": approach.v[-1]},
+    )
     lin = fflin.linearize(limp, end["q0"])
     K = fflin.line_up(fflin.lqr(fflin.linearize(robot, end["q0"])), lin)
     on = fflin.simulate(limp, fflin.StateFeedback(lin, K), **end, duration=1.0)
@@ -154,7 +201,9 @@ def test_what_does_not_go_on_is_one_line(flown):
     pushed = robot.replace(
         inputs=[*robot.inputs, fflin.Thruster("base", (0, 0, 0), (1, 0, 0), "jet")]
     )
-    pushed = fflin.simulate(pushed, None, q0=approach.q[-1], v0=approach.v[-1], duration=0.1)
+    pushed = fflin.simulate(
+        pushed, None, q0=approach.q[-1], v0=approach.v[-1], duration=0.1
+    )
     for call, said in [
         (approach.then, "last phase"),
         (lambda: approach.then(caught), "last phase"),

@@ -47,14 +47,18 @@ def test_motion_shows_linear_beside_nonlinear_and_their_difference(loop):
     np.testing.assert_array_equal(full.get_ydata(), motion.x[:, 2])
     np.testing.assert_array_equal(dashed.get_ydata(), motion.linear[:, 2])
     assert dashed.get_linestyle() == "--"
-    differences = [each for each in figure.axes if each.get_ylabel().startswith("difference")]
+    differences = [
+        each for each in figure.axes if each.get_ylabel().startswith("difference")
+    ]
     assert len(differences) == 6
     apart = differences[0].get_lines()[2].get_ydata()
     np.testing.assert_array_equal(apart, motion.x[:, 2] - motion.linear[:, 2])
     assert axes["velocity v_b"].get_ylabel() == "[m/s]"
     torque = lines(axes["base torque"])["z"]
     np.testing.assert_array_equal(torque.get_ydata(), motion.u[:, 2])
-    assert set(lines(axes["joint torques"])) == set(fflin.load("planar_detumble").joint_names)
+    assert set(lines(axes["joint torques"])) == set(
+        fflin.load("planar_detumble").joint_names
+    )
     assert "relative momentum drift" in axes
 
 
@@ -71,7 +75,9 @@ def test_a_reference_lies_pale_under_what_follows_it(along):
     titles = ("attitude q_b", "position r_b", "joints q_m", "angular velocity omega_b")
     titles = (*titles, "velocity v_b", "joint rates qdot_m")
     for title, start in zip(titles, range(0, 18, 3), strict=True):
-        curves = [each for each in found[title].get_lines() if len(each.get_xdata()) > 2]
+        curves = [
+            each for each in found[title].get_lines() if len(each.get_xdata()) > 2
+        ]
         assert len(curves) == 6
         for k, (pale, flown) in enumerate(zip(curves[::2], curves[1::2], strict=True)):
             np.testing.assert_array_equal(pale.get_ydata(), motion.target[:, start + k])
@@ -82,7 +88,10 @@ def test_a_reference_lies_pale_under_what_follows_it(along):
     assert texts.count("reference") == 1
     figure = motion.plot(show=["q_m", "tau_m"])
     (named,) = figure.legends
-    assert [text.get_text() for text in named.get_texts()][-2:] == ["reference", "limit"]
+    assert [text.get_text() for text in named.get_texts()][-2:] == [
+        "reference",
+        "limit",
+    ]
     assert not any(legend_texts(axes) for axes in figure.axes[:-1])
 
 
@@ -95,16 +104,27 @@ def test_below_it_stands_the_error(along):
     figure = motion.plot()
     strips = [each for each in figure.axes if each.get_ylabel().startswith("error")]
     units = ["[deg]", "[m]", "[rad]", "[rad/s]", "[m/s]", "[rad/s]"]
-    assert [each.get_ylabel() for each in strips] == [f"error\n{unit}" for unit in units]
-    flown = np.array([each.get_ydata() for axes in strips for each in axes.get_lines()[:3]]).T
+    assert [each.get_ylabel() for each in strips] == [
+        f"error\n{unit}" for unit in units
+    ]
+    flown = np.array(
+        [each.get_ydata() for axes in strips for each in axes.get_lines()[:3]]
+    ).T
     np.testing.assert_allclose(flown[:, 3:], motion.error[:, 3:], atol=1e-15)
-    turned = motion.error[:, :3] / np.linalg.norm(motion.error[:, :3], axis=1, keepdims=True)
-    np.testing.assert_allclose(flown[:, :3], motion.attitude_error[:, None] * turned, atol=1e-6)
+    turned = motion.error[:, :3] / np.linalg.norm(
+        motion.error[:, :3], axis=1, keepdims=True
+    )
+    np.testing.assert_allclose(
+        flown[:, :3], motion.attitude_error[:, None] * turned, atol=1e-6
+    )
 
 
 def rests(figure):
     """The times at which lines mark that a reference rests, of each panel that has one."""
-    marks = [[x for x in axes.get_lines() if x.get_label() == "_rest"] for axes in figure.axes]
+    marks = [
+        [x for x in axes.get_lines() if x.get_label() == "_rest"]
+        for axes in figure.axes
+    ]
     return [line.get_xdata()[0] for (line,) in filter(None, marks)]
 
 
@@ -122,13 +142,17 @@ def test_motion_without_a_prediction_has_no_differences():
     robot = fflin.load("cubesat")
     motion = fflin.simulate(robot, v0=[0, 0, 0, 0.1, 0, 0.2], duration=1.0, every=10)
     figure = motion.plot()
-    assert not [each for each in figure.axes if each.get_ylabel().startswith("difference")]
+    assert not [
+        each for each in figure.axes if each.get_ylabel().startswith("difference")
+    ]
 
 
 def test_many_inputs_and_joints_are_named_beside_the_panels_each_in_its_colour():
     bare = fflin.load("servicer_7dof")
     thrusters = [
-        fflin.Thruster("tool", (0, 0, 0), (1.0, k, 0.0), f"a_thruster_with_a_long_name_{k}")
+        fflin.Thruster(
+            "tool", (0, 0, 0), (1.0, k, 0.0), f"a_thruster_with_a_long_name_{k}"
+        )
         for k in range(12)
     ]
     robot = bare.replace(inputs=[*thrusters, *bare.inputs[2:]])
@@ -143,7 +167,10 @@ def test_many_inputs_and_joints_are_named_beside_the_panels_each_in_its_colour()
         assert len(colors) == len(legend.get_lines())
     axes = {each.get_title(): each for each in figure.axes}
     torques, angles = (
-        {line.get_label().rpartition(".")[2]: line.get_color() for line in axes[title].get_lines()}
+        {
+            line.get_label().rpartition(".")[2]: line.get_color()
+            for line in axes[title].get_lines()
+        }
         for title in ("joint torques", "joints q_m")
     )
     assert torques == angles
@@ -165,8 +192,12 @@ def limited():
         fflin.BaseForce(max=2e3),
         *robot.inputs[2:],
         fflin.Thruster("base", (0, 0, 0), (1, 0, 0), "main", max=22.0),
-        fflin.ReactionWheel((0, 0, 1), inertia=0.05, name="spin", max=2.0, max_speed=300.0),
-        fflin.ReactionWheel((1, 0, 0), inertia=0.05, name="idle", max=2.0, max_speed=300.0),
+        fflin.ReactionWheel(
+            (0, 0, 1), inertia=0.05, name="spin", max=2.0, max_speed=300.0
+        ),
+        fflin.ReactionWheel(
+            (1, 0, 0), inertia=0.05, name="idle", max=2.0, max_speed=300.0
+        ),
     ]
     robot = robot.replace(inputs=inputs)
     u = np.zeros(18)
@@ -179,7 +210,9 @@ def limited():
     return fflin.simulate(robot, policy, v0=v0, duration=0.02, dt=1e-3, limits="urdf")
 
 
-@pytest.mark.parametrize(("target", "since"), [((0, 1, 2, 3, 3), 0.75), ((0, 1, 2, 3, 4), None)])
+@pytest.mark.parametrize(
+    ("target", "since"), [((0, 1, 2, 3, 3), 0.75), ((0, 1, 2, 3, 4), None)]
+)
 def test_a_target_rests_from_where_two_rows_of_it_are_one(target, since):
     rows = np.outer(target, (1.0, 0.0))
     t = np.linspace(0.0, 1.0, 5)
@@ -208,7 +241,9 @@ def test_each_axis_has_one_unit_and_wheels_have_panels_of_their_own(limited):
     for title in ("joints q_m", "joint rates qdot_m"):
         assert not {"spin", "idle"} & set(lines(found[title]))
     speed = limited.x[:, limited.state_names.index("qdot_m.spin")]
-    np.testing.assert_array_equal(lines(found["wheel speed"])["spin"].get_ydata(), speed)
+    np.testing.assert_array_equal(
+        lines(found["wheel speed"])["spin"].get_ydata(), speed
+    )
     momentum = lines(found["wheel momentum"])["spin"].get_ydata()
     np.testing.assert_allclose(momentum, 0.05 * speed)
 

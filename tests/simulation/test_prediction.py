@@ -17,7 +17,9 @@ def test_a_measured_feedback_is_foreseen_with_its_filter(outputs):
     x0 = lin.x0 + 1e-3 * np.cos(np.arange(len(lin.x0)))
     options = {"x0": x0, "duration": 2.0, "dt": 0.01}
     seldom = fflin.simulate(robot, policy, every=5, **options)
-    np.testing.assert_allclose(seldom.linear, foreseen(lin, compensator, x0, 40), atol=1e-12)
+    np.testing.assert_allclose(
+        seldom.linear, foreseen(lin, compensator, x0, 40), atol=1e-12
+    )
     # Of the continuous model at every row, at the samples the same.
     q = fflin.configuration(robot, {"joint_2": 0.4})
     continuous = fflin.linearize(robot, q, None, fflin.equilibrium(robot, q).u)
@@ -37,7 +39,9 @@ def test_a_robot_that_nothing_drives_is_foreseen():
 
 def test_a_feedback_of_a_part_is_foreseen_by_the_whole_model():
     robot = fflin.load("servicer_7dof")
-    robot = robot.replace(inputs=[each for each in robot.inputs if hasattr(each, "joint")])
+    robot = robot.replace(
+        inputs=[each for each in robot.inputs if hasattr(each, "joint")]
+    )
     lin = fflin.linearize(robot)
     part = fflin.momentum_reduction(lin)
     policy = fflin.StateFeedback(part, fflin.lqr(part, *unit_weights(part)).K)
@@ -73,7 +77,9 @@ def test_where_nothing_can_be_foreseen_the_reason_is_said():
     )
     for policy in policies:
         for linear in (lin, True):
-            why = f"cannot predict a motion with a policy of type {type(policy).__name__}"
+            why = (
+                f"cannot predict a motion with a policy of type {type(policy).__name__}"
+            )
             with pytest.raises(fflin.InputError, match=why) as caught:
                 fflin.simulate(robot, policy, duration=0.1, linear=linear)
             assert "\n" not in str(caught.value)
@@ -111,7 +117,17 @@ def test_a_continuous_controller_is_foreseen_from_another_point_and_with_what_is
 
 @pytest.mark.parametrize(
     "steps, every",
-    [(1, 1), (64, 1), (100, 7), (98, 7), (5, 9), (255, 1), (256, 1), (700, 7), (1030, 300)],
+    [
+        (1, 1),
+        (64, 1),
+        (100, 7),
+        (98, 7),
+        (5, 9),
+        (255, 1),
+        (256, 1),
+        (700, 7),
+        (1030, 300),
+    ],
 )
 def test_the_motion_of_a_linear_loop_is_that_of_its_single_steps(steps, every):
     rng = np.random.default_rng(4)

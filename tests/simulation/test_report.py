@@ -31,7 +31,9 @@ def first(motion):
 
 
 def cells(motion, title):
-    line = next(row for row in motion_report(motion).splitlines() if row.startswith(title + " "))
+    line = next(
+        row for row in motion_report(motion).splitlines() if row.startswith(title + " ")
+    )
     return line.removeprefix(title).split()
 
 
@@ -44,8 +46,12 @@ def test_what_has_settled_says_so_first_and_when():
     assert says(motion_report(motion), "ets_vii: 20 s", "2001 rows, frame hybrid")
 
 
-@pytest.mark.parametrize(("when", "settled"), [(18.9, True), (19.1, False), (20.5, False)])
-def test_the_margin_is_two_percent_of_the_largest_error_for_the_last_twentieth(when, settled):
+@pytest.mark.parametrize(
+    ("when", "settled"), [(18.9, True), (19.1, False), (20.5, False)]
+)
+def test_the_margin_is_two_percent_of_the_largest_error_for_the_last_twentieth(
+    when, settled
+):
     rate = math.log(50.0) / when
     motion = course(lambda t: np.exp(-rate * t))
     assert first(motion).startswith("settled" if settled else "not settled")
@@ -66,9 +72,14 @@ def test_the_headline_names_the_rates_that_the_table_calls_unsettled():
     x = motion.x.copy()
     at = motion.state_names.index("omega_b.x")
     x[:, at] = 1e-3
-    headline = " ".join(motion_report(replace(motion, x=x)).split("ets_vii:")[0].split())
+    headline = " ".join(
+        motion_report(replace(motion, x=x)).split("ets_vii:")[0].split()
+    )
     assert headline.startswith("positions settled after 7.83")
-    assert says(headline, "not yet settled: omega_b 0.001 rad/s") and "joint rates" not in headline
+    assert (
+        says(headline, "not yet settled: omega_b 0.001 rad/s")
+        and "joint rates" not in headline
+    )
     assert cells(replace(motion, x=x), "omega_b")[-2:] == ["not", "yet"]
     # A rate that is not fed back never settles, and its row says so.
     loose = replace(motion, x=x, steered=("q_b.x", "q_m.joint_1"))
@@ -108,16 +119,22 @@ def test_a_motion_without_a_target_has_no_verdict():
 
 def test_a_motion_without_a_target_tells_how_far_it_went():
     robot = fflin.load("ets_vii")
-    v0 = fflin.velocity(robot, {"omega_b.z": 0.1, "v_b.x": 0.05, robot.joint_names[0]: 0.2})
+    v0 = fflin.velocity(
+        robot, {"omega_b.z": 0.1, "v_b.x": 0.05, robot.joint_names[0]: 0.2}
+    )
     motion = fflin.simulate(robot, v0=v0, duration=2.0)
     turned = np.degrees(2.0 * np.arcsin(np.linalg.norm(motion.x[:, :3], axis=1)))
-    moved, swung = (np.abs(motion.x[:, part]).max(axis=1) for part in (slice(3, 6), slice(6, 12)))
+    moved, swung = (
+        np.abs(motion.x[:, part]).max(axis=1) for part in (slice(3, 6), slice(6, 12))
+    )
     assert "change from the start" in motion_report(motion)
     for title, size in (("attitude", turned), ("position", moved), ("joints", swung)):
         assert cells(motion, title)[1:] == [f"{size.max():.3g}", f"{size[-1]:.3g}"]
     orbit = fflin.load("ets_vii", orbit=fflin.CircularOrbit(altitude=700e3))
     report = motion_report(fflin.simulate(orbit, v0=v0, duration=2.0))
-    assert "change from the start" in report and max(map(len, report.splitlines())) <= 80
+    assert (
+        "change from the start" in report and max(map(len, report.splitlines())) <= 80
+    )
 
 
 def test_no_line_is_longer_than_80_columns():
@@ -134,7 +151,9 @@ def pushed_by(*inputs, policy=True):
     robot = fflin.load("cubesat", inputs=inputs)
     lin = fflin.linearize(robot)
     K = np.zeros((len(lin.u0), 12))
-    K[:3, :3], K[:3, 6:9] = (np.diag(lin.M.diagonal()[:3]) * gain for gain in (2.0, 2.0))
+    K[:3, :3], K[:3, 6:9] = (
+        np.diag(lin.M.diagonal()[:3]) * gain for gain in (2.0, 2.0)
+    )
     law = fflin.LinearController(-K, lin) if policy else None
     x0 = np.zeros(12)
     x0[[0, 3, 9]] = 0.1, 0.01, 1e-4
@@ -177,7 +196,9 @@ def test_a_base_that_no_force_pushes_is_off_its_target_by_a_figure():
     x0[3] = 1.0
     policy = fflin.StateFeedback(lin, fflin.lqr(lin).K)
     said = motion_report(fflin.simulate(robot, policy, x0=x0, duration=1.0))
-    assert says(said, "settled: attitude at the target", "not controlled: position 1 m;")
+    assert says(
+        said, "settled: attitude at the target", "not controlled: position 1 m;"
+    )
 
 
 def test_lengths_and_angles_of_joints_have_rows_of_their_own():
@@ -185,17 +206,25 @@ def test_lengths_and_angles_of_joints_have_rows_of_their_own():
     units = list(motion.state_units)
     units[motion.state_names.index("q_m.joint_2")] = "m"
     slides = replace(motion, state_units=tuple(units))
-    rows = [row.split()[:2] for row in motion_report(slides).splitlines() if "joints " in row]
+    rows = [
+        row.split()[:2]
+        for row in motion_report(slides).splitlines()
+        if "joints " in row
+    ]
     assert ["joints", "rad"] in rows and ["joints", "m"] in rows
 
 
 def test_what_no_policy_steers_is_told_apart():
-    steered = tuple(n for n in course(np.exp).state_names if n.startswith(("q_m", "qdot_m")))
+    steered = tuple(
+        n for n in course(np.exp).state_names if n.startswith(("q_m", "qdot_m"))
+    )
     motion = course(lambda t: np.exp(-t), steered=steered)
     x = motion.x.copy()
     x[:, 0] = np.sin(np.radians(15.0))
     said = first(replace(motion, x=x))
-    assert said.startswith("settled") and says(said, "3.92 s", "not controlled: attitude 30 deg")
+    assert said.startswith("settled") and says(
+        said, "3.92 s", "not controlled: attitude 30 deg"
+    )
 
 
 def test_the_states_that_a_feedback_feeds_back_are_on_record():
@@ -263,7 +292,9 @@ def test_what_tumbles_or_swings_through_its_target_has_not_settled(duration):
     K[2, 2] = 2.0 * lin.M[2, 2] * (2.0 * np.pi / 40.0) ** 2  # a spring and no damper
     x0 = np.zeros(12)
     x0[2] = 0.05
-    swinging = fflin.simulate(robot, fflin.StateFeedback(lin, K), x0=x0, duration=duration)
+    swinging = fflin.simulate(
+        robot, fflin.StateFeedback(lin, K), x0=x0, duration=duration
+    )
     assert first(swinging).startswith("not settled: attitude")
 
 
@@ -278,13 +309,20 @@ def test_a_wheel_at_its_largest_speed_is_told_and_its_angle_is_no_difference():
     policy = fflin.StateFeedback(lin, fflin.lqr(lin, weights="identity").K)
     q0 = fflin.configuration(robot)
     q0[3:7] = [np.sin(1.2), 0.0, 0.0, np.cos(1.2)]
-    motion = fflin.simulate(robot, policy, q0=q0, duration=60.0, limits="urdf", linear=lin)
+    motion = fflin.simulate(
+        robot, policy, q0=q0, duration=60.0, limits="urdf", linear=lin
+    )
     (full,) = [each for each in motion.saturated if each.name == "qdot_m.a"]
     speed = np.abs(motion.x[:, motion.state_names.index("qdot_m.a")])
-    share = np.diff(motion.t, append=motion.t[-1:])[speed >= 60.0 * (1.0 - 1e-3)].sum() / 60.0
+    share = (
+        np.diff(motion.t, append=motion.t[-1:])[speed >= 60.0 * (1.0 - 1e-3)].sum()
+        / 60.0
+    )
     assert full.share == pytest.approx(share) and share > 0.1
     assert says(motion_report(motion), "a at", f"{full.limit:.3g} rad/s")
-    assert "linear model" in motion_report(motion) and "q_m." not in motion_report(motion)
+    assert "linear model" in motion_report(motion) and "q_m." not in motion_report(
+        motion
+    )
 
 
 @pytest.mark.parametrize("every", [1, 10])
@@ -304,7 +342,8 @@ def test_a_printed_motion_is_its_report():
 
 
 def test_errors_of_one_title_in_two_units_are_both_in_the_record():
-    robot = fflin.load("panda")  # seven revolute joints, and a prismatic one in the gripper
+    # seven revolute joints, and a prismatic one in the gripper
+    robot = fflin.load("panda")
     lin = fflin.linearize(robot)
     q0 = fflin.configuration(robot, {"panda_joint1": 0.1, "panda_finger_joint1": 0.01})
     law = fflin.StateFeedback(lin, fflin.lqr(lin).K)
@@ -324,20 +363,26 @@ def test_the_headline_states_how_near_the_target_an_error_stays():
     )
     stays = course(lambda t: np.maximum(np.exp(-t), 0.006), joint=0.0)
     assert says(motion_report(stays), "remaining: attitude 0.12 deg")
-    cycle = course(lambda t: np.exp(-2.0 * t) + 0.006 * np.abs(np.sin(2.0 * t)), joint=0.0)
-    assert says(motion_report(cycle), "remaining: attitude") and "drifting" not in motion_report(
-        cycle
+    cycle = course(
+        lambda t: np.exp(-2.0 * t) + 0.006 * np.abs(np.sin(2.0 * t)), joint=0.0
     )
+    assert says(
+        motion_report(cycle), "remaining: attitude"
+    ) and "drifting" not in motion_report(cycle)
     drifts = course(lambda t: np.exp(-2.0 * t) + 5e-4 * t, joint=0.0)
     assert says(motion_report(drifts), "drifting: attitude 0.2 deg")
 
 
 def on_off(**fields):
     """A motion of a cubesat whose thruster of 1 N fires three pulses, of 0.1, 0.2 and 0.4 s."""
-    jet = fflin.Thruster("base", (0, 0, 0), (1, 0, 0), "jet", max=1.0, on_off=True, **fields)
+    jet = fflin.Thruster(
+        "base", (0, 0, 0), (1, 0, 0), "jet", max=1.0, on_off=True, **fields
+    )
     robot = fflin.load("cubesat", inputs=[fflin.BaseTorque(), jet])
     idle = np.zeros(4)
-    motion = fflin.simulate(robot, lambda t, q, v: idle, duration=2.0, dt=0.01, sample=0.1)
+    motion = fflin.simulate(
+        robot, lambda t, q, v: idle, duration=2.0, dt=0.01, sample=0.1
+    )
     u = motion.u.copy()
     for start, rows in ((10, 10), (50, 20), (100, 40)):
         u[start : start + rows, 3] = 1.0
@@ -349,10 +394,14 @@ def test_pulses_of_a_thruster_are_counted_and_are_no_saturation():
     # 0.7 N s of an exhaust of 980.665 m/s.
     assert says(report, "impulse 0.7 N s in 3 pulses, propellant 0.000714 kg")
     motion = on_off()
-    assert not motion.saturated and says(motion_report(motion), "impulse 0.7 N s in 3 pulses")
+    assert not motion.saturated and says(
+        motion_report(motion), "impulse 0.7 N s in 3 pulses"
+    )
     assert "propellant" not in motion_report(motion)
     rare = replace(motion, step=0.002)  # every fifth step is recorded
-    assert "pulses" not in str(firings(rare)) and firings(rare).impulse == pytest.approx(0.7)
+    assert "pulses" not in str(firings(rare)) and firings(
+        rare
+    ).impulse == pytest.approx(0.7)
     with pytest.raises(fflin.InputError, match="isp"):
         fflin.Thruster("base", (0, 0, 0), (1, 0, 0), isp=-1.0)
 
@@ -360,6 +409,10 @@ def test_pulses_of_a_thruster_are_counted_and_are_no_saturation():
 def test_thrusters_without_pulses_saturate():
     jet = fflin.Thruster("base", (0, 0, 0), (1, 0, 0), "jet", max=1.0)
     robot = fflin.load("cubesat", inputs=[fflin.BaseTorque(), jet])
-    motion = fflin.simulate(robot, lambda t, q, v: [0, 0, 0, 9.0], duration=1.0, limits="urdf")
+    motion = fflin.simulate(
+        robot, lambda t, q, v: [0, 0, 0, 9.0], duration=1.0, limits="urdf"
+    )
     assert [each.name for each in motion.saturated] == ["jet"]
-    assert says(motion_report(motion), "impulse 1 N s") and "pulses" not in motion_report(motion)
+    assert says(
+        motion_report(motion), "impulse 1 N s"
+    ) and "pulses" not in motion_report(motion)

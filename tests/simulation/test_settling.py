@@ -50,7 +50,10 @@ def test_sampled_loops_settle_when_their_continuous_ones_do():
 def test_a_loop_that_takes_for_ever_is_looked_at_for_a_minute():
     robot = fflin.load("cubesat")
     lin = fflin.linearize(robot)
-    K = np.hstack((1e-6 * np.eye(6), 1e-3 * np.eye(6))) * np.abs(lin.M.diagonal())[:, None]
+    K = (
+        np.hstack((1e-6 * np.eye(6), 1e-3 * np.eye(6)))
+        * np.abs(lin.M.diagonal())[:, None]
+    )
     q = fflin.configuration(robot)
     q[:3] = 1.0
     assert time_to_settle(robot, fflin.StateFeedback(lin, K), q, None) == 60.0
@@ -58,11 +61,18 @@ def test_a_loop_that_takes_for_ever_is_looked_at_for_a_minute():
 
 def test_which_thrusters_give_every_wrench():
     inspector, cubesat = (
-        fflin.load(name, inputs=fflin.load_inputs(name)) for name in ("inspector", "cubesat")
+        fflin.load(name, inputs=fflin.load_inputs(name))
+        for name in ("inspector", "cubesat")
     )
-    assert thrusters_give_every_wrench(inspector) and thrusters_give_every_wrench(cubesat)
+    assert thrusters_give_every_wrench(inspector) and thrusters_give_every_wrench(
+        cubesat
+    )
     assert not thrusters_give_every_wrench(fflin.load("cubesat"))
-    fewer = [each for each in inspector.inputs if getattr(each, "name", "") != "top_left_front"]
+    fewer = [
+        each
+        for each in inspector.inputs
+        if getattr(each, "name", "") != "top_left_front"
+    ]
     assert not thrusters_give_every_wrench(inspector.replace(inputs=fewer))
     helped = [*fewer, fflin.BaseTorque(), fflin.BaseForce()]
     assert thrusters_give_every_wrench(inspector.replace(inputs=helped))
@@ -72,7 +82,10 @@ def test_what_is_not_fed_back_does_not_lengthen_or_shorten_a_run():
     wheels = [fflin.ReactionWheel(axis, inertia=1e-4) for axis in np.eye(3).tolist()]
     robot = fflin.load("cubesat", inputs=wheels)
     lin = fflin.linearize(robot)
-    slow = fflin.bryson(lin, {"q_b": 1.0, "omega_b": 1.0}), fflin.bryson(lin, {"wheel": 5e-5})
+    slow = (
+        fflin.bryson(lin, {"q_b": 1.0, "omega_b": 1.0}),
+        fflin.bryson(lin, {"wheel": 5e-5}),
+    )
     policy = fflin.StateFeedback(lin, fflin.lqr(lin, *slow).K)
     q = fflin.configuration(robot)
     q[3:7] = [np.sin(0.2), 0.0, 0.0, np.cos(0.2)]

@@ -15,7 +15,9 @@ def motion():
     lin = fflin.linearize(robot)
     x0 = lin.x0.copy()
     x0[2], x0[6] = 0.1, 0.2
-    return fflin.simulate(robot, fflin.StateFeedback(lin, fflin.lqr(lin).K), x0=x0, duration=1.0)
+    return fflin.simulate(
+        robot, fflin.StateFeedback(lin, fflin.lqr(lin).K), x0=x0, duration=1.0
+    )
 
 
 def drawn(motion, show):
@@ -36,16 +38,25 @@ def test_groups_names_and_patterns_pick_panels_and_lines(motion):
     names = motion.state_names
     panels = drawn(motion, ["q_b.z", "*.joint_1", "F_b"])
     assert set(panels) == {
-        *("attitude q_b", "joints q_m", "joint rates qdot_m", "base force", "joint torques")
+        *(
+            "attitude q_b",
+            "joints q_m",
+            "joint rates qdot_m",
+            "base force",
+            "joint torques",
+        )
     }
     np.testing.assert_array_equal(panels["attitude q_b"]["z"], motion.x[:, 2])
     np.testing.assert_array_equal(
-        panels["joint rates qdot_m"]["joint_1"], motion.x[:, names.index("qdot_m.joint_1")]
+        panels["joint rates qdot_m"]["joint_1"],
+        motion.x[:, names.index("qdot_m.joint_1")],
     )
     assert list(panels["joints q_m"]) == ["joint_1"]
     assert list(panels["base force"]) == ["x", "y", "z"]
     torque = panels["joint torques"]["joint_1"]
-    np.testing.assert_array_equal(torque, motion.u[:, motion.input_names.index("tau_m.joint_1")])
+    np.testing.assert_array_equal(
+        torque, motion.u[:, motion.input_names.index("tau_m.joint_1")]
+    )
 
 
 def test_states_alone_and_inputs_alone(motion):
@@ -63,6 +74,18 @@ def test_what_is_not_there_is_told(motion):
 
 def test_show_on_the_command_line(tmp_path, capsys):
     path = tmp_path / "a.svg"
-    options = ["--duration", "0.5", "--plot", str(path), "--show", "r_b", "--show", "tau_m"]
-    assert main(["simulate", "planar_detumble", "--rpy", "0", "0", "5", *options]) in (0, 1)
+    options = [
+        "--duration",
+        "0.5",
+        "--plot",
+        str(path),
+        "--show",
+        "r_b",
+        "--show",
+        "tau_m",
+    ]
+    assert main(["simulate", "planar_detumble", "--rpy", "0", "0", "5", *options]) in (
+        0,
+        1,
+    )
     assert path.stat().st_size and "wrote" in capsys.readouterr().out

@@ -33,7 +33,9 @@ def test_torque_free_axisymmetric_body_turns_as_the_closed_form_says(project, ac
     robot = free_body((a, a, c))
     omega = np.array([0.05, 0.0, 0.01])
     v0 = np.concatenate((np.zeros(3), omega))
-    motion = fflin.simulate(robot, v0=v0, duration=duration, dt=0.1, every=360, project=project)
+    motion = fflin.simulate(
+        robot, v0=v0, duration=duration, dt=0.1, every=360, project=project
+    )
     H = np.diag([a, a, c]) @ omega
     for t, q in zip(motion.t, motion.q, strict=True):
         spin = np.array([0.0, 0.0, -(c - a) / a * omega[2] * t])
@@ -42,7 +44,9 @@ def test_torque_free_axisymmetric_body_turns_as_the_closed_form_says(project, ac
         assert np.linalg.norm(apart) < accuracy
 
 
-@pytest.mark.parametrize(("method", "order"), [("cf4", 4.0), ("semi_implicit_euler", 1.0)])
+@pytest.mark.parametrize(
+    ("method", "order"), [("cf4", 4.0), ("semi_implicit_euler", 1.0)]
+)
 @pytest.mark.parametrize("project", [True, False])
 def test_order_of_the_methods(method, order, project):
     robot = fflin.load("canadarm2")
@@ -59,7 +63,9 @@ def test_order_of_the_methods(method, order, project):
     for dt in steps:
         motion = end(dt)
         apart = pin.difference(robot.model, exact.q[-1], motion.q[-1])
-        errors.append(np.linalg.norm(np.concatenate((apart, motion.v[-1] - exact.v[-1]))))
+        errors.append(
+            np.linalg.norm(np.concatenate((apart, motion.v[-1] - exact.v[-1])))
+        )
     slopes = np.diff(np.log2(errors)) / -1.0
     assert slopes[-1] == pytest.approx(order, abs=0.1)
 
@@ -144,7 +150,9 @@ def test_momentum_follows_the_impulse_of_wrenches_thrusters_wheels_and_gravity(f
             duration=1.2,
             dt=dt,
             frame=frame,
-            reference=pin.SE3(pin.exp3(np.array([0.3, -0.2, 0.5])), np.array([1.0, 2.0, 3.0])),
+            reference=pin.SE3(
+                pin.exp3(np.array([0.3, -0.2, 0.5])), np.array([1.0, 2.0, 3.0])
+            ),
             disturbance=lambda t, q, v: push,
             project=project,
         )
@@ -267,8 +275,12 @@ def test_allocation_gives_the_wrench_with_thrusts_that_push():
     assert note == "allocation: the commanded tau_b, F_b are realised by thrust"
     assert note in str(motion)
     # Attitude and position are those relative to the model's reference, wherever it starts.
-    turned = fflin.configuration(robot, {}, pin.SE3(pin.rpy.rpyToMatrix(0.2, 0, 0), np.zeros(3)))
-    motion = fflin.simulate(robot, policy, q0=turned, duration=60.0, dt=0.05, sample=0.1)
+    turned = fflin.configuration(
+        robot, {}, pin.SE3(pin.rpy.rpyToMatrix(0.2, 0, 0), np.zeros(3))
+    )
+    motion = fflin.simulate(
+        robot, policy, q0=turned, duration=60.0, dt=0.05, sample=0.1
+    )
     assert motion.attitude_error[0] == pytest.approx(np.degrees(0.2))
     assert motion.attitude_error[-1] < 0.2
     # A model that is sampled says when the thrusters are told.
@@ -304,13 +316,17 @@ def test_feedback_along_a_trajectory_brings_the_robot_back_to_it():
         every=5,
         sample=6.0,
     )
-    traj = fflin.linearize_trajectory(robot, reference.t, reference.q, reference.v, reference.u)
+    traj = fflin.linearize_trajectory(
+        robot, reference.t, reference.q, reference.v, reference.u
+    )
     lin = fflin.linearize(robot)
     Q, R = unit_weights(lin)
     schedule = fflin.tvlqr(traj, 10.0 * Q, R, 10.0 * Q)
     off = pin.integrate(robot.model, q0, 0.02 * np.ones(robot.nv))
     policy = fflin.TrajectoryFeedback(traj, schedule)
-    led = fflin.simulate(robot, policy, q0=off, v0=v0, duration=6.0, dt=0.01, frame="local")
+    led = fflin.simulate(
+        robot, policy, q0=off, v0=v0, duration=6.0, dt=0.01, frame="local"
+    )
     free = fflin.simulate(
         robot, lambda t, q, v: u, q0=off, v0=v0, duration=6.0, dt=0.01, frame="local"
     )
@@ -355,7 +371,9 @@ def test_rows_are_kept_where_a_run_is_interrupted():
 def test_an_unstable_loop_stops_and_says_when(tmp_path):
     robot, lin, gain = regulated("ets_vii")
     policy = fflin.StateFeedback(lin, -0.05 * gain.K)
-    motion = fflin.simulate(robot, policy, x0=displaced(lin, 5.0), duration=60.0, dt=0.01)
+    motion = fflin.simulate(
+        robot, policy, x0=displaced(lin, 5.0), duration=60.0, dt=0.01
+    )
     assert motion.stopped.startswith(("left the chart at t", "diverged at t"))
     assert motion.t[-1] < 60.0
     motion.save(tmp_path / "m.npz")
@@ -409,7 +427,9 @@ def test_csv_has_names_and_rows(tmp_path):
     assert names[-1] == f"u.{motion.input_names[-1]} [{motion.input_units[-1]}]"
     assert len(lines) == 4
     values = np.array([line.split(",") for line in lines[1:]], dtype=float)
-    np.testing.assert_array_equal(values, np.column_stack((motion.t, motion.x, motion.u)))
+    np.testing.assert_array_equal(
+        values, np.column_stack((motion.t, motion.x, motion.u))
+    )
 
 
 @pytest.mark.parametrize(
@@ -428,7 +448,10 @@ def test_csv_has_names_and_rows(tmp_path):
         ({"duration": 1.0, "x0": np.zeros(24), "v0": np.zeros(12)}, "either x0"),
         ({"duration": 1.0, "every": 0}, "every"),
         ({"duration": 1.0, "events": [3]}, "function"),
-        ({"duration": 1.0, "disturbance": lambda t, q, v: [1.0]}, "disturbance(t, q, v)"),
+        (
+            {"duration": 1.0, "disturbance": lambda t, q, v: [1.0]},
+            "disturbance(t, q, v)",
+        ),
         ({"duration": 1.0, "frame": "base"}, "frame"),
     ],
 )
@@ -482,13 +505,20 @@ def test_a_gain_that_is_sampled_too_slowly_is_reported(part, unstable):
     K[:, :3] = 2.0 * w**2 * J  # q_b is half of the angle
     K[:, 6:9] = np.sqrt(2.0) * w * J
     sample = part * np.sqrt(2.0) / w
-    policy, options = fflin.StateFeedback(lin, K), {"duration": 4 * sample, "dt": sample / 20}
+    policy, options = (
+        fflin.StateFeedback(lin, K),
+        {"duration": 4 * sample, "dt": sample / 20},
+    )
     assert not fflin.simulate(robot, policy, **options).notes
     notes = fflin.simulate(robot, policy, sample=sample, **options).notes
     assert any("sampled linear loop is unstable" in note for note in notes) == unstable
     # A gain that was designed for this sample time has the same loop, without the advice.
-    notes = fflin.simulate(robot, fflin.StateFeedback(lin.discretize(sample), K), **options).notes
-    assert [note for note in notes if "unstable" in note and "held" not in note] == list(notes)
+    notes = fflin.simulate(
+        robot, fflin.StateFeedback(lin.discretize(sample), K), **options
+    ).notes
+    assert [
+        note for note in notes if "unstable" in note and "held" not in note
+    ] == list(notes)
     assert bool(notes) == unstable
 
 
@@ -496,4 +526,7 @@ def test_a_state_feedback_of_the_wrong_sign_is_reported():
     robot = free_body((20.0, 30.0, 40.0))
     lin = fflin.linearize(robot)
     policy = fflin.StateFeedback(lin, -fflin.lqr(lin).K)
-    assert "the linear loop is unstable" in fflin.simulate(robot, policy, duration=1.0).notes[0]
+    assert (
+        "the linear loop is unstable"
+        in fflin.simulate(robot, policy, duration=1.0).notes[0]
+    )

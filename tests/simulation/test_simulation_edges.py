@@ -20,7 +20,17 @@ from tests.support.weights import unit_weights
 
 
 def finite(motion):
-    names = ("t", "q", "v", "x", "u", "energy", "momentum", "momentum_drift", "prediction")
+    names = (
+        "t",
+        "q",
+        "v",
+        "x",
+        "u",
+        "energy",
+        "momentum",
+        "momentum_drift",
+        "prediction",
+    )
     return all(np.isfinite(getattr(motion, name)).all() for name in names)
 
 
@@ -50,7 +60,9 @@ def test_a_policy_that_gives_no_inputs_is_refused(policy, said, sample):
 
 def test_an_infinite_command_within_limits_is_the_limit():
     robot = free_body((20.0, 30.0, 40.0))
-    motion = fflin.simulate(robot, after_half_a_second(math.inf), duration=1.0, limits=2.0)
+    motion = fflin.simulate(
+        robot, after_half_a_second(math.inf), duration=1.0, limits=2.0
+    )
     assert finite(motion)
     assert motion.u[-1, 0] == 2.0
     with pytest.raises(fflin.InputError, match="tau_b"):
@@ -78,7 +90,10 @@ def test_a_policy_may_keep_and_change_what_it_is_given_and_gives():
     for options in ({}, {"sample": 0.1, "delay": 0.2}):
         asked, given = (
             fflin.simulate(robot, policy, duration=1.0, **options, **watched)
-            for policy, watched in ((clean, {}), (careless, {"events": [spoil], "callback": spoil}))
+            for policy, watched in (
+                (clean, {}),
+                (careless, {"events": [spoil], "callback": spoil}),
+            )
         )
         np.testing.assert_array_equal(given.x, asked.x)
         np.testing.assert_array_equal(given.u, asked.u)
@@ -92,7 +107,9 @@ def test_an_unstable_loop_has_neither_warnings_nor_an_infinite_prediction():
     motion = fflin.simulate(robot, policy, x0=displaced(lin, 5.0), duration=100.0)
     assert motion.stopped.startswith(("diverged at t", "left the chart at t"))
     assert finite(motion)
-    held = fflin.simulate(robot, policy, x0=displaced(lin, 5.0), duration=2.0, limits=1e-3)
+    held = fflin.simulate(
+        robot, policy, x0=displaced(lin, 5.0), duration=2.0, limits=1e-3
+    )
     assert len(held.linear) == len(held.t)
     # The linear model of a loop that is held within limits has no bounds.
     long = fflin.simulate(
@@ -109,7 +126,9 @@ def test_a_speed_whose_square_overflows_is_refused_or_a_divergence(size):
         fflin.simulate(robot, v0=[size, 0, 0, 0, 0, 0], duration=1.0)
     force = np.array([size, 0, 0, 0, 0, 0])
     motion = fflin.simulate(robot, duration=1.0, disturbance=lambda t, q, v: force)
-    assert motion.stopped.startswith("diverged at t = 0.01 s in steps of 0.01 s; give a smaller dt")
+    assert motion.stopped.startswith(
+        "diverged at t = 0.01 s in steps of 0.01 s; give a smaller dt"
+    )
     assert finite(motion)
 
 
@@ -121,7 +140,9 @@ def test_the_prediction_is_that_of_the_last_row_too():
     def at_16_steps(t, q, v):
         return 0.155 - t
 
-    motion = fflin.simulate(robot, policy, x0=x0, duration=1.0, every=7, events=[at_16_steps])
+    motion = fflin.simulate(
+        robot, policy, x0=x0, duration=1.0, every=7, events=[at_16_steps]
+    )
     np.testing.assert_allclose(motion.t, [0.0, 0.07, 0.14, 0.16])
     np.testing.assert_allclose(motion.x, motion.linear, atol=1e-9)
     # Between its samples a sampled model moves as the continuous one; one from a file is not known.
@@ -130,7 +151,9 @@ def test_the_prediction_is_that_of_the_last_row_too():
     for linear in (None, lin):
         motion = fflin.simulate(robot, sampled, linear=linear, **options)
         np.testing.assert_allclose(motion.x, motion.linear, atol=1e-9)
-    alone = fflin.StateFeedback(replace(sampled.lin, A=sampled.lin.A * (1.0 + 1e-12)), gain.K)
+    alone = fflin.StateFeedback(
+        replace(sampled.lin, A=sampled.lin.A * (1.0 + 1e-12)), gain.K
+    )
     assert fflin.simulate(robot, alone, **options).linear is None
 
 
@@ -189,7 +212,9 @@ def test_a_model_that_cannot_predict_is_refused():
         with pytest.raises(fflin.InputError, match="robot"):
             fflin.simulate(robot, policy, duration=1.0, linear=other)
     with pytest.raises(fflin.InputError, match="linear"):
-        fflin.simulate(robot, lambda t, q, v: np.zeros(len(lin.u0)), duration=1.0, linear=lin)
+        fflin.simulate(
+            robot, lambda t, q, v: np.zeros(len(lin.u0)), duration=1.0, linear=lin
+        )
 
 
 def test_whole_numbers_of_numpy_are_whole_numbers():
@@ -199,12 +224,16 @@ def test_whole_numbers_of_numpy_are_whole_numbers():
 
 def test_energy_of_gravity_and_springs_is_part_of_the_whole():
     robot = fflin.load(
-        "servicer_7dof", gravity=(0.3, 0.1, -0.5), stiffness={"panel_left": 50.0, "joint_2": 20.0}
+        "servicer_7dof",
+        gravity=(0.3, 0.1, -0.5),
+        stiffness={"panel_left": 50.0, "joint_2": 20.0},
     )
     q0 = fflin.configuration(robot, {"panel_left": 0.4, "joint_2": -0.3})
     motion = fflin.simulate(robot, q0=q0, duration=1.0, dt=0.0025, every=20)
     kinetic = motion.energy[-1] - motion.energy[0]
-    assert abs(kinetic) < 1e-6 * np.abs(motion.v[-1, :3] @ motion.v[-1, :3] * robot.mass)
+    assert abs(kinetic) < 1e-6 * np.abs(
+        motion.v[-1, :3] @ motion.v[-1, :3] * robot.mass
+    )
     # A spring at rest but bent holds k a^2 / 2.
     assert motion.energy[0] - fflin.simulate(
         robot.replace(stiffness={}), q0=q0, duration=0.01
@@ -221,7 +250,12 @@ def test_the_linear_loop_is_that_of_scipy_late_limited_and_off_a_fixed_point():
     calm = fflin.linearize(fflin.load("ets_vii"))
     K = fflin.lqr(calm, *unit_weights(calm)).K
     policy, x0 = fflin.StateFeedback(lin, K), displaced(lin)
-    options = {"x0": x0, "duration": 2.0, "dt": 0.05, "limits": {"tau_b": 300.0, "tau_m": 4.0}}
+    options = {
+        "x0": x0,
+        "duration": 2.0,
+        "dt": 0.05,
+        "limits": {"tau_b": 300.0, "tau_m": 4.0},
+    }
     late = fflin.simulate(robot, policy, sample=0.1, delay=0.15, **options)
     high = np.r_[np.full(3, 300.0), np.full(3, np.inf), np.full(6, 4.0)]
     # f0 is one more input, of the value 1.
@@ -270,7 +304,9 @@ def test_an_allocation_is_sampled_as_its_policy_is_and_refuses_what_is_no_comman
     gain = fflin.acceleration_lqr(lin, 0.04, 0.2, 1.0)
     inner = fflin.StateFeedback(lin.discretize(0.1), gain.K)
     x0 = np.r_[np.full(6, 0.1), np.zeros(6)]
-    motion = fflin.simulate(robot, fflin.Allocation(inner, design), x0=x0, duration=1.0, dt=0.05)
+    motion = fflin.simulate(
+        robot, fflin.Allocation(inner, design), x0=x0, duration=1.0, dt=0.05
+    )
     changes = np.flatnonzero(np.diff(motion.u, axis=0).any(axis=1)) + 1
     np.testing.assert_array_equal(changes, np.arange(2, 20, 2))
     for asked, said in (
@@ -299,10 +335,15 @@ def test_the_attitude_error_is_the_angle_to_the_target_that_is_turned_too():
     robot = fflin.load("cubesat")
     aim = pin.SE3(pin.exp3(np.array([0.9, -0.4, 0.7])), np.zeros(3))
     at = pin.SE3(pin.exp3(np.array([-0.5, 1.1, 0.3])), np.zeros(3))
-    lin = fflin.linearize(robot, fflin.configuration(robot, base=aim), reference=pin.SE3.Identity())
+    lin = fflin.linearize(
+        robot, fflin.configuration(robot, base=aim), reference=pin.SE3.Identity()
+    )
     K = fflin.acceleration_lqr(fflin.linearize(robot), 1.0, 1.0, 1.0).K
     motion = fflin.simulate(
-        robot, fflin.StateFeedback(lin, K), q0=fflin.configuration(robot, base=at), duration=0.01
+        robot,
+        fflin.StateFeedback(lin, K),
+        q0=fflin.configuration(robot, base=at),
+        duration=0.01,
     )
     angle = np.degrees(np.linalg.norm(pin.log3(aim.rotation.T @ at.rotation)))
     assert motion.attitude_error[0] == pytest.approx(angle, abs=1e-9)
@@ -338,7 +379,9 @@ def test_a_step_that_a_fast_gain_makes_short_is_told_once():
         return -1.0
 
     with pytest.warns(fflin.FflinWarning) as told:
-        fflin.simulate(robot, fflin.StateFeedback(lin, 1e6 * K), duration=2.0, events=[at_once])
+        fflin.simulate(
+            robot, fflin.StateFeedback(lin, 1e6 * K), duration=2.0, events=[at_once]
+        )
     (said,) = [str(each.message) for each in told]
     poles = np.abs(np.linalg.eigvals(lin.A - lin.B @ (1e6 * K)))
     assert says(said, f"{poles.max():.3g} 1/s", "dt=")

@@ -33,7 +33,9 @@ def test_runs_of_up_to_100000_rows_are_recorded_step_by_step():
     )
 
 
-@pytest.mark.parametrize(("sample", "every"), [(0.01, 24), (0.03, 24), (0.5, 50), (0.07, 28)])
+@pytest.mark.parametrize(
+    ("sample", "every"), [(0.01, 24), (0.03, 24), (0.5, 50), (0.07, 28)]
+)
 def test_what_is_recorded_of_a_sampled_loop_are_samples_or_parts_of_them(sample, every):
     found = of(2400.0 - 2400.0 % sample, sample=sample)
     assert found.every == every
@@ -75,7 +77,9 @@ def test_the_pole_that_makes_a_run_slow_is_told():
         motion = fflin.simulate(robot, policy, duration=120.0, events=[at_once])
     fastest = np.abs(np.linalg.eigvals(lin.A - lin.B @ K)).max()
     (line,) = [str(each.message) for each in said]
-    assert says(line, f"{-fastest:.3g} 1/s", "mainly qdot_m.joint_5", "0.001 s", "120,000")
+    assert says(
+        line, f"{-fastest:.3g} 1/s", "mainly qdot_m.joint_5", "0.001 s", "120,000"
+    )
     assert says(line, "dt=", "sample=")
     assert motion.notes[1:] == (
         "one in 12 steps is recorded; every=1 (--every 1) records all 120,000 steps",
@@ -105,5 +109,7 @@ def test_every_of_the_command(tmp_path):
     command = ("simulate", "planar_detumble", "--duration", 1, "-o", "m.npz")
     code, _, _ = run(*command, "--every", 25, cwd=tmp_path)
     assert code == 0
-    np.testing.assert_allclose(fflin.Motion.load(tmp_path / "m.npz").t, [0, 0.25, 0.5, 0.75, 1.0])
+    np.testing.assert_allclose(
+        fflin.Motion.load(tmp_path / "m.npz").t, [0, 0.25, 0.5, 0.75, 1.0]
+    )
     assert run(*command, "--every", 0, cwd=tmp_path)[0] == 2

@@ -55,7 +55,9 @@ def test_a_schedule_runs_as_the_feedback_along_its_trajectory(case):
         e = moving_error(state, q, v, run.q[k], run.v[k])
         np.testing.assert_allclose(run.error[k], e, atol=1e-13)
         if k < 400:
-            np.testing.assert_allclose(run.u[k], u - schedule.gain(run.t[k]) @ e, atol=1e-12)
+            np.testing.assert_allclose(
+                run.u[k], u - schedule.gain(run.t[k]) @ e, atol=1e-12
+            )
     apart = [
         pin.log3(pin.XYZQUATToSE3(r[:7]).rotation.T @ pin.XYZQUATToSE3(q[:7]).rotation)
         for r, q in ((traj.point(t)[0], q) for t, q in zip(run.t, run.q, strict=True))
@@ -84,7 +86,9 @@ def test_after_the_end_the_last_configuration_is_held_at_rest():
     run = fflin.simulate(robot, schedule, duration=120.0, dt=0.02)
     after = run.t > traj.t[-1] + 1e-9
     held = fflin.StateMap(robot, frame="local").to_state(traj.q[-1], np.zeros(robot.nv))
-    np.testing.assert_allclose(run.target[after], np.tile(held, (after.sum(), 1)), atol=1e-14)
+    np.testing.assert_allclose(
+        run.target[after], np.tile(held, (after.sum(), 1)), atol=1e-14
+    )
     assert np.abs(run.error[-1]).max() < 1e-4
 
 
@@ -107,10 +111,15 @@ def test_a_sampled_schedule_is_asked_at_its_samples():
 @pytest.mark.exhaustive
 def test_a_clock_that_does_not_begin_at_zero_is_counted_from_the_first_knot(case):
     robot, schedule, traj = case
-    late = fflin.Trajectory(robot, traj.t + 100.0, traj.q, traj.v, traj.u, hold=traj.hold)
+    late = fflin.Trajectory(
+        robot, traj.t + 100.0, traj.q, traj.v, traj.u, hold=traj.hold
+    )
     moved = fflin.tvlqr(fflin.linearize_trajectory(robot, late))
     q0, v0 = beside(robot, traj, 0.02)
-    runs = [fflin.simulate(robot, each, q0=q0, v0=v0, linear=False) for each in (schedule, moved)]
+    runs = [
+        fflin.simulate(robot, each, q0=q0, v0=v0, linear=False)
+        for each in (schedule, moved)
+    ]
     np.testing.assert_allclose(runs[1].x, runs[0].x, atol=1e-9)
 
 
@@ -119,7 +128,9 @@ def test_thrusters_take_what_a_schedule_asks_of_the_base():
     design = fflin.load("cubesat", inputs=[fflin.BaseTorque(), fflin.BaseForce()])
     traj = swung(design, size=1e-4, spin=0.02).trajectory()
     schedule = fflin.tvlqr(fflin.linearize_trajectory(design, traj))
-    places = [(x, y, z) for x in (-0.05, 0.05) for y in (-0.05, 0.05) for z in (-0.15, 0.15)]
+    places = [
+        (x, y, z) for x in (-0.05, 0.05) for y in (-0.05, 0.05) for z in (-0.15, 0.15)
+    ]
     thrusters = [
         fflin.Thruster("base", place, -np.sign(place[axis]) * np.eye(3)[axis])
         for place in places
@@ -167,7 +178,9 @@ def test_a_schedule_of_another_robot_is_refused(case):
 
 def test_where_nothing_holds_the_robot_a_run_ends_with_its_trajectory():
     robot = fflin.load(
-        "planar_detumble", gravity=(0.0, 0.0, -9.81), inputs=[fflin.JointTorque("joint_1")]
+        "planar_detumble",
+        gravity=(0.0, 0.0, -9.81),
+        inputs=[fflin.JointTorque("joint_1")],
     )
     t = np.linspace(0.0, 0.4, 9)
     fall = fflin.simulate(robot, duration=0.4, dt=0.01, every=5, frame="local")
@@ -209,14 +222,17 @@ def test_a_loop_of_ten_seconds_comes_back_to_a_hundredth_of_a_degree():
 
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("sample", [None, 0.1])
-def test_after_the_end_the_regulator_about_rest_acts_whatever_the_weight_at_the_end(sample):
+def test_after_the_end_the_regulator_about_rest_acts_whatever_the_weight_at_the_end(
+    sample,
+):
     robot = fflin.load("planar_detumble")
     traj = swung(robot, size=0.3).trajectory()
     along = fflin.linearize_trajectory(robot, traj)
     heavy = fflin.tvlqr(along, 10.0, 0.05, 1e4, sample=sample)
     steady = fflin.tvlqr(along, 10.0, 0.05, "steady", sample=sample)
     ends = [
-        fflin.TrajectoryFeedback(along, each).gain(traj.t[-1] + 1.0) for each in (heavy, steady)
+        fflin.TrajectoryFeedback(along, each).gain(traj.t[-1] + 1.0)
+        for each in (heavy, steady)
     ]
     np.testing.assert_array_equal(*ends)
     if sample is None:
@@ -231,20 +247,26 @@ def test_after_the_end_the_regulator_about_rest_acts_whatever_the_weight_at_the_
 def test_the_last_step_ends_on_the_trajectory_whatever_its_time_is_rounded_to():
     robot = fflin.load("planar_detumble")
     traj = swung(robot, 1.0, size=0.3, spin=0.02).trajectory()
-    policy = fflin.TrajectoryFeedback(traj, fflin.tvlqr(fflin.linearize_trajectory(robot, traj)))
+    policy = fflin.TrajectoryFeedback(
+        traj, fflin.tvlqr(fflin.linearize_trajectory(robot, traj))
+    )
     late = np.nextafter(policy.duration, np.inf)
     for t in (policy.duration, late):
         np.testing.assert_array_equal(policy.reference(t)[1], traj.point(traj.t[-1])[1])
     assert not policy.reference(policy.duration + 1e-6)[1].any()
 
 
-@pytest.mark.parametrize("engine", ["python", pytest.param("compiled", marks=pytest.mark.compiled)])
+@pytest.mark.parametrize(
+    "engine", ["python", pytest.param("compiled", marks=pytest.mark.compiled)]
+)
 @pytest.mark.parametrize("how", ["schedule", "option"])
 def test_at_the_very_end_held_inputs_are_those_of_rest(engine, how):
     """The last input of a motion brakes: held on for a sample it kicks the robot out of rest."""
     robot = fflin.load("planar_detumble")
     start = fflin.velocity(robot, {"omega_b.y": 0.02})
-    brake = np.linalg.lstsq(fflin.linearize(robot).B[9:], -start[[3, 4, 5, 0, 1, 2, 6, 7, 8]])[0]
+    brake = np.linalg.lstsq(
+        fflin.linearize(robot).B[9:], -start[[3, 4, 5, 0, 1, 2, 6, 7, 8]]
+    )[0]
     run = fflin.simulate(
         robot,
         lambda t, q, v: brake,
@@ -258,15 +280,21 @@ def test_at_the_very_end_held_inputs_are_those_of_rest(engine, how):
     traj = run.trajectory()
     assert np.abs(traj.v[-1]).max() < 0.1 * np.abs(start).max()
     sample = 0.1 if how == "schedule" else None
-    schedule = fflin.tvlqr(fflin.linearize_trajectory(robot, traj), 1.0, 1e3, sample=sample)
+    schedule = fflin.tvlqr(
+        fflin.linearize_trajectory(robot, traj), 1.0, 1e3, sample=sample
+    )
     option = {"sample": 0.1} if how == "option" else {}
-    flown = fflin.simulate(robot, schedule, duration=3.0, dt=0.01, engine=engine, **option)
+    flown = fflin.simulate(
+        robot, schedule, duration=3.0, dt=0.01, engine=engine, **option
+    )
     at = np.searchsorted(flown.t, 1.0 - 1e-9)
     assert np.abs(flown.u[at - 1]).max() > 0.5 * np.abs(brake).max()
     assert np.abs(flown.u[at]).max() < 0.1 * np.abs(brake).max()
 
 
-@pytest.mark.parametrize("engine", ["python", pytest.param("compiled", marks=pytest.mark.compiled)])
+@pytest.mark.parametrize(
+    "engine", ["python", pytest.param("compiled", marks=pytest.mark.compiled)]
+)
 def test_inputs_that_jump_at_knots_are_followed_to_the_integrators_order(engine):
     robot = fflin.load("ets_vii")
     u = 0.5 * np.random.default_rng(6).normal(size=(5, 12))
@@ -279,7 +307,9 @@ def test_inputs_that_jump_at_knots_are_followed_to_the_integrators_order(engine)
         every=40,
         **options,
     )
-    schedule = fflin.tvlqr(fflin.linearize_trajectory(robot, held.trajectory()), 1.0, 1.0, 1.0)
+    schedule = fflin.tvlqr(
+        fflin.linearize_trajectory(robot, held.trajectory()), 1.0, 1.0, 1.0
+    )
     errors = []
     for dt in (0.04, 0.02):
         run = fflin.simulate(
@@ -309,7 +339,9 @@ def test_a_run_of_just_the_trajectorys_length_needs_no_rest(first):
     t = np.linspace(0.0, 0.7, 8)
     fall = fflin.simulate(robot, duration=0.7, dt=0.01, every=10, frame="local")
     traj = fflin.Trajectory(robot, first + t, fall.q, fall.v, fall.u)
-    schedule = fflin.tvlqr(fflin.linearize_trajectory(robot, traj), 1.0, 1.0, 1.0, sample=0.07)
+    schedule = fflin.tvlqr(
+        fflin.linearize_trajectory(robot, traj), 1.0, 1.0, 1.0, sample=0.07
+    )
     for dt in (0.07, 0.01):
         run = fflin.simulate(robot, schedule, dt=dt)
         assert np.abs(run.error).max() < 1e-4
@@ -318,11 +350,15 @@ def test_a_run_of_just_the_trajectorys_length_needs_no_rest(first):
 @pytest.mark.parametrize(
     ("sample", "degrees"), [(0.2, 0.1), *exhaustive((0.05, 0.01), (0.1, 0.02))]
 )
-def test_default_gains_of_samples_bring_errors_to_nothing_within_a_trajectory(sample, degrees):
+def test_default_gains_of_samples_bring_errors_to_nothing_within_a_trajectory(
+    sample, degrees
+):
     robot = fflin.load("planar_detumble")
     traj = swung(robot, 6.0, size=0.5).trajectory().resampled(0.1)
     schedule = fflin.tvlqr(fflin.linearize_trajectory(robot, traj), sample=sample)
-    offset = np.r_[0.0, 0.0, 0.0, 0.0, np.radians(1.0), 0.0, np.full(3, np.radians(3.0))]
+    offset = np.r_[
+        0.0, 0.0, 0.0, 0.0, np.radians(1.0), 0.0, np.full(3, np.radians(3.0))
+    ]
     q0 = pin.integrate(robot.model, traj.q[0], offset)
     run = fflin.simulate(robot, schedule, q0=q0, v0=traj.v[0], linear=False)
     assert run.attitude_error[0] == pytest.approx(1.0)
@@ -333,7 +369,9 @@ def test_a_start_beside_a_trajectory_is_off_by_what_is_asked(case):
     robot, schedule, traj = case
     policy = fflin.TrajectoryFeedback(traj, schedule)
     state = fflin.StateMap(robot, frame="local")
-    q, v = policy.beside({"yaw": 90.0, "q_m": 0.1, "q_m.joint_2": 0.2, "omega_b.y": 0.3})
+    q, v = policy.beside(
+        {"yaw": 90.0, "q_m": 0.1, "q_m.joint_2": 0.2, "omega_b.y": 0.3}
+    )
     e = moving_error(state, traj.q[0], traj.v[0], q, v)
     expected = np.zeros(state.nx)
     expected[2], expected[6 : 6 + robot.n], expected[7] = np.sqrt(0.5), 0.1, 0.2

@@ -9,12 +9,17 @@ import pytest
 from tests.support.patience import STALL
 
 ARGUMENTS = (
-    *("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"),
+    *(
+        "--use-angle=swiftshader",
+        "--enable-unsafe-swiftshader",
+        "--ignore-gpu-blocklist",
+    ),
     *("--disable-background-networking", "--disable-quic", "--no-first-run"),
     *("--disable-component-update", "--disable-sync", "--disable-dev-shm-usage"),
 )
 
-FRAMES = 1800  # that a page may take for what is waited for: half a minute, if nothing else runs
+# that a page may take for what is waited for: half a minute, if nothing else runs
+FRAMES = 1800
 
 # Without a graphics card pixels cost much more than all else: WebGL draws only while it should.
 PAINT = """
@@ -33,7 +38,9 @@ def chromium():
 
     Until it is closed this thread counts as one whose event loop runs: `asyncio.run` needs another.
     """
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    playwright = pytest.importorskip(
+        "playwright.sync_api", reason="playwright is not installed"
+    )
     program = shutil.which("chromium") or shutil.which("google-chrome")
     if program is None:
         pytest.skip("no chromium; apt install chromium")
@@ -54,7 +61,12 @@ class Watched:
     """
 
     def __init__(
-        self, browser, url, size=(800, 600), ready="window.fflin && fflin.ready", painted=False
+        self,
+        browser,
+        url,
+        size=(800, 600),
+        ready="window.fflin && fflin.ready",
+        painted=False,
     ):
         self.said, self.errors, self.requests = [], [], []
         self.page = browser.new_page(viewport={"width": size[0], "height": size[1]})
@@ -77,7 +89,8 @@ class Watched:
 
     def _console(self, message):
         self.said.append(message.text)
-        advice = message.text.startswith("Canvas2D: Multiple readback")  # the tests read them
+        # the tests read them
+        advice = message.text.startswith("Canvas2D: Multiple readback")
         if message.type in ("error", "warning") and not advice:
             self.errors.append(message.text)
 
@@ -101,7 +114,9 @@ class Watched:
                 look();
             }})"""
         )
-        assert held, f"{FRAMES} frames did not bring {expression}; the page said {self.said}"
+        assert held, (
+            f"{FRAMES} frames did not bring {expression}; the page said {self.said}"
+        )
 
     def do(self, expression):
         """Evaluate JavaScript."""
@@ -121,7 +136,9 @@ class Watched:
     def pose(self, path):
         """Return position and quaternion of a node of meshcat's scene."""
         node = f"viewer.scene_tree.find({list(path)!r}).object"
-        return self.do(f"[...{node}.position.toArray(), ...{node}.quaternion.toArray()]")
+        return self.do(
+            f"[...{node}.position.toArray(), ...{node}.quaternion.toArray()]"
+        )
 
     def picture(self):
         """Return what is on the screen, (height, width, 3), without the panels."""

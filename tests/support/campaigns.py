@@ -16,11 +16,16 @@ def both(robot, policy, given, runs=3, tolerance=1e-10, **options):
     """Hold the runs of eight lanes against those in Python; return those of the lanes."""
     pytest.importorskip("numba")
     options = {"duration": 3.0, "dt": 0.01} | options
-    jobs = [CampaignJob(robot, policy, given, 5, name, options) for name in ("python", "compiled")]
+    jobs = [
+        CampaignJob(robot, policy, given, 5, name, options)
+        for name in ("python", "compiled")
+    ]
     drawn = jobs[0].dispersions.drawn(0, runs)
     python, lanes = (flown(job, drawn) for job in jobs)
     for name in jobs[0].shapes:
-        size = np.maximum(1.0, np.where(np.isfinite(python[name]), np.abs(python[name]), 1.0))
+        size = np.maximum(
+            1.0, np.where(np.isfinite(python[name]), np.abs(python[name]), 1.0)
+        )
         assert np.array_equal(np.isinf(python[name]), np.isinf(lanes[name])), name
         with np.errstate(invalid="ignore"):
             apart = np.nan_to_num(lanes[name] - python[name], nan=0.0)

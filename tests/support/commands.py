@@ -27,11 +27,15 @@ def warned(*arguments, cwd=None):
     code, _, complained = _called(arguments, cwd, {})
     assert code == 0, complained
     start = "fflin: warning: "
-    return {x.removeprefix(start) for x in complained.splitlines() if x.startswith(start)}
+    return {
+        x.removeprefix(start) for x in complained.splitlines() if x.startswith(start)
+    }
 
 
 def _called(arguments, cwd, environment):
-    out, err = (io.TextIOWrapper(io.BytesIO(), "utf-8", write_through=True) for _ in range(2))
+    out, err = (
+        io.TextIOWrapper(io.BytesIO(), "utf-8", write_through=True) for _ in range(2)
+    )
     with (
         mock.patch.dict(os.environ, environment),
         _inside(cwd),
@@ -70,7 +74,9 @@ def refused(*arguments, cwd=None):
     """Run what must be refused: exit 2, nothing on stdout, one line on stderr, which it returns."""
     code, out, err = run(*arguments, cwd=cwd)
     assert code == 2 and not out
-    assert err.startswith("fflin: error: ") and err.count("\n") == 1 and err.endswith("\n")
+    assert (
+        err.startswith("fflin: error: ") and err.count("\n") == 1 and err.endswith("\n")
+    )
     return err
 
 

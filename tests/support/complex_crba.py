@@ -13,7 +13,9 @@ def spatial(parameters):
     """Return the spatial inertia (6, 6), linear first, of dynamic parameters (10,)."""
     m, first = parameters[0], parameters[1:4]
     xx, xy, yy, xz, yz, zz = parameters[4:]
-    C = np.array([[0, -first[2], first[1]], [first[2], 0, -first[0]], [-first[1], first[0], 0]])
+    C = np.array(
+        [[0, -first[2], first[1]], [first[2], 0, -first[0]], [-first[1], first[0], 0]]
+    )
     about = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     return np.block([[m * np.eye(3), -C], [C, about]])
 

@@ -42,9 +42,13 @@ def case(seed, robots):
     stiffness = some(rng.choice([0.0, 0.3, 0.6, 1.0]), 0.0, 3.0)
     damping = some(rng.choice([0.0, 0.3, 0.6, 1.0]), -1.0, 1.5)
     share = rng.choice([0.3, 0.6, 1.0])
-    driven = [j for j in robot.joint_names if rng.random() < share] or list(robot.joint_names[:1])
+    driven = [j for j in robot.joint_names if rng.random() < share] or list(
+        robot.joint_names[:1]
+    )
     base = [kind() for kind in (BaseTorque, BaseForce) if rng.random() < 0.25]
-    seen = [j for j in robot.joint_names if rng.random() < share] or list(robot.joint_names[-1:])
+    seen = [j for j in robot.joint_names if rng.random() < share] or list(
+        robot.joint_names[-1:]
+    )
     kind = (JointPositions, JointVelocities)[int(rng.integers(2))]
     chosen = robot.replace(
         inputs=[*base, *(JointTorque(j) for j in driven)],
@@ -125,7 +129,9 @@ def main():
             decided = decisions(lin.discretize(dt) if dt else lin)
             if arguments.exact:
                 true = truth(lin, K, D)
-                decided["wrong"] = {k: [decided[k], v] for k, v in true.items() if decided[k] != v}
+                decided["wrong"] = {
+                    k: [decided[k], v] for k, v in true.items() if decided[k] != v
+                }
             found[f"{seed} {lin.robot} {dt:g}"] = decided
     print(json.dumps(found))
 

@@ -36,5 +36,9 @@ def write(heard):
 def _replace(k, kind, sentence):
     text = PAGE.read_text(encoding="utf-8")
     row = list(ROW.finditer(text))[k]
-    words = re.sub(r"[|<]", r"\\\g<0>", textwrap.shorten(sentence, LONGEST, placeholder=" ..."))
-    PAGE.write_text(text[: row.start()] + f"| `{kind}`: {words} | " + text[row.end() :], "utf-8")
+    words = re.sub(
+        r"[|<]", r"\\\g<0>", textwrap.shorten(sentence, LONGEST, placeholder=" ...")
+    )
+    PAGE.write_text(
+        text[: row.start()] + f"| `{kind}`: {words} | " + text[row.end() :], "utf-8"
+    )

@@ -20,7 +20,9 @@ def modular(matrix):
         return exact.numerator * pow(exact.denominator, -1, PRIME) % PRIME
 
     matrix = np.asarray(matrix)
-    return np.array([residue(x) for x in matrix.ravel()], dtype=np.int64).reshape(matrix.shape)
+    return np.array([residue(x) for x in matrix.ravel()], dtype=np.int64).reshape(
+        matrix.shape
+    )
 
 
 def product(a, b):
@@ -83,4 +85,6 @@ def observable(M, K, D, C):
 
 def rank(matrix):
     """Rank modulo the prime."""
-    return krylov_dimension(np.zeros((len(matrix), len(matrix)), dtype=np.int64), modular(matrix))
+    return krylov_dimension(
+        np.zeros((len(matrix), len(matrix)), dtype=np.int64), modular(matrix)
+    )

@@ -26,7 +26,10 @@ def assert_legible(figure):
     boxes = texts(figure)
     for i, (text, box) in enumerate(boxes):
         for other, at in boxes[:i]:
-            over = min(box.x1, at.x1) - max(box.x0, at.x0), min(box.y1, at.y1) - max(box.y0, at.y0)
+            over = (
+                min(box.x1, at.x1) - max(box.x0, at.x0),
+                min(box.y1, at.y1) - max(box.y0, at.y0),
+            )
             # Half a pixel is what the extent of a letter is rounded by.
             assert min(over) <= 0.5, f"{text!r} lies on {other!r}"
         assert box.x0 >= -1.0 and box.x1 <= figure.bbox.x1 + 1.0, f"{text!r} is cut"

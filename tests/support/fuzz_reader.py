@@ -16,7 +16,20 @@ from tests.support.reader_corpus import CASES, REFUSE
 ROBOTS = Path(__file__).parents[2] / "robots"
 
 TOKENS = [
-    *(b"<", b">", b"/>", b"</", b'"', b"'", b"=", b"&", b"&amp;", b"&#0;", b"&#x10FFFF;", b"<!--"),
+    *(
+        b"<",
+        b">",
+        b"/>",
+        b"</",
+        b'"',
+        b"'",
+        b"=",
+        b"&",
+        b"&amp;",
+        b"&#0;",
+        b"&#x10FFFF;",
+        b"<!--",
+    ),
     *(
         b"-->",
         b"<![CDATA[",
@@ -28,10 +41,47 @@ TOKENS = [
         b"\xff\xfe",
         b"\xef\xbb\xbf",
     ),
-    *(b"\xc3", b"\xed\xa0\x80", b"\r", b"\n", b" ", b"nan", b"1e999", b"-", b"0", b".", b","),
-    *(b"<robot>", b"</robot>", b"<link", b"<joint", b"<inertial>", b"</inertial>", b"<mimic"),
-    *(b' name="', b' type="', b' link="', b' xyz="', b' value="', b"fixed", b"planar", b"floating"),
-    *(b"root_joint", b"universe", b"world", b"base", b"arm", b"hinge", b'encoding="utf-16"'),
+    *(
+        b"\xc3",
+        b"\xed\xa0\x80",
+        b"\r",
+        b"\n",
+        b" ",
+        b"nan",
+        b"1e999",
+        b"-",
+        b"0",
+        b".",
+        b",",
+    ),
+    *(
+        b"<robot>",
+        b"</robot>",
+        b"<link",
+        b"<joint",
+        b"<inertial>",
+        b"</inertial>",
+        b"<mimic",
+    ),
+    *(
+        b' name="',
+        b' type="',
+        b' link="',
+        b' xyz="',
+        b' value="',
+        b"fixed",
+        b"planar",
+        b"floating",
+    ),
+    *(
+        b"root_joint",
+        b"universe",
+        b"world",
+        b"base",
+        b"arm",
+        b"hinge",
+        b'encoding="utf-16"',
+    ),
 ]
 
 
@@ -87,7 +137,9 @@ def main(count: int, seed: int, folder: Path) -> None:
         except FflinError as error:
             text = str(error)
             if "\n" in text or not text.startswith(f"{path}:") or len(text) > 2_000:
-                raise AssertionError(f"not one line that names the file: {text!r}") from error
+                raise AssertionError(
+                    f"not one line that names the file: {text!r}"
+                ) from error
             accepted = False
         if time.process_time() - begin > 5.0:
             raise AssertionError("it took more than 5 s of the processor")

@@ -15,7 +15,9 @@ fflin.monte_carlo(robot, law, spread, runs=8, duration=0.02, dt=0.01, engine="co
 fflin.sweep(robot, [robot.neutral()])
 """,
 )
-_BEFORE = "import fflin; robot = fflin.load('planar_detumble'); lin = fflin.linearize(robot)"
+_BEFORE = (
+    "import fflin; robot = fflin.load('planar_detumble'); lin = fflin.linearize(robot)"
+)
 
 
 def wanted(selection: str) -> bool:
@@ -25,6 +27,10 @@ def wanted(selection: str) -> bool:
 
 def prepare() -> None:
     """Compile what is not on disk yet, and wait for it."""
-    started = [subprocess.Popen([sys.executable, "-c", _BEFORE + calls]) for calls in _CALLS]
+    started = [
+        subprocess.Popen([sys.executable, "-c", _BEFORE + calls]) for calls in _CALLS
+    ]
     for process in started:
-        assert process.wait() == 0, "the kernels were not compiled; the reason stands above"
+        assert process.wait() == 0, (
+            "the kernels were not compiled; the reason stands above"
+        )

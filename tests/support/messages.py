@@ -120,12 +120,16 @@ class Snapshot:
 
     def missing(self, heard):
         """Return the sentences whose template is not in the snapshot."""
-        return [sentence for sentence in heard if template(sentence) not in self.sentences]
+        return [
+            sentence for sentence in heard if template(sentence) not in self.sentences
+        ]
 
     def write(self, heard, whole):
         """Add sentences; if all tests were run (`whole`), also remove those that were not heard."""
         new = {template(sentence): sentence for sentence in heard}
-        kept = {key: said for key, said in self.sentences.items() if key in new or not whole}
+        kept = {
+            key: said for key, said in self.sentences.items() if key in new or not whole
+        }
         text = json.dumps(sorted((new | kept).values()), indent=1, ensure_ascii=False)
         self.path.write_text(text + "\n", encoding="utf-8")
 
@@ -160,15 +164,23 @@ class Messages:
     @pytest.hookimpl(optionalhook=True)
     def pytest_testnodedown(self, node):
         self.heard |= getattr(node, "workeroutput", {}).get("heard", {})
-        self.narrowed = self.narrowed or getattr(node, "workeroutput", {}).get("narrowed", True)
+        self.narrowed = self.narrowed or getattr(node, "workeroutput", {}).get(
+            "narrowed", True
+        )
 
     def pytest_sessionfinish(self, exitstatus):
         if hasattr(self.config, "workeroutput"):
             self.config.workeroutput |= {"heard": self.heard, "narrowed": self.narrowed}
         elif self.write:
-            default = self.config.getini("testpaths") or [str(self.config.invocation_params.dir)]
-            whole = exitstatus == 0 and not self.narrowed and self.config.args == default
-            self.snapshot.write([each for heard in self.heard.values() for each in heard], whole)
+            default = self.config.getini("testpaths") or [
+                str(self.config.invocation_params.dir)
+            ]
+            whole = (
+                exitstatus == 0 and not self.narrowed and self.config.args == default
+            )
+            self.snapshot.write(
+                [each for heard in self.heard.values() for each in heard], whole
+            )
             errors_page.write(self.heard)
 
 

@@ -37,7 +37,9 @@ def settling(robot, duration, *, reference=HOME, predicted=False):
         robot.follow(each)
     x = np.array([state.to_state(each, np.zeros(robot.nv)) for each in q])
     size = len(actuation.names)
-    strength = np.r_[-40, -15, 9, -20, 14, 3, rng.uniform(-5, 5, max(size - 6, 0))][:size]
+    strength = np.r_[-40, -15, 9, -20, 14, 3, rng.uniform(-5, 5, max(size - 6, 0))][
+        :size
+    ]
     u = np.outer(decay, strength)
     if "thrust" in actuation.groups:
         u = np.abs(u)

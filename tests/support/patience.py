@@ -15,7 +15,8 @@ import psutil
 
 STALL = 60.0  # [s] without progress after which a wait fails
 LIMIT = 300.0  # [s] of processor time after which a wait fails
-IDLE = 0.6  # [s] of processor time that is no progress: clocks have steps, and polling takes some
+# [s] of processor time that is no progress: clocks have steps, and polling takes some
+IDLE = 0.6
 
 
 class Family:
@@ -68,7 +69,9 @@ class Patience:
         if now - self._since > self._stall:
             return f"nothing happened for {self._stall:g} s, waiting for {self._what}"
         if taken - self._start > self._limit:
-            return f"{self._limit:g} s of processor time were not enough for {self._what}"
+            return (
+                f"{self._limit:g} s of processor time were not enough for {self._what}"
+            )
         return ""
 
 
@@ -127,13 +130,18 @@ def in_own_session(command, folder, *, stdout=subprocess.PIPE):
         yield process
 
 
-def finished(command, *, input=None, capture_output=False, check=False, watch=(), **options):
+def finished(
+    command, *, input=None, capture_output=False, check=False, watch=(), **options
+):
     """Run a command as `subprocess.run` does, and kill it when waiting for it is in vain."""
     if capture_output:
         options |= {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     if input is not None:
         options["stdin"] = subprocess.PIPE
-    with subprocess.Popen(command, **options) as process, finishing(process, **dict(watch)):
+    with (
+        subprocess.Popen(command, **options) as process,
+        finishing(process, **dict(watch)),
+    ):
         out, err = process.communicate(input)
     done = subprocess.CompletedProcess(command, process.returncode, out, err)
     if check:

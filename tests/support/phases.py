@@ -31,7 +31,9 @@ def regulated(robot, q, v, duration, **options):
             joint.place(target, 0.0)
     lin = fflin.linearize(robot, target)
     policy = fflin.StateFeedback(lin, fflin.lqr(lin).K)
-    return fflin.simulate(robot, policy, q0=q, v0=v, duration=duration, dt=0.02, **options)
+    return fflin.simulate(
+        robot, policy, q0=q, v0=v, duration=duration, dt=0.02, **options
+    )
 
 
 def phases(payload=DEBRIS, payload_v=TWIST):

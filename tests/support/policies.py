@@ -18,7 +18,11 @@ JETS = [
         (np.roll(place, axis), np.roll(way, axis), most)
         for axis in range(3)
         for place, way, most in (
-            *(((0.0, side, 0.0), (way, 0.0, 0.0), 0.5) for side in (-1.0, 1.0) for way in (-1, 1)),
+            *(
+                ((0.0, side, 0.0), (way, 0.0, 0.0), 0.5)
+                for side in (-1.0, 1.0)
+                for way in (-1, 1)
+            ),
             # The same again, and one that there is enough of.
             ((0.0, 1.0, 0.0), (1.0, 0.0, 0.0), None),
         )
@@ -54,7 +58,11 @@ def coarsened(made, *names):
 
 
 def motors(robot):
-    return [fflin.JointTorque(name) for name in robot.joint_names if name not in robot.passive]
+    return [
+        fflin.JointTorque(name)
+        for name in robot.joint_names
+        if name not in robot.passive
+    ]
 
 
 def plain(robot):
@@ -87,7 +95,11 @@ def between_gains(robot):
     gains = fflin.lqr_batch(batch, by.Q, by.R)
     # So that they differ more.
     sizes = 1.0 + 0.1 * np.arange(len(gains))[:, None, None]
-    return robot, fflin.ScheduledFeedback(lin, replace(gains, K=coarse(sizes * gains.K))), {}
+    return (
+        robot,
+        fflin.ScheduledFeedback(lin, replace(gains, K=coarse(sizes * gains.K))),
+        {},
+    )
 
 
 def compensated(robot, dt=SAMPLE):
@@ -110,7 +122,11 @@ def controlled(robot):
     lin = fflin.linearize(robot)
     by = fflin.lqg(fflin.lqr(lin), fflin.kalman(lin, 1e-3, 1e-2))
     damping = -0.05 * np.linalg.pinv(lin.B) @ np.linalg.pinv(lin.C)
-    return robot, fflin.LinearController((*map(coarse, (by.A, by.B, by.C, damping)),), lin), {}
+    return (
+        robot,
+        fflin.LinearController((*map(coarse, (by.A, by.B, by.C, damping)),), lin),
+        {},
+    )
 
 
 def controlled_in_samples(robot):
@@ -131,7 +147,9 @@ def path(robot):
         q = fflin.configuration(robot, {robot.joint_names[0]: -0.4})
         lin = fflin.linearize(robot, q)
         policy, x0[6] = fflin.StateFeedback(lin, coarse(fflin.lqr(lin).K)), 2.9
-    flown = fflin.simulate(robot, policy, x0=x0, duration=8.0, dt=SAMPLE, engine="python")
+    flown = fflin.simulate(
+        robot, policy, x0=x0, duration=8.0, dt=SAMPLE, engine="python"
+    )
     along = fflin.Trajectory(robot, flown.t, flown.q, flown.v, flown.u, frame="hybrid")
     start = {"x0": None, "q0": flown.q[3], "v0": flown.v[0], "linear": False}
     return fflin.linearize_trajectory(robot, along), start
@@ -149,7 +167,11 @@ def followed_outputs(robot):
     by = fflin.tvkalman(along, 1e-3, 1e-4, P0=1e-4, sample=SAMPLE)
     by = coarsened(by, "L", "P")
     size = len(by.output_names)
-    return robot, fflin.TrajectoryOutputFeedback(along, gains, by, lambda t: noise(t)[:size]), start
+    return (
+        robot,
+        fflin.TrajectoryOutputFeedback(along, gains, by, lambda t: noise(t)[:size]),
+        start,
+    )
 
 
 def shared(robot):

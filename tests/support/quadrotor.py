@@ -25,14 +25,19 @@ LINK = """<link name="LINK"><inertial><origin xyz="0 0 -0.1"/><mass value="0.1"/
   """
 
 ROTORS = [
-    fflin.Thruster("base", (x, y, 0.0), (0, 0, 1), f"rotor_{k + 1}", max=6.0, torque=K * sign)
+    fflin.Thruster(
+        "base", (x, y, 0.0), (0, 0, 1), f"rotor_{k + 1}", max=6.0, torque=K * sign
+    )
     for k, ((x, y), sign) in enumerate(zip(PLACES, SIGNS, strict=True))
 ]
 
 
 def quadrotor(folder, arm=True, **fields):
     """The robot in a folder, under gravity, with or without its arm."""
-    links = [("upper", "shoulder", "base", "-0.05"), ("lower", "elbow", "upper", "-0.2")]
+    links = [
+        ("upper", "shoulder", "base", "-0.05"),
+        ("lower", "elbow", "upper", "-0.2"),
+    ]
     text = ""
     for link, joint, parent, place in links if arm else ():
         part = LINK.replace("LINK", link).replace("JOINT", joint)
@@ -49,5 +54,7 @@ def canted(degrees):
     for k, ((x, y), sign) in enumerate(zip(PLACES, SIGNS, strict=True)):
         across = math.tan(math.radians(degrees)) * sign / REACH
         along = (-y * across, x * across, 1.0)
-        rotors.append(fflin.Thruster("base", (x, y, 0.0), along, f"rotor_{k + 1}", max=6.0))
+        rotors.append(
+            fflin.Thruster("base", (x, y, 0.0), along, f"rotor_{k + 1}", max=6.0)
+        )
     return [*rotors, fflin.JointTorque("*")]

@@ -57,8 +57,12 @@ def random_robot(rng):
         scales = dict(zip(robot.joint_names, inertia, strict=True))
         sprung = [name for name in names if rng.random() < 0.7]
         robot = robot.replace(
-            stiffness={name: scales[name] * 10.0 ** rng.uniform(-2, 2) for name in sprung},
-            damping={name: scales[name] * 10.0 ** rng.uniform(-3, 0) for name in sprung},
+            stiffness={
+                name: scales[name] * 10.0 ** rng.uniform(-2, 2) for name in sprung
+            },
+            damping={
+                name: scales[name] * 10.0 ** rng.uniform(-3, 0) for name in sprung
+            },
         )
     robot = _with_inputs(robot, links, rng)
     kind = rng.choice(["free", "gravity", "orbit"])
@@ -80,7 +84,9 @@ class Link(NamedTuple):
 
 def _links(rng):
     """Links with masses that differ by up to 1e5; the first one is the base."""
-    masses = 10.0 ** rng.uniform(0.0, 3.5) * 10.0 ** -rng.uniform(0.0, 5.0, rng.integers(1, 8))
+    masses = 10.0 ** rng.uniform(0.0, 3.5) * 10.0 ** -rng.uniform(
+        0.0, 5.0, rng.integers(1, 8)
+    )
     masses[0] = 1.2 * masses.max()
     links = []
     for k, mass in enumerate(masses):
@@ -118,7 +124,8 @@ def _urdf(links, rng):
         if kind != "continuous" and leaders and rng.random() < 0.15:
             ratio, offset = rng.normal(size=2).tolist()
             mimic = (
-                f'<mimic joint="{rng.choice(leaders)}" multiplier="{ratio!r}" offset="{offset!r}"/>'
+                f'<mimic joint="{rng.choice(leaders)}" '
+                f'multiplier="{ratio!r}" offset="{offset!r}"/>'
             )
         elif kind != "continuous":
             leaders.append(f"joint_{k}")
@@ -183,14 +190,20 @@ def _with_inputs(robot, links, rng):
         inputs += [fflin.BaseTorque(), fflin.BaseForce()]
     for k in range(rng.integers(0, 4)):
         link = links[rng.integers(len(links))].name
-        inputs.append(fflin.Thruster(link, rng.normal(size=3), rng.normal(size=3), f"thruster_{k}"))
+        inputs.append(
+            fflin.Thruster(
+                link, rng.normal(size=3), rng.normal(size=3), f"thruster_{k}"
+            )
+        )
     for k in range(rng.integers(0, 4)):
         link = links[rng.integers(len(links))]
         moment = float(np.linalg.eigvalsh(link.inertia)[0])
         axis = rng.normal(size=3)
         if rng.random() < 0.5:
             momentum = moment * rng.normal() * 10.0 ** rng.uniform(0.0, 2.0)
-            wheel = fflin.ReactionWheel(axis, link.name, momentum=momentum, name=f"wheel_{k}")
+            wheel = fflin.ReactionWheel(
+                axis, link.name, momentum=momentum, name=f"wheel_{k}"
+            )
         else:
             inertia = moment * 10.0 ** rng.uniform(-5.0, -1.5)
             wheel = fflin.ReactionWheel(axis, link.name, inertia, name=f"wheel_{k}")
@@ -200,16 +213,22 @@ def _with_inputs(robot, links, rng):
     inputs += [fflin.JointTorque(name) for name in joints if rng.random() < 0.8]
     try:
         return robot.replace(inputs=inputs or [fflin.BaseTorque()])
-    except fflin.InputError:  # the link with an appendage has less inertia than the wheel
+    except (
+        fflin.InputError
+    ):  # the link with an appendage has less inertia than the wheel
         return robot
 
 
 def _outputs(robot, links, rng):
     if rng.random() < 0.3:
         return [fflin.FullState()]
-    kinds = [kind for kind in SENSORS if not (robot.orbit and kind is fflin.Accelerometer)]
+    kinds = [
+        kind for kind in SENSORS if not (robot.orbit and kind is fflin.Accelerometer)
+    ]
     chosen = rng.permutation(len(links))[:2]
-    outputs = [kind(links[k].name) for k in chosen for kind in kinds if rng.random() < 0.7]
+    outputs = [
+        kind(links[k].name) for k in chosen for kind in kinds if rng.random() < 0.7
+    ]
     if len(links) > 2 and rng.random() < 0.5:
         outputs.append(fflin.RelativePose(links[-1].name, links[-2].name))
     if rng.random() < 0.5:
@@ -224,7 +243,9 @@ def _outputs(robot, links, rng):
 def _point(robot, rng):
     """A random q, v and u of a robot; each part is at rest in some of the points."""
     # Modes move their masses by up to about 0.3 rad or 0.3 m.
-    spans = np.array([0.3 / joint.scale if joint.mode else 2.5 for joint in robot.joints])
+    spans = np.array(
+        [0.3 / joint.scale if joint.mode else 2.5 for joint in robot.joints]
+    )
     values = spans * rng.uniform(-1.0, 1.0, robot.n)
     joints = dict(zip(robot.joint_names, values, strict=True))
     if rng.random() < 0.2:

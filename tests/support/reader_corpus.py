@@ -63,7 +63,11 @@ def moments(ixx=1, ixy=0, ixz=0, iyy=1, iyz=0, izz=1):
 
 def arm(*, child=None, kind="revolute", inside=AXIS + LIMIT, more="", **keywords):
     """Build a base with one arm on a joint named "hinge"."""
-    parts = (link("base"), child or link("arm"), joint("hinge", "base", "arm", kind, inside))
+    parts = (
+        link("base"),
+        child or link("arm"),
+        joint("hinge", "base", "arm", kind, inside),
+    )
     return robot(*parts, more, **keywords)
 
 
@@ -73,14 +77,18 @@ def three(first="", second="", third=""):
     ends = (("base", "a"), ("a", "b"), ("b", "c"))
     joints = [
         joint(f"j{k}", *pair, inside=AXIS + inside)
-        for k, (pair, inside) in enumerate(zip(ends, (first, second, third), strict=True), 1)
+        for k, (pair, inside) in enumerate(
+            zip(ends, (first, second, third), strict=True), 1
+        )
     ]
     return robot(*links, *joints)
 
 
 def chain(number, kind):
     links = [link(f"l{k}") for k in range(number)]
-    return robot(*links, *(joint(f"j{k}", f"l{k}", f"l{k + 1}", kind) for k in range(number - 1)))
+    return robot(
+        *links, *(joint(f"j{k}", f"l{k}", f"l{k + 1}", kind) for k in range(number - 1))
+    )
 
 
 # --- Numbers -------------------------------------------------------------------------------------
@@ -102,14 +110,39 @@ BAD_NUMBERS = {
     "expression": "1+1",
 }
 for title, text in BAD_NUMBERS.items():
-    refuse(f"mass: {title}", arm(child=inertial(text)), ":3:", f"'{text}'", "link 'arm'", "finite")
+    refuse(
+        f"mass: {title}",
+        arm(child=inertial(text)),
+        ":3:",
+        f"'{text}'",
+        "link 'arm'",
+        "finite",
+    )
 for entry in ("ixx", "ixy", "izz"):
-    refuse(f"{entry} nan", arm(child=inertial("1", moments(**{entry: "nan"}))), ":3:", entry)
+    refuse(
+        f"{entry} nan",
+        arm(child=inertial("1", moments(**{entry: "nan"}))),
+        ":3:",
+        entry,
+    )
 for attribute in ("damping", "friction"):
     inside = AXIS + f'<dynamics {attribute}="1,5"/>'
-    refuse(f"{attribute} with comma", arm(inside=inside), ":4:", attribute, "'hinge'", "'1,5'")
+    refuse(
+        f"{attribute} with comma",
+        arm(inside=inside),
+        ":4:",
+        attribute,
+        "'hinge'",
+        "'1,5'",
+    )
     inside = AXIS + f'<dynamics {attribute}=""/>'
-    refuse(f"{attribute} empty", arm(inside=inside), ":4:", f"empty '{attribute}'", "'hinge'")
+    refuse(
+        f"{attribute} empty",
+        arm(inside=inside),
+        ":4:",
+        f"empty '{attribute}'",
+        "'hinge'",
+    )
 for attribute, texts in {
     "lower": ("1,5", "", "nan", "inf", "1e999"),
     "upper": ("1,5", "", "nan", "-inf"),
@@ -118,10 +151,20 @@ for attribute, texts in {
 }.items():
     for text in texts:
         inside = AXIS + f'<limit {attribute}="{text}"/>'
-        warn(f"{attribute} of '{text}'", arm(inside=inside), ":4:", attribute, "'hinge'", "lim")
+        warn(
+            f"{attribute} of '{text}'",
+            arm(inside=inside),
+            ":4:",
+            attribute,
+            "'hinge'",
+            "lim",
+        )
 accept(
     "infinite limits",
-    arm(inside=AXIS + '<limit lower="-inf" upper="INF" effort="+inf" velocity="Infinity"/>'),
+    arm(
+        inside=AXIS
+        + '<limit lower="-inf" upper="INF" effort="+inf" velocity="Infinity"/>'
+    ),
 )
 warn(
     "limits in the wrong order",
@@ -139,22 +182,69 @@ for title, text, words in (
     ("empty", "", "empty"),
     ("words", "left of it", "'left'"),
 ):
-    refuse(f"xyz: {title}", arm(inside=f'{AXIS}<origin xyz="{text}"/>'), ":4:", words, "'hinge'")
-    refuse(f"rpy: {title}", arm(inside=f'{AXIS}<origin rpy="{text}"/>'), ":4:", words, "rpy")
-    refuse(f"axis: {title}", arm(inside=f'<axis xyz="{text}"/>'), ":4:", words, "<axis>")
-refuse("com of two entries", arm(child=inertial(origin='<origin xyz="0 0"/>')), ":3:", "'arm'")
+    refuse(
+        f"xyz: {title}",
+        arm(inside=f'{AXIS}<origin xyz="{text}"/>'),
+        ":4:",
+        words,
+        "'hinge'",
+    )
+    refuse(
+        f"rpy: {title}",
+        arm(inside=f'{AXIS}<origin rpy="{text}"/>'),
+        ":4:",
+        words,
+        "rpy",
+    )
+    refuse(
+        f"axis: {title}", arm(inside=f'<axis xyz="{text}"/>'), ":4:", words, "<axis>"
+    )
+refuse(
+    "com of two entries",
+    arm(child=inertial(origin='<origin xyz="0 0"/>')),
+    ":3:",
+    "'arm'",
+)
 refuse("rpy beyond anything", arm(inside=f'{AXIS}<origin rpy="1e40 0 0"/>'), "'hinge'")
-refuse("xyz of 1e29", arm(inside=f'{AXIS}<origin xyz="0 -1e29 0"/>'), ":4:", "'hinge'", "1e+07 m")
-refuse("xyz of 1e8", arm(inside=f'{AXIS}<origin xyz="1e8 0 0"/>'), ":4:", "'hinge'", "1e+08 m")
+refuse(
+    "xyz of 1e29",
+    arm(inside=f'{AXIS}<origin xyz="0 -1e29 0"/>'),
+    ":4:",
+    "'hinge'",
+    "1e+07 m",
+)
+refuse(
+    "xyz of 1e8",
+    arm(inside=f'{AXIS}<origin xyz="1e8 0 0"/>'),
+    ":4:",
+    "'hinge'",
+    "1e+08 m",
+)
 accept("xyz of 1e7", arm(inside=f'{AXIS}<origin xyz="1e7 0 0"/>'))
-refuse("com of 1e29", arm(child=inertial(origin='<origin xyz="1e29 0 0"/>')), ":3:", "'arm'", "m;")
+refuse(
+    "com of 1e29",
+    arm(child=inertial(origin='<origin xyz="1e29 0 0"/>')),
+    ":3:",
+    "'arm'",
+    "m;",
+)
 refuse("mass beyond anything", arm(child=inertial("1e40")), "'arm'")
-accept("numbers in every form", arm(child=inertial("+1.", moments(".5", "-0", "0e5", "5E-1"))))
-accept("spaces around numbers", arm(inside='<axis xyz="  0\t0\n1 "/>', child=inertial(" 1 ")))
+accept(
+    "numbers in every form",
+    arm(child=inertial("+1.", moments(".5", "-0", "0e5", "5E-1"))),
+)
+accept(
+    "spaces around numbers",
+    arm(inside='<axis xyz="  0\t0\n1 "/>', child=inertial(" 1 ")),
+)
 
 # --- Inertias ------------------------------------------------------------------------------------
 
-refuse("inertial without mass", arm(child=link("arm", f"<inertial>{INERTIA}</inertial>")), "<mass>")
+refuse(
+    "inertial without mass",
+    arm(child=link("arm", f"<inertial>{INERTIA}</inertial>")),
+    "<mass>",
+)
 refuse(
     "inertial without inertia",
     arm(child=link("arm", '<inertial><mass value="1"/></inertial>')),
@@ -162,7 +252,9 @@ refuse(
     "<inertia>",
 )
 refuse(
-    "mass without value", arm(child=link("arm", f"<inertial><mass/>{INERTIA}</inertial>")), "val"
+    "mass without value",
+    arm(child=link("arm", f"<inertial><mass/>{INERTIA}</inertial>")),
+    "val",
 )
 refuse(
     "mass as text",
@@ -177,44 +269,88 @@ refuse(
 )
 refuse("negative mass", arm(child=inertial("-1")), ":3:", "-1 kg", "0 or more")
 refuse(
-    "negative mass of the root", robot(link("base", INERTIAL.replace('"1"', '"-1"', 1))), "'base'"
+    "negative mass of the root",
+    robot(link("base", INERTIAL.replace('"1"', '"-1"', 1))),
+    "'base'",
 )
-refuse("negative moment", arm(child=inertial("1", moments(izz=-1))), ":3:", "'arm'", "-1")
-refuse("all moments negative", arm(child=inertial("1", moments(-1, 0, 0, -1, 0, -1))), "0 or more")
-refuse("products too large", arm(child=inertial("1", moments(ixy=2))), "'arm'", "principal")
+refuse(
+    "negative moment", arm(child=inertial("1", moments(izz=-1))), ":3:", "'arm'", "-1"
+)
+refuse(
+    "all moments negative",
+    arm(child=inertial("1", moments(-1, 0, 0, -1, 0, -1))),
+    "0 or more",
+)
+refuse(
+    "products too large", arm(child=inertial("1", moments(ixy=2))), "'arm'", "principal"
+)
 refuse(
     "negative moment of a link that is welded to another",
     arm(child=inertial("1", moments(izz=-0.5)), kind="fixed"),
     "'arm'",
     "0 or more",
 )
-refuse("negative moment without mass", arm(child=inertial("0", moments(izz=-1))), "0 or more")
-refuse("two inertial", arm(child=link("arm", INERTIAL * 2)), "second <inertial>", "'arm'", "line 3")
+refuse(
+    "negative moment without mass",
+    arm(child=inertial("0", moments(izz=-1))),
+    "0 or more",
+)
+refuse(
+    "two inertial",
+    arm(child=link("arm", INERTIAL * 2)),
+    "second <inertial>",
+    "'arm'",
+    "line 3",
+)
 refuse(
     "two mass",
-    arm(child=link("arm", f'<inertial><mass value="1"/><mass value="2"/>{INERTIA}</inertial>')),
+    arm(
+        child=link(
+            "arm", f'<inertial><mass value="1"/><mass value="2"/>{INERTIA}</inertial>'
+        )
+    ),
     "second <mass>",
 )
 refuse("two inertia", arm(child=inertial("1", INERTIA * 2)), "second <inertia>")
-refuse("two origins of an inertial", arm(child=inertial(origin="<origin/>" * 2)), "second <origin>")
-refuse("mass outside of inertial", arm(child=link("arm", '<mass value="1"/>')), "<inertial>")
+refuse(
+    "two origins of an inertial",
+    arm(child=inertial(origin="<origin/>" * 2)),
+    "second <origin>",
+)
+refuse(
+    "mass outside of inertial",
+    arm(child=link("arm", '<mass value="1"/>')),
+    "<inertial>",
+)
 refuse("inertia outside of inertial", arm(child=link("arm", INERTIA)), "<inertial>")
 refuse(
-    "Inertial in capitals", arm(child=link("arm", INERTIAL.replace("inertial", "Inertial"))), "mean"
+    "Inertial in capitals",
+    arm(child=link("arm", INERTIAL.replace("inertial", "Inertial"))),
+    "mean",
 )
-refuse("intertial", arm(child=link("arm", INERTIAL.replace("inertial", "intertial"))), "<inertial>")
+refuse(
+    "intertial",
+    arm(child=link("arm", INERTIAL.replace("inertial", "intertial"))),
+    "<inertial>",
+)
 warn("unit of a mass", arm(child=inertial('1" unit="kg')), ":3:", "'unit'", "<mass>")
 refuse("mass misspelt", arm(child=inertial('1" vaule="2')), ":3:", "'vaule'", "<mass>")
-warn("triangle inequality", arm(child=inertial("1", moments(izz=3))), "'arm'", "inertia")
+warn(
+    "triangle inequality", arm(child=inertial("1", moments(izz=3))), "'arm'", "inertia"
+)
 warn("inertia without mass", arm(child=inertial("0")), "'arm'", "mass")
 warn(
     "tiny negative moment of a link that is welded to another",
-    arm(child=inertial("1e-6", moments("2e-8", "6e-8", 0, "3e-8", 0, "4e-8")), kind="fixed"),
+    arm(
+        child=inertial("1e-6", moments("2e-8", "6e-8", 0, "3e-8", 0, "4e-8")),
+        kind="fixed",
+    ),
     "'arm'",
     "negative",
 )
 accept(
-    "a flat plate in three digits", arm(child=inertial("1", moments(0.333, 0, 0, 0.333, 0, 0.6664)))
+    "a flat plate in three digits",
+    arm(child=inertial("1", moments(0.333, 0, 0, 0.333, 0, 0.6664))),
 )
 accept("a rod", arm(child=inertial("1", moments(ixx=0))))
 accept(
@@ -224,7 +360,9 @@ accept(
 warn(
     "rounding for an inertia",
     robot(
-        link("a"), inertial("1", moments("-1e-20", 0, 0, 0, 0, 0)), joint("j", "a", "arm", "fixed")
+        link("a"),
+        inertial("1", moments("-1e-20", 0, 0, 0, 0, 0)),
+        joint("j", "a", "arm", "fixed"),
     ),
     "'arm'",
     "inertia",
@@ -236,9 +374,16 @@ refuse(
     "mass",
 )
 refuse("massless leaf", arm(child=link("arm", "")), "'hinge'", "mass")
-refuse("massless leaf with zeros", arm(child=inertial("0", moments(0, 0, 0, 0, 0, 0))), "'hinge'")
+refuse(
+    "massless leaf with zeros",
+    arm(child=inertial("0", moments(0, 0, 0, 0, 0, 0))),
+    "'hinge'",
+)
 refuse("massless robot", robot(link("base", "")), "the base", "mass")
-accept("massless root", robot(link("root", ""), link("base"), joint("j", "root", "base", "fixed")))
+accept(
+    "massless root",
+    robot(link("root", ""), link("base"), joint("j", "root", "base", "fixed")),
+)
 accept(
     "massless link amid a chain",
     robot(
@@ -249,7 +394,10 @@ accept(
         joint("k", "b", "c", inside='<axis xyz="1 0 0"/>'),
     ),
 )
-accept("massless flange", arm(more=link("tool", "") + joint("weld", "arm", "tool", "fixed", "")))
+accept(
+    "massless flange",
+    arm(more=link("tool", "") + joint("weld", "arm", "tool", "fixed", "")),
+)
 
 # --- The document --------------------------------------------------------------------------------
 
@@ -262,32 +410,57 @@ refuse("plain text", "A robot with an arm.", ":1:", "well-formed")
 refuse("JSON", '{"robot": {}}', "well-formed")
 refuse("cut off", arm()[:-30], "well-formed")
 refuse("cut off in a tag", arm()[:60], "well-formed")
-refuse("end tags crossed", "<robot name='r'><link name='a'></robot></link>", "mismatched tag")
 refuse(
-    "attribute twice", '<robot name="r"><link name="a" name="b"/></robot>', "duplicate attribute"
+    "end tags crossed",
+    "<robot name='r'><link name='a'></robot></link>",
+    "mismatched tag",
 )
-refuse("attribute unquoted", "<robot name=r><link name='a'/></robot>", ":1:", "well-formed")
+refuse(
+    "attribute twice",
+    '<robot name="r"><link name="a" name="b"/></robot>',
+    "duplicate attribute",
+)
+refuse(
+    "attribute unquoted", "<robot name=r><link name='a'/></robot>", ":1:", "well-formed"
+)
 refuse("two robots", arm() + arm(), ":7:", "document element")
 refuse("text after the robot", arm() + "done", "document element")
 refuse("robot in robot", robot(link("base"), robot(link("arm"))), ":3:", "<robot>")
 refuse("another root", "<model name='r'><link name='a'/></model>", "<model>", "<robot>")
-refuse("SDF", '<sdf version="1.9"><model name="r"><link name="a"/></model></sdf>', "<sdf>")
+refuse(
+    "SDF", '<sdf version="1.9"><model name="r"><link name="a"/></model></sdf>', "<sdf>"
+)
 refuse("MJCF", "<mujoco><worldbody/></mujoco>", "<mujoco>")
 refuse("entity", '<!DOCTYPE r [<!ENTITY m "1">]>' + arm(child=inertial("&m;")), "entit")
 BOMB = "".join(f'<!ENTITY a{k} "{f"&a{k - 1};" * 10}">' for k in range(1, 12))
-refuse("entity bomb", f'<!DOCTYPE r [<!ENTITY a0 "x">{BOMB}]><robot name="&a11;"/>', "entit")
 refuse(
-    "external entity", '<!DOCTYPE r [<!ENTITY x SYSTEM "/etc/passwd">]><robot name="&x;"/>', "entit"
+    "entity bomb",
+    f'<!DOCTYPE r [<!ENTITY a0 "x">{BOMB}]><robot name="&a11;"/>',
+    "entit",
+)
+refuse(
+    "external entity",
+    '<!DOCTYPE r [<!ENTITY x SYSTEM "/etc/passwd">]><robot name="&x;"/>',
+    "entit",
 )
 refuse(
     "entity of an external subset",
     '<!DOCTYPE robot SYSTEM "gone.dtd">' + arm(child=inertial("1&m;")),
     "entit",
 )
-refuse("entity of a parameter", "<!DOCTYPE robot [%p;]>" + arm(child=inertial("1&m;")), "entit")
+refuse(
+    "entity of a parameter",
+    "<!DOCTYPE robot [%p;]>" + arm(child=inertial("1&m;")),
+    "entit",
+)
 refuse("document type", "<!DOCTYPE robot>" + arm(), "<!DOCTYPE>")
 refuse("undefined entity", arm(child=inertial("&m;")), "undefined entity")
-refuse("unknown encoding", '<?xml version="1.0" encoding="klingon"?>' + arm(), "encoding", "UTF-8")
+refuse(
+    "unknown encoding",
+    '<?xml version="1.0" encoding="klingon"?>' + arm(),
+    "encoding",
+    "UTF-8",
+)
 refuse(
     "Latin-1 that is said to be UTF-8",
     arm(child=link("arm", INERTIAL), more="<!--\u00e4-->").encode("latin-1"),
@@ -309,10 +482,14 @@ accept("UTF-16", arm().encode("utf-16"))
 accept(
     "Latin-1",
     (
-        '<?xml version="1.0" encoding="iso-8859-1"?>' + arm(child=link("arm"), more="<!--\u00e4-->")
+        '<?xml version="1.0" encoding="iso-8859-1"?>'
+        + arm(child=link("arm"), more="<!--\u00e4-->")
     ).encode("latin-1"),
 )
-accept("declaration and comments", '<?xml version="1.0"?><!-- a --><?pi?>' + arm(more="<!-- b -->"))
+accept(
+    "declaration and comments",
+    '<?xml version="1.0"?><!-- a --><?pi?>' + arm(more="<!-- b -->"),
+)
 accept("CDATA and stray text", arm(more="stray <![CDATA[<text>]]>"))
 accept("no name", robot(link("base"), attributes=""))
 accept("empty name", robot(link("base"), attributes='name=""'))
@@ -323,13 +500,25 @@ accept("apostrophes", arm().replace('"', "'"))
 # --- Names ---------------------------------------------------------------------------------------
 
 refuse(
-    "link without a name", robot(link("base"), f"<link>{INERTIAL}</link>"), ":3:", "<link>", "name"
+    "link without a name",
+    robot(link("base"), f"<link>{INERTIAL}</link>"),
+    ":3:",
+    "<link>",
+    "name",
 )
 refuse("link of empty name", robot(link("base"), link("")), ":3:", "empty 'name'")
-refuse("joint without a name", arm().replace('name="hinge"', ""), ":4:", "<joint>", "name")
+refuse(
+    "joint without a name", arm().replace('name="hinge"', ""), ":4:", "<joint>", "name"
+)
 refuse("two links of one name", arm(more=link("arm")), ":5:", "'arm'", "line 3")
-refuse("two joints of one name", arm(more=link("b") + joint("hinge", "arm", "b")), "second joint")
-refuse("joint named universe", arm().replace('"hinge"', '"universe"'), "differ", "rename")
+refuse(
+    "two joints of one name",
+    arm(more=link("b") + joint("hinge", "arm", "b")),
+    "second joint",
+)
+refuse(
+    "joint named universe", arm().replace('"hinge"', '"universe"'), "differ", "rename"
+)
 refuse(
     "a control character as name",
     robot(link("a&#10;b", INERTIAL.replace('"1"', '"-1"', 1))),
@@ -342,7 +531,9 @@ accept("link named universe", arm().replace('"arm"', '"universe"'))
 accept("root link named world", arm().replace('"base"', '"world"'))
 accept("leaf named world", arm().replace('"arm"', '"world"'))
 accept("joint and link of one name", arm().replace('"hinge"', '"arm"'))
-accept("unicode names", arm().replace('"hinge"', '"Gelenk-\u00fc \u95a2\u7bc0 \U0001f916"'))
+accept(
+    "unicode names", arm().replace('"hinge"', '"Gelenk-\u00fc \u95a2\u7bc0 \U0001f916"')
+)
 accept("escaped names", arm().replace('"arm"', '"a&lt;&amp;&quot;&apos;&gt;"'))
 accept("spaces in names", arm().replace('"hinge"', '" the hinge "'))
 
@@ -351,7 +542,12 @@ accept("spaces in names", arm().replace('"hinge"', '" the hinge "'))
 refuse("no links", robot(), ":1:", "no <link>")
 refuse("no links but joints", robot(joint("j", "a", "b")), "no <link>")
 refuse("unknown parent", robot(link("arm"), joint("j", "bass", "arm")), ":3:", "'bass'")
-refuse("unknown child", robot(link("base"), link("arm"), joint("j", "base", "amr")), ":4:", "arm")
+refuse(
+    "unknown child",
+    robot(link("base"), link("arm"), joint("j", "base", "amr")),
+    ":4:",
+    "arm",
+)
 refuse(
     "no parent",
     robot(link("a"), '<joint name="j" type="fixed"><child link="a"/></joint>'),
@@ -362,12 +558,27 @@ refuse(
     robot(link("a"), '<joint name="j" type="fixed"><parent link="a"/></joint>'),
     "<child>",
 )
-refuse("parent without link", arm().replace('<parent link="base"/>', "<parent/>"), "'link'")
-refuse("two parents in one joint", arm(inside=AXIS + '<parent link="arm"/>'), "second <parent>")
-refuse("two children in one joint", arm(inside=AXIS + '<child link="arm"/>'), "second <child>")
+refuse(
+    "parent without link", arm().replace('<parent link="base"/>', "<parent/>"), "'link'"
+)
+refuse(
+    "two parents in one joint",
+    arm(inside=AXIS + '<parent link="arm"/>'),
+    "second <parent>",
+)
+refuse(
+    "two children in one joint",
+    arm(inside=AXIS + '<child link="arm"/>'),
+    "second <child>",
+)
 refuse(
     "two parents of one link",
-    robot(*map(link, "abc"), joint("j", "a", "b"), joint("k", "a", "c"), joint("l", "b", "c")),
+    robot(
+        *map(link, "abc"),
+        joint("j", "a", "b"),
+        joint("k", "a", "c"),
+        joint("l", "b", "c"),
+    ),
     ":7:",
     "'c'",
     "'k'",
@@ -380,7 +591,12 @@ refuse(
     "'k'",
     "'j'",
 )
-refuse("a link its own parent", arm(more=joint("k", "arm", "arm")), "only one parent", "'k'")
+refuse(
+    "a link its own parent",
+    arm(more=joint("k", "arm", "arm")),
+    "only one parent",
+    "'k'",
+)
 refuse("a detached link", arm(more=link("lost")), ":5:", "2 separate trees", "'lost'")
 refuse(
     "a detached arm",
@@ -400,19 +616,41 @@ refuse(
 )
 refuse(
     "a loop of three",
-    robot(*map(link, "abc"), joint("j", "a", "b"), joint("k", "b", "c"), joint("l", "c", "a")),
+    robot(
+        *map(link, "abc"),
+        joint("j", "a", "b"),
+        joint("k", "b", "c"),
+        joint("l", "c", "a"),
+    ),
     "loop",
 )
-refuse("links in a wrapper", robot(link("base"), f"<arms>{link('arm')}</arms>"), ":3:", "<arms>")
 refuse(
-    "joint in a wrapper", robot(link("base"), f"<arms>{joint('j', 'base', 'arm')}</arms>"), "<arms>"
+    "links in a wrapper",
+    robot(link("base"), f"<arms>{link('arm')}</arms>"),
+    ":3:",
+    "<arms>",
 )
-refuse("joint in a link", robot(link("base", INERTIAL + joint("j", "base", "arm"))), "<joint>")
-refuse("Link in capitals", robot(link("base"), link("arm").replace("link", "Link")), "<Link>")
+refuse(
+    "joint in a wrapper",
+    robot(link("base"), f"<arms>{joint('j', 'base', 'arm')}</arms>"),
+    "<arms>",
+)
+refuse(
+    "joint in a link",
+    robot(link("base", INERTIAL + joint("j", "base", "arm"))),
+    "<joint>",
+)
+refuse(
+    "Link in capitals",
+    robot(link("base"), link("arm").replace("link", "Link")),
+    "<Link>",
+)
 refuse("Joint in capitals", arm().replace("joint", "Joint"), "<Joint>")
 refuse("a chain of 10,000 links", chain(10_000, "fixed"), "10000", "1000")
 refuse("1,000 joints", chain(999, "continuous"), "998 joints", "GiB")
-refuse("20,000 links", robot(*(link(f"l{k}", "") for k in range(20_000))), "20000 links")
+refuse(
+    "20,000 links", robot(*(link(f"l{k}", "") for k in range(20_000))), "20000 links"
+)
 refuse("317 joints", chain(318, "continuous"), "317 joints", "GiB")
 accept("a chain of 900 links", chain(900, "fixed"))
 refuse(
@@ -432,19 +670,36 @@ refuse(
     "'a_'",
     "lock",
 )
-refuse("a floating joint below a link of mass", arm(kind="floating", inside=""), "'hinge'")
+refuse(
+    "a floating joint below a link of mass", arm(kind="floating", inside=""), "'hinge'"
+)
 accept("a joint before its links", robot(joint("j", "a", "b"), link("b"), link("a")))
 accept(
     "branches",
-    robot(*map(link, "abcd"), joint("z", "a", "b"), joint("y", "a", "c"), joint("x", "b", "d")),
+    robot(
+        *map(link, "abcd"),
+        joint("z", "a", "b"),
+        joint("y", "a", "c"),
+        joint("x", "b", "d"),
+    ),
 )
 
 # --- Joints --------------------------------------------------------------------------------------
 
 refuse("no type", arm().replace('type="revolute"', ""), ":4:", "'type'", "'hinge'")
-for kind in ("hinge", "Revolute", "ball", "universal", "revolute2", "screw", "${type}x"):
+for kind in (
+    "hinge",
+    "Revolute",
+    "ball",
+    "universal",
+    "revolute2",
+    "screw",
+    "${type}x",
+):
     if "$" not in kind:
-        refuse(f"type {kind}", arm(kind=kind), ":4:", f"'{kind}'", "revolute", "'hinge'")
+        refuse(
+            f"type {kind}", arm(kind=kind), ":4:", f"'{kind}'", "revolute", "'hinge'"
+        )
 refuse("type spherical", arm(kind="spherical"), "'spherical'", "revolute")
 refuse("type floating", arm(kind="floating"), "'hinge'", "lock")
 refuse("type planar", arm(kind="planar"), "'hinge'", "lock")
@@ -453,22 +708,63 @@ refuse("axis 1e-200", arm(inside='<axis xyz="0 0 1e-200"/>'), "length 1e-200")
 refuse("axis 1e20", arm(inside='<axis xyz="0 1e20 0"/>'), "length 1e+20")
 refuse("axis without xyz", arm(inside="<axis/>"), "'xyz'")
 refuse("axis by rpy", arm(inside='<axis rpy="0 0 1"/>'), "no 'xyz'")
-warn("axis with an rpy", arm(inside='<axis xyz="0 0 1" rpy="0 0 1"/>'), ":4:", "'rpy'", "<axis>")
+warn(
+    "axis with an rpy",
+    arm(inside='<axis xyz="0 0 1" rpy="0 0 1"/>'),
+    ":4:",
+    "'rpy'",
+    "<axis>",
+)
 refuse("two axes", arm(inside=AXIS * 2), "second <axis>", "'hinge'")
 refuse("two origins", arm(inside=AXIS + "<origin/>" * 2), "second <origin>")
 refuse("two limits", arm(inside=AXIS + LIMIT * 2), "second <limit>")
 refuse("two dynamics", arm(inside=AXIS + "<dynamics/>" * 2), "second <dynamics>")
-refuse("origin misspelt", arm(inside=AXIS + '<orgin xyz="1 0 0"/>'), "<orgin>", "<origin>")
+refuse(
+    "origin misspelt", arm(inside=AXIS + '<orgin xyz="1 0 0"/>'), "<orgin>", "<origin>"
+)
 refuse("Axis in capitals", arm(inside='<Axis xyz="0 0 1"/>'), "<Axis>", "<axis>")
 refuse("xzy in an origin", arm(inside=AXIS + '<origin xzy="1 0 0"/>'), "'xzy'")
-refuse("quaternion as quat", arm(inside=AXIS + '<origin quat="0 0 0 1"/>'), "'quat'", "quat_xyzw")
-refuse("quaternion as quat_wxyz", arm(inside=AXIS + '<origin quat_wxyz="1 0 0 0"/>'), "quat_xyzw")
-refuse("quaternion and rpy", arm(inside=AXIS + '<origin rpy="0 0 0" quat_xyzw="0 0 0 1"/>'), "both")
-refuse("quaternion of length 2", arm(inside=AXIS + '<origin quat_xyzw="0 0 0 2"/>'), "length 2")
-refuse("quaternion zero", arm(inside=AXIS + '<origin quat_xyzw="0 0 0 0"/>'), "length 0")
-refuse("quaternion of three", arm(inside=AXIS + '<origin quat_xyzw="0 0 1"/>'), "has 3 entries")
-refuse("negative damping", arm(inside=AXIS + '<dynamics damping="-1"/>'), "damping", "0 or more")
-refuse("negative friction", arm(inside=AXIS + '<dynamics friction="-1"/>'), "friction", "0 or more")
+refuse(
+    "quaternion as quat",
+    arm(inside=AXIS + '<origin quat="0 0 0 1"/>'),
+    "'quat'",
+    "quat_xyzw",
+)
+refuse(
+    "quaternion as quat_wxyz",
+    arm(inside=AXIS + '<origin quat_wxyz="1 0 0 0"/>'),
+    "quat_xyzw",
+)
+refuse(
+    "quaternion and rpy",
+    arm(inside=AXIS + '<origin rpy="0 0 0" quat_xyzw="0 0 0 1"/>'),
+    "both",
+)
+refuse(
+    "quaternion of length 2",
+    arm(inside=AXIS + '<origin quat_xyzw="0 0 0 2"/>'),
+    "length 2",
+)
+refuse(
+    "quaternion zero", arm(inside=AXIS + '<origin quat_xyzw="0 0 0 0"/>'), "length 0"
+)
+refuse(
+    "quaternion of three",
+    arm(inside=AXIS + '<origin quat_xyzw="0 0 1"/>'),
+    "has 3 entries",
+)
+refuse(
+    "negative damping",
+    arm(inside=AXIS + '<dynamics damping="-1"/>'),
+    "damping",
+    "0 or more",
+)
+refuse(
+    "negative friction",
+    arm(inside=AXIS + '<dynamics friction="-1"/>'),
+    "friction",
+    "0 or more",
+)
 warn("damping", arm(inside=AXIS + '<dynamics damping="0.1"/>'), "'hinge'")
 warn("friction", arm(inside=AXIS + '<dynamics friction="0.1"/>'), "friction", "'hinge'")
 warn(
@@ -488,7 +784,10 @@ accept("limit of nothing", arm(inside=AXIS + "<limit/>"))
 accept("axis of length 2", arm(inside='<axis xyz="0 0 -2"/>'))
 accept("axis askew", arm(inside='<axis xyz="1 -2 3"/>'))
 accept("fixed joint with a zero axis", arm(kind="fixed", inside='<axis xyz="0 0 0"/>'))
-accept("fixed joint with a bad limit", arm(kind="fixed", inside='<limit lower="" upper="-"/>'))
+accept(
+    "fixed joint with a bad limit",
+    arm(kind="fixed", inside='<limit lower="" upper="-"/>'),
+)
 accept("quaternion", arm(inside=AXIS + '<origin xyz="1 0 0" quat_xyzw="0 0.6 0 0.8"/>'))
 accept("empty origin", arm(inside=AXIS + "<origin/>"))
 
@@ -496,27 +795,52 @@ accept("empty origin", arm(inside=AXIS + "<origin/>"))
 
 refuse("mimic of nothing", three("<mimic/>"), ":6:", "'joint'", "'j1'")
 refuse("mimic of an unknown joint", three('<mimic joint="j9"/>'), ":6:", "'j1'", "'j9'")
-refuse("mimic of Drake", three("", '<drake:mimic joint="j1"/>'), ":7:", "'j2'", "<mimic>")
+refuse(
+    "mimic of Drake", three("", '<drake:mimic joint="j1"/>'), ":7:", "'j2'", "<mimic>"
+)
 refuse("mimic of itself", three('<mimic joint="j1"/>'), ":6:", "loop", "'j1'")
-refuse("mimics of each other", three('<mimic joint="j2"/>', '<mimic joint="j1"/>'), "loop", "'j2'")
+refuse(
+    "mimics of each other",
+    three('<mimic joint="j2"/>', '<mimic joint="j1"/>'),
+    "loop",
+    "'j2'",
+)
 refuse(
     "mimics in a circle of three",
     three(*(f'<mimic joint="j{k}"/>' for k in (2, 3, 1))),
     "loop",
     "'j3'",
 )
-refuse("two mimics in one joint", three('<mimic joint="j2"/><mimic joint="j3"/>'), "second <mimic>")
+refuse(
+    "two mimics in one joint",
+    three('<mimic joint="j2"/><mimic joint="j3"/>'),
+    "second <mimic>",
+)
 refuse(
     "mimic of a fixed joint",
-    arm(inside=AXIS + '<mimic joint="weld"/>', more=link("t") + joint("weld", "arm", "t", "fixed")),
+    arm(
+        inside=AXIS + '<mimic joint="weld"/>',
+        more=link("t") + joint("weld", "arm", "t", "fixed"),
+    ),
     "'weld'",
     "fixed",
 )
-refuse("mimic multiplier nan", three('<mimic joint="j2" multiplier="nan"/>'), "multiplier", "'nan'")
-refuse("mimic offset with unit", three('<mimic joint="j2" offset="90deg"/>'), "offset", "'90deg'")
+refuse(
+    "mimic multiplier nan",
+    three('<mimic joint="j2" multiplier="nan"/>'),
+    "multiplier",
+    "'nan'",
+)
+refuse(
+    "mimic offset with unit",
+    three('<mimic joint="j2" offset="90deg"/>'),
+    "offset",
+    "'90deg'",
+)
 refuse("mimic multipler", three('<mimic joint="j2" multipler="2"/>'), "'multipler'")
 accept(
-    "mimic of a leader that comes later", three('<mimic joint="j3" multiplier="-2" offset="0.1"/>')
+    "mimic of a leader that comes later",
+    three('<mimic joint="j3" multiplier="-2" offset="0.1"/>'),
 )
 accept("mimic of a leader that comes earlier", three("", "", '<mimic joint="j1"/>'))
 accept("mimic in a fixed joint", arm(kind="fixed", inside='<mimic joint="nothing"/>'))
@@ -524,7 +848,8 @@ accept("mimic in a fixed joint", arm(kind="fixed", inside='<mimic joint="nothing
 # --- Extensions ----------------------------------------------------------------------------------
 
 VISUAL = (
-    '<visual><geometry><mesh filename="package://no/where.stl" scale="a b"/></geometry></visual>'
+    '<visual><geometry><mesh filename="package://no/where.stl" scale="a b"/>'
+    "</geometry></visual>"
 )
 accept("mesh that is not there", arm(child=link("arm", INERTIAL + VISUAL)))
 accept(
@@ -532,7 +857,9 @@ accept(
     arm(child=link("arm", INERTIAL + "<collision><origin xyz='?'/></collision>")),
 )
 accept("gazebo", arm(more='<gazebo reference="arm"><mu1>0.2</mu1></gazebo>'))
-accept("gazebo with names", arm(more=f"<gazebo>{link('x', '')}<joint name='y'/></gazebo>"))
+accept(
+    "gazebo with names", arm(more=f"<gazebo>{link('x', '')}<joint name='y'/></gazebo>")
+)
 for wrapper in ("gazebo", "group", "transmission", "ros2_control", "drake:group"):
     both = link("tip") + joint("k", "arm", "tip")
     refuse(
@@ -549,19 +876,27 @@ for wrapper in ("gazebo", "group", "transmission", "ros2_control", "drake:group"
         ":5:",
         "'k'",
     )
-accept("transmission", arm(more='<transmission name="t"><joint name="hinge"/></transmission>'))
+accept(
+    "transmission",
+    arm(more='<transmission name="t"><joint name="hinge"/></transmission>'),
+)
 accept(
     "ros2_control",
-    arm(more='<ros2_control name="c"><joint name="hinge"><param>1</param></joint></ros2_control>'),
+    arm(
+        more='<ros2_control name="c"><joint name="hinge"><param>1</param></joint></ros2_control>'
+    ),
 )
 accept("unbound prefix", arm(more='<drake:proximity_properties drake:x="1"/>'))
 accept("prefixed attribute", arm(inside=AXIS + '<origin xyz="0 0 1" drake:note="1"/>'))
 accept(
     "unknown elements",
-    arm(child=link("arm", INERTIAL + "<contact/><self_filter/>"), more="<sensor/><foo/>"),
+    arm(
+        child=link("arm", INERTIAL + "<contact/><self_filter/>"), more="<sensor/><foo/>"
+    ),
 )
 accept(
-    "unknown attributes", arm(attributes='name="r" foo="1"').replace("<link ", '<link type="x" ')
+    "unknown attributes",
+    arm(attributes='name="r" foo="1"').replace("<link ", '<link type="x" '),
 )
 accept("materials", arm(more='<material name="m"><color rgba="x"/></material>' * 2))
 accept(
@@ -569,11 +904,17 @@ accept(
     arm(inside=AXIS + '<safety_controller k="?"/><calibration rising="?"/>'),
 )
 accept(
-    "xacro merely declared", arm(attributes='name="r" xmlns:xacro="http://www.ros.org/wiki/xacro"')
+    "xacro merely declared",
+    arm(attributes='name="r" xmlns:xacro="http://www.ros.org/wiki/xacro"'),
 )
-accept("dollar in a mesh", arm(child=link("arm", INERTIAL + VISUAL.replace("no", "${no}"))))
+accept(
+    "dollar in a mesh", arm(child=link("arm", INERTIAL + VISUAL.replace("no", "${no}")))
+)
 for place in ("material", "plugin", "sensor", "gazebo"):
-    accept(f"dollar in a {place}", arm(more=f'<{place} name="${{x}}"><a b="$(find y)"/></{place}>'))
+    accept(
+        f"dollar in a {place}",
+        arm(more=f'<{place} name="${{x}}"><a b="$(find y)"/></{place}>'),
+    )
 for place in ("safety_controller", "calibration"):
     accept(f"dollar in a {place}", arm(inside=AXIS + f'<{place} a="${{x}}"/>'))
 accept("dollar in a comment", arm(more="<!-- ${mass} <xacro:if/> -->"))
@@ -582,15 +923,23 @@ accept("dollar in a comment", arm(more="<!-- ${mass} <xacro:if/> -->"))
 
 XACRO = 'name="r" xmlns:xacro="http://www.ros.org/wiki/xacro"'
 MACRO = (
-    f'<xacro:macro name="make" params="m">{inertial("${2 * m}")}</xacro:macro><xacro:make m="1"/>'
+    f'<xacro:macro name="make" params="m">{inertial("${2 * m}")}</xacro:macro>'
+    '<xacro:make m="1"/>'
 )
 accept("xacro in a URDF", arm(child=MACRO, attributes=XACRO))
 accept("xacro file", arm(child=MACRO, attributes=XACRO), ".xacro")
 accept("xacro file of plain URDF", arm(), ".urdf.xacro")
 accept("property without declaration", arm(child=inertial("${2 + 3}")))
-refuse("xacro: unknown property", arm(child=inertial("${m}"), attributes=XACRO), "xacro", "'m'")
+refuse(
+    "xacro: unknown property",
+    arm(child=inertial("${m}"), attributes=XACRO),
+    "xacro",
+    "'m'",
+)
 refuse("xacro: its first use", arm(child=inertial("${m}")), "<mass>", "line 3")
-refuse("xacro: unknown macro", arm(child="<xacro:take/>", attributes=XACRO), "xacro:take")
+refuse(
+    "xacro: unknown macro", arm(child="<xacro:take/>", attributes=XACRO), "xacro:take"
+)
 refuse(
     "xacro: missing include",
     arm(more='<xacro:include filename="gone.xacro"/>', attributes=XACRO),
@@ -598,7 +947,10 @@ refuse(
 )
 refuse(
     "xacro: endless macro",
-    arm(more='<xacro:macro name="a"><xacro:a/></xacro:macro><xacro:a/>', attributes=XACRO),
+    arm(
+        more='<xacro:macro name="a"><xacro:a/></xacro:macro><xacro:a/>',
+        attributes=XACRO,
+    ),
     "xacro",
 )
 refuse(
@@ -608,7 +960,10 @@ refuse(
     "-1 kg",
 )
 refuse(
-    "xacro: bad expression", arm(child=inertial("${1/0}"), attributes=XACRO), "xacro", "division"
+    "xacro: bad expression",
+    arm(child=inertial("${1/0}"), attributes=XACRO),
+    "xacro",
+    "division",
 )
 refuse("xacro: not well-formed", "<robot><xacro:", "well-formed", suffix=".xacro")
 
@@ -653,7 +1008,11 @@ def _looping(path):
     return path
 
 
-refuse("a name that is too long", lambda path: path.with_name("x" * 5000 + ".urdf"), "no file")
+refuse(
+    "a name that is too long",
+    lambda path: path.with_name("x" * 5000 + ".urdf"),
+    "no file",
+)
 if sys.platform == "linux":
     accept("a file name that is no text", _no_text)
 refuse("a missing file", lambda path: path, "no file")

@@ -15,7 +15,9 @@ def mostly(names, *quick):
     """Return test parameters for names, of which all but the quick ones are exhaustive."""
     assert set(quick) <= set(names)
     marks = pytest.mark.exhaustive
-    return [name if name in quick else pytest.param(name, marks=marks) for name in names]
+    return [
+        name if name in quick else pytest.param(name, marks=marks) for name in names
+    ]
 
 
 def random_pose(rng, degrees):
@@ -57,7 +59,9 @@ def random_tree(rng, n, *, prismatic=True):
     for index in range(n):
         del branch[rng.integers(1, len(branch) + 1) :]
         joint = kinds[index % len(kinds)]()
-        branch.append(model.addJoint(branch[-1], joint, pin.SE3.Random(), f"joint_{index}"))
+        branch.append(
+            model.addJoint(branch[-1], joint, pin.SE3.Random(), f"joint_{index}")
+        )
         model.appendBodyToJoint(branch[-1], pin.Inertia.Random(), pin.SE3.Random())
     return fflin.from_model(model, name=f"tree_{n}")
 
@@ -65,7 +69,9 @@ def random_tree(rng, n, *, prismatic=True):
 def free_body(inertia, name="body"):
     """A body that floats free, as a robot without joints."""
     model = pin.Model()
-    root = model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "root_joint")
+    root = model.addJoint(
+        0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "root_joint"
+    )
     model.addJointFrame(root)
     body = pin.Inertia(50.0, np.zeros(3), np.diag(inertia))
     model.appendBodyToJoint(root, body, pin.SE3.Identity())
@@ -78,14 +84,18 @@ def panels(damping):
     hub = pin.Inertia(100.0, np.zeros(3), np.diag((20.0, 25.0, 30.0)))
     model = pin.Model()
     model.name = "panels"
-    base = model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "root_joint")
+    base = model.addJoint(
+        0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "root_joint"
+    )
     model.addJointFrame(base)
     model.appendBodyToJoint(base, hub, pin.SE3.Identity())
     model.addBodyFrame("base", base, pin.SE3.Identity(), -1)
     for name, side in (("h1", 1.0), ("h2", -1.0)):
         place = pin.SE3(np.eye(3), np.array((0.0, 0.5 * side, 0.0)))
         joint = model.addJoint(base, pin.JointModelRX(), place, name)
-        panel = pin.Inertia(4.0, np.array((0.0, 0.8 * side, 0.0)), np.diag((0.5, 0.1, 0.5)))
+        panel = pin.Inertia(
+            4.0, np.array((0.0, 0.8 * side, 0.0)), np.diag((0.5, 0.1, 0.5))
+        )
         model.appendBodyToJoint(joint, panel, pin.SE3.Identity())
     robot = fflin.from_model(model)
     return robot.replace(inputs=[fflin.BaseTorque()], stiffness=30.0, damping=damping)
@@ -95,11 +105,15 @@ def singular_at(value):
     """A robot whose M is singular where its last joint is at a value: a point mass on its axis."""
     model = pin.Model()
     model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "free")
-    model.appendBodyToJoint(1, pin.Inertia(5.0, np.zeros(3), np.eye(3)), pin.SE3.Identity())
+    model.appendBodyToJoint(
+        1, pin.Inertia(5.0, np.zeros(3), np.eye(3)), pin.SE3.Identity()
+    )
     joint = model.addJoint(1, pin.JointModelRZ(), pin.SE3.Identity(), "turn")
     slide = model.addJoint(joint, pin.JointModelPX(), pin.SE3.Identity(), "slide")
     model.appendBodyToJoint(
-        slide, pin.Inertia(1.0, np.array([-value, 0.0, 0.0]), np.zeros((3, 3))), pin.SE3.Identity()
+        slide,
+        pin.Inertia(1.0, np.array([-value, 0.0, 0.0]), np.zeros((3, 3))),
+        pin.SE3.Identity(),
     )
     return fflin.from_model(model, name="singular")
 

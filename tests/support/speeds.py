@@ -12,7 +12,9 @@ def between_knots(motion, k, parts=64):
     u = motion.u[k] + (motion.hold == "linear") * s * (motion.u[k + 1] - motion.u[k])
     q, v = motion.q[k], motion.v[k]
     held = {"hold": motion.hold, "frame": motion.frame}
-    divided = fflin.Trajectory(motion.robot, t, np.tile(q, rows), np.tile(v, rows), u, **held)
+    divided = fflin.Trajectory(
+        motion.robot, t, np.tile(q, rows), np.tile(v, rows), u, **held
+    )
     for part in range(parts):
         q, v = divided.end(part, 1, q, v)
         yield q, v

@@ -10,7 +10,12 @@ from tests.support.robots import random_point
 def points(robot, count, seed=0):
     """Random (q, v, u) rows."""
     rng = np.random.default_rng(seed)
-    return tuple(map(np.array, zip(*(random_point(robot, rng) for _ in range(count)), strict=True)))
+    return tuple(
+        map(
+            np.array,
+            zip(*(random_point(robot, rng) for _ in range(count)), strict=True),
+        )
+    )
 
 
 def assert_same(one, other, tolerance=0.0):
@@ -22,6 +27,8 @@ def assert_same(one, other, tolerance=0.0):
             assert left.shape == right.shape, field.name
             assert not left.flags.writeable, field.name
             scale = np.abs(right).max(initial=0.0)
-            assert np.abs(left - right).max(initial=0.0) <= tolerance * scale, field.name
+            assert np.abs(left - right).max(initial=0.0) <= tolerance * scale, (
+                field.name
+            )
         elif field.name != "_robot" and not (callable(left) or callable(right)):
             assert left == right, field.name

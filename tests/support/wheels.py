@@ -6,7 +6,14 @@ import pinocchio as pin
 import fflin
 
 # Three and more in skew axes; the first three and the first four turn a body about all axes.
-AXES = ((1.0, 0.0, 0.0), (0.2, 1.0, 0.1), (-0.3, 0.1, 1.0), (1.0, -1.0, 1.0), (0, 1, 0), (1, 0, 1))
+AXES = (
+    (1.0, 0.0, 0.0),
+    (0.2, 1.0, 0.1),
+    (-0.3, 0.1, 1.0),
+    (1.0, -1.0, 1.0),
+    (0, 1, 0),
+    (1, 0, 1),
+)
 ORTHOGONAL = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 PYRAMID = ((1.0, 0.0, 1.0), (0.0, 1.0, 1.0), (-1.0, 0.0, 1.0), (0.0, -1.0, 1.0))
 
@@ -18,7 +25,8 @@ def unit(axis):
 def wheels(axes, inertia, frames=(None,)):
     """Wheels about these axes, on the frames by turns."""
     return [
-        fflin.ReactionWheel(axis, frames[k % len(frames)], inertia) for k, axis in enumerate(axes)
+        fflin.ReactionWheel(axis, frames[k % len(frames)], inertia)
+        for k, axis in enumerate(axes)
     ]
 
 
@@ -41,7 +49,9 @@ def spun(axes, *, others=(), J=0.02, arm=True, **fields):
     wheel = pin.Inertia(2.0, np.array([0.0, 0.0, 0.03]), np.diag([0.6 * J, 0.6 * J, J]))
     places = []
     for k, axis in enumerate(axes):
-        up = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), unit(axis)).matrix()
+        up = pin.Quaternion.FromTwoVectors(
+            np.array([0.0, 0.0, 1.0]), unit(axis)
+        ).matrix()
         places.append(pin.SE3(up, np.array([0.2 * k, -0.1, 0.3 - 0.2 * k])))
     joints = [fflin.JointTorque("arm")] if arm else []
     robots = []
@@ -64,7 +74,9 @@ def spun(axes, *, others=(), J=0.02, arm=True, **fields):
         motors = [fflin.JointTorque(name) for name in names]
         if mounted:
             pairs = zip(names, axes, strict=True)
-            motors = [fflin.ReactionWheel(axis, None, J, name=name) for name, axis in pairs]
+            motors = [
+                fflin.ReactionWheel(axis, None, J, name=name) for name, axis in pairs
+            ]
         robot = fflin.from_model(model, name="satellite")
         robots.append(robot.replace(inputs=[*others, *joints, *motors], **fields))
     return robots

@@ -14,7 +14,9 @@ from tests.support.patience import finished
 
 pytestmark = pytest.mark.docs
 
-PAGE = (Path(__file__).parents[2] / "docs/guide/uncertain_models.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).parents[2] / "docs/guide/uncertain_models.md").read_text(
+    encoding="utf-8"
+)
 
 # What of the toolbox the page needs, for one value of each delta.
 TOOLBOX = {
@@ -50,7 +52,9 @@ def followed(tmp_path_factory):
 @pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
 def test_slycot_takes_the_model_of_the_page(followed):
     _, names = followed
-    assert names["plant"].nstates == 30 and names["Z"].shape == 2 * (names["blocks"].sum(),)
+    assert names["plant"].nstates == 30 and names["Z"].shape == 2 * (
+        names["blocks"].sum(),
+    )
     # At a delta of 1 / |mu| or less no pole is on the axis: that of the loop at w = 10.
     bound = names["ab13md"](names["Z"], names["blocks"], names["kinds"])[0]
     rng = np.random.default_rng(0)
@@ -69,7 +73,9 @@ def test_octave_takes_the_model_of_the_page(followed):
     lft = fflin.LFT.load(folder / "uncertain.mat")
     plain, robust = blocks("matlab")
     for name, body in TOOLBOX.items():
-        (folder / f"{name}.m").write_text(f"function value = {name}(varargin)\n{body}\nend\n")
+        (folder / f"{name}.m").write_text(
+            f"function value = {name}(varargin)\n{body}\nend\n"
+        )
     delta = np.array([0.5, -0.3, 0.8, -1.0])
     given = plain.replace("delta(1) = 1;", f"delta = {delta.tolist()};")
     assert given != plain
@@ -89,6 +95,8 @@ def test_octave_takes_the_model_of_the_page(followed):
     found = loadmat(folder / "out.mat", squeeze_me=True)
     ends = {"first": np.array([1.0, 0.0, 0.0, 0.0]), "second": delta, "plant": delta}
     for name, row in ends.items():
-        for got, expected in zip((found[name]["A"], found[name]["B"]), lft.at(row), strict=False):
+        for got, expected in zip(
+            (found[name]["A"], found[name]["B"]), lft.at(row), strict=False
+        ):
             assert np.abs(got.item() - expected).max() < 1e-12 * np.abs(expected).max()
     assert names["lft"].parameters == lft.parameters

@@ -24,7 +24,9 @@ def weighed_by_hand(robot, q, v, bodies):
         first += p[0] * place.translation + place.rotation @ p[1:4]
         own = spatial(p) @ (J @ v)
         h[3:] += place.rotation @ own[:3]
-        h[:3] += place.rotation @ own[3:] + np.cross(place.translation, place.rotation @ own[:3])
+        h[:3] += place.rotation @ own[3:] + np.cross(
+            place.translation, place.rotation @ own[:3]
+        )
     h[:3] -= np.cross(first / total, h[3:])
     return np.concatenate((first / total, h))
 
@@ -39,10 +41,13 @@ def test_centre_of_mass_and_momentum_as_by_complex_steps(name):
     q[:3] = 0.0
     S = fflin.sensitivity(fflin.linearize(robot, q, v, reference=pin.SE3.Identity()))
     bodies = {
-        j: robot.model.inertias[j].toDynamicParameters() + 0j for j in range(1, robot.model.njoints)
+        j: robot.model.inertias[j].toDynamicParameters() + 0j
+        for j in range(1, robot.model.njoints)
     }
     names = [n for n, one in S.parameters.items() if one.bodies]
-    for name in np.random.default_rng(6).choice(names, min(12, len(names)), replace=False):
+    for name in np.random.default_rng(6).choice(
+        names, min(12, len(names)), replace=False
+    ):
         stepped = dict(bodies)
         for joint, change in S.parameters[name].bodies.items():
             stepped[joint] = bodies[joint] + 1j * H * change
@@ -50,7 +55,9 @@ def test_centre_of_mass_and_momentum_as_by_complex_steps(name):
         got = S[name].dy0
         size = np.abs(expected).max() + 1e-12
         assert np.abs(got[[0, 1, 2, *range(-6, 0)]] - expected).max() < 1e-10 * size
-        assert not got[3:-6].any() and not S[name].dC[3:-6].any() and not S[name].dD.any()
+        assert (
+            not got[3:-6].any() and not S[name].dC[3:-6].any() and not S[name].dD.any()
+        )
 
 
 @pytest.mark.parametrize("frame", ["hybrid", "local", "world"])
@@ -72,9 +79,14 @@ def test_their_rows_of_C_as_by_differences(name, frame):
         step = 2e-3 / S._derivatives.fraction(one.bodies)
         for at, got in ((2, S[one.name].dC), (5, S[one.name].dy0)):
             expected = fourth_order(
-                lambda s, one=one, at=at: everything(of(changed(robot, one.bodies, s)))[at], step
+                lambda s, one=one, at=at: everything(of(changed(robot, one.bodies, s)))[
+                    at
+                ],
+                step,
             )
-            assert np.abs(got - expected).max() < 1e-7 * np.abs(expected).max() + 1e-9, one.name
+            assert (
+                np.abs(got - expected).max() < 1e-7 * np.abs(expected).max() + 1e-9
+            ), one.name
 
 
 @pytest.mark.parametrize("at", ["rest", "sprung", "motion", "moving"])
@@ -91,7 +103,12 @@ def test_sampled_models_as_by_complex_steps(at):
     sampled = lin.discretize(0.1)
     S, D = fflin.sensitivity(lin), fflin.sensitivity(sampled)
     nx, nu = lin.B.shape
-    for name in ("link_3.mass", "base.com.x", "panel_left.stiffness", "panel_left.damping"):
+    for name in (
+        "link_3.mass",
+        "base.com.x",
+        "panel_left.stiffness",
+        "panel_left.damping",
+    ):
         block = np.zeros((nx + nu + 1, nx + nu + 1), complex)
         slope, got = S[name], D[name]
         block[:nx] = 1j * H * np.column_stack((slope.dA, slope.dB, slope.df0))
@@ -102,10 +119,15 @@ def test_sampled_models_as_by_complex_steps(at):
             (got.dB, expected[:, nx:-1]),
             (got.df0, expected[:, -1]),
         ):
-            assert np.abs(found - part).max() <= 1e-10 * np.abs(expected).max() + 1e-300, name
+            assert (
+                np.abs(found - part).max() <= 1e-10 * np.abs(expected).max() + 1e-300
+            ), name
             assert np.abs(found - part).max() <= 1e-8 * np.abs(part).max(), name
     index = list(D.names).index("link_3.mass")
-    assert np.abs(D.dB[index] - D["link_3.mass"].dB).max() <= 1e-12 * np.abs(D.dB[index]).max()
+    assert (
+        np.abs(D.dB[index] - D["link_3.mass"].dB).max()
+        <= 1e-12 * np.abs(D.dB[index]).max()
+    )
 
 
 @pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
@@ -118,12 +140,17 @@ def test_sampled_models_of_other_masses_and_their_poles():
     one = S.parameters["link_2.mass"]
 
     def at(size):
-        return fflin.linearize(changed(robot, one.bodies, size), q, v, u).discretize(0.2)
+        return fflin.linearize(changed(robot, one.bodies, size), q, v, u).discretize(
+            0.2
+        )
 
     slope, step = S["link_2.mass"], 2e-3 / S._derivatives.fraction(one.bodies)
     for part in ("A", "B", "f0"):
         expected = fourth_order(lambda s, part=part: getattr(at(s), part), step)
-        assert np.abs(getattr(slope, f"d{part}") - expected).max() < 1e-7 * np.abs(expected).max()
+        assert (
+            np.abs(getattr(slope, f"d{part}") - expected).max()
+            < 1e-7 * np.abs(expected).max()
+        )
     assert max(S.check(["link_2.mass", "base.com.x"]).values()) < 1e-6
     rest = fflin.linearize(robot).discretize(0.2)
     gain = fflin.lqr(rest)
@@ -155,13 +182,17 @@ def test_of_a_link_without_mass_nothing_is_weighed():
     v = fflin.velocity(robot, {"w": 50.0})
     S = fflin.sensitivity(fflin.linearize(robot, q, v))
     # The wheel's spin is relative to its carrier, which has lost what the wheel has.
-    assert S["w.inertia"].dy0 == pytest.approx([0.0, 0.0, 50.0, 0.0, 0.0, 0.0], rel=1e-10)
+    assert S["w.inertia"].dy0 == pytest.approx(
+        [0.0, 0.0, 50.0, 0.0, 0.0, 0.0], rel=1e-10
+    )
 
 
 def test_outputs_that_weigh_in_orbit_as_by_differences():
     robot = in_orbit(fflin.load("servicer_7dof")).replace(outputs=WEIGHED[:1])
     rng = np.random.default_rng(10)
-    q = fflin.configuration(robot, {"joint_2": 0.4, "joint_5": -0.8}, random_pose(rng, 60.0))
+    q = fflin.configuration(
+        robot, {"joint_2": 0.4, "joint_5": -0.8}, random_pose(rng, 60.0)
+    )
     v = 0.2 * rng.normal(size=robot.nv)
     S = fflin.sensitivity(fflin.linearize(robot, q, v, frame="lvlh"))
     for name in ("link_3.mass", "base.com.y"):

@@ -14,7 +14,9 @@ from tests.robot.test_appendages import beam, displaced, full, hub_with_rod, ser
 def free_flying():
     """Servicer with flexible appendages and a tank on springs."""
     rigid, appendages = servicer()
-    tank = fflin.Slosh("base", 30.0, (0.1, 0.0, 0.3), frequency=0.2, damping=0.02, name="tank")
+    tank = fflin.Slosh(
+        "base", 30.0, (0.1, 0.0, 0.3), frequency=0.2, damping=0.02, name="tank"
+    )
     return rigid.replace(appendages=[*appendages, tank])
 
 
@@ -43,7 +45,8 @@ def test_derivatives_are_those_of_relinearised_robots(name, part):
     h = 1e-4
     of = fflin.uncertain(robot, {f"{name}.{part}": (0.01, 1.0)})
     ends = [
-        fflin.linearize(of.at({f"{name}.{part}": slope.value + step}), q=q, v=v) for step in (-h, h)
+        fflin.linearize(of.at({f"{name}.{part}": slope.value + step}), q=q, v=v)
+        for step in (-h, h)
     ]
     for given, key in ((slope.dA, "A"), (slope.df0, "f0")):
         expected = (getattr(ends[1], key) - getattr(ends[0], key)) / (2.0 * h)
@@ -60,19 +63,29 @@ def test_a_changed_frequency_keeps_the_damping_ratio():
     tank = 2.0 * math.pi * 0.2
     assert other.stiffness["tank_x"] == pytest.approx(30.0 * tank**2, rel=1e-14)
     assert other.damping["tank_x"] == pytest.approx(2.0 * 0.03 * 30.0 * tank, rel=1e-14)
-    left = fflin.uncertain(robot, {"left_mode_3.frequency": 0.2}).at({"left_mode_3.frequency": 1.0})
-    assert left.damping["left_mode_3"] == pytest.approx(2.0 * 0.3 * 2.0 * math.pi, rel=1e-14)
+    left = fflin.uncertain(robot, {"left_mode_3.frequency": 0.2}).at(
+        {"left_mode_3.frequency": 1.0}
+    )
+    assert left.damping["left_mode_3"] == pytest.approx(
+        2.0 * 0.3 * 2.0 * math.pi, rel=1e-14
+    )
     # Of a body that is made anew too.
     both = fflin.uncertain(robot, {"boom_mode_1.frequency": 0.2, "link_7.mass": 0.1})
     made = both.at(
-        {"boom_mode_1.frequency": 0.33, "link_7.mass": 1.02 * robot.pieces["link_7"].mass}
+        {
+            "boom_mode_1.frequency": 0.33,
+            "link_7.mass": 1.02 * robot.pieces["link_7"].mass,
+        }
     )
     assert made.stiffness["boom_mode_1"] == pytest.approx(omega**2, rel=1e-14)
 
 
 def test_a_body_made_anew_keeps_the_springs_that_were_set():
     robot = free_flying().replace(stiffness={"boom_mode_1": 1.0})
-    assert robot.with_mass_properties({"joint_1": {"mass": 20.0}}).stiffness["boom_mode_1"] == 1.0
+    assert (
+        robot.with_mass_properties({"joint_1": {"mass": 20.0}}).stiffness["boom_mode_1"]
+        == 1.0
+    )
 
 
 def test_the_lft_is_exact_in_frequency_and_ratio():
@@ -105,22 +118,35 @@ def test_frequencies_of_zero_or_less_are_refused():
 
 
 def beam_on_hub():
-    robot = hub_with_rod(10.0, 2.0, 1.0, 2.0).replace(appendages=[beam(1.0, 2.0, 5.0, 2)])
+    robot = hub_with_rod(10.0, 2.0, 1.0, 2.0).replace(
+        appendages=[beam(1.0, 2.0, 5.0, 2)]
+    )
     return robot.replace(damping={"beam_mode_1": 0.1})
 
 
-DISPERSED = {"beam_mode_*.frequency": 0.2, "beam_mode_1.damping": (-0.5, 0.5), "base.mass": 0.01}
+DISPERSED = {
+    "beam_mode_*.frequency": 0.2,
+    "beam_mode_1.damping": (-0.5, 0.5),
+    "base.mass": 0.01,
+}
 
 
 def test_runs_of_a_campaign_have_their_frequencies_and_ratios():
     robot = beam_on_hub()
     policy = fflin.StateFeedback(fflin.linearize(robot), np.zeros((6, 16)))
-    start = {"q0": fflin.configuration(robot, {"beam_mode_1": 0.05}), "duration": 1.0, "dt": 0.01}
+    start = {
+        "q0": fflin.configuration(robot, {"beam_mode_1": 0.05}),
+        "duration": 1.0,
+        "dt": 0.01,
+    }
     given = {name: spread for name, spread in DISPERSED.items() if name != "base.mass"}
     made = fflin.monte_carlo(robot, policy, given, runs=3, engine="python", **start)
     for run, drawn in enumerate(made.drawn):
         d = dict(zip(made.names, drawn, strict=True))
-        factors = {name: 1.0 + d[f"{name}.frequency"] for name in ("beam_mode_1", "beam_mode_2")}
+        factors = {
+            name: 1.0 + d[f"{name}.frequency"]
+            for name in ("beam_mode_1", "beam_mode_2")
+        }
         stiffness = {name: f**2 * robot.stiffness[name] for name, f in factors.items()}
         damping = 0.1 * factors["beam_mode_1"] * (1.0 + d["beam_mode_1.damping"])
         other = robot.replace(stiffness=stiffness, damping={"beam_mode_1": damping})
@@ -137,13 +163,18 @@ def test_compiled_runs_have_their_frequencies_and_ratios():
 
 
 @pytest.mark.parametrize(
-    ("name", "said"), [("wheel", "no frequency"), ("swing_x", "is 0"), ("joint_1", "no frequency")]
+    ("name", "said"),
+    [("wheel", "no frequency"), ("swing_x", "is 0"), ("joint_1", "no frequency")],
 )
 def test_frequencies_that_do_not_exist_are_not_dispersed(name, said):
     robot = full()
-    policy = fflin.StateFeedback(fflin.linearize(robot), np.zeros((16, 2 * (6 + robot.n))))
+    policy = fflin.StateFeedback(
+        fflin.linearize(robot), np.zeros((16, 2 * (6 + robot.n)))
+    )
     with pytest.raises((InputError, fflin.UnknownNameError), match=said):
-        fflin.monte_carlo(robot, policy, {f"{name}.frequency": 0.1}, runs=2, duration=1.0)
+        fflin.monte_carlo(
+            robot, policy, {f"{name}.frequency": 0.1}, runs=2, duration=1.0
+        )
 
 
 def test_a_changed_body_keeps_the_coordinates_of_its_modes():

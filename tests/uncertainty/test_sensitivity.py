@@ -25,7 +25,9 @@ def changed(robot, bodies, size):
 
 
 def fourth_order(of, step):
-    return (8.0 * (of(step) - of(-step)) - (of(2.0 * step) - of(-2.0 * step))) / (12.0 * step)
+    return (8.0 * (of(step) - of(-step)) - (of(2.0 * step) - of(-2.0 * step))) / (
+        12.0 * step
+    )
 
 
 def everything(lin):
@@ -65,7 +67,10 @@ def test_at_rest_as_by_complex_steps(name):
 
 def robot_inverse(robot, lin):
     """Return M^-1 in base axes, by CRBA."""
-    data, order = robot.create_data(), [3, 4, 5, 0, 1, 2, *(j.idx_v for j in robot.joints)]
+    data, order = (
+        robot.create_data(),
+        [3, 4, 5, 0, 1, 2, *(j.idx_v for j in robot.joints)],
+    )
     q = lin.q.copy()
     q[:3] = 0.0
     M = pin.crba(robot.model, data, q)
@@ -73,7 +78,8 @@ def robot_inverse(robot, lin):
 
 
 @pytest.mark.parametrize(
-    ("frame", "moving"), [("hybrid", False), ("world", False), ("local", False), ("local", True)]
+    ("frame", "moving"),
+    [("hybrid", False), ("world", False), ("local", False), ("local", True)],
 )
 @pytest.mark.parametrize(
     "name",
@@ -88,7 +94,11 @@ def test_in_motion_as_by_differences(name, frame, moving):
     rng = np.random.default_rng(2)
     if name == "servicer_7dof":
         robot = robot.replace(stiffness={"panel_*": 80.0}, damping={"panel_*": 3.0})
-        outputs = [fflin.FullState(), fflin.Accelerometer("tool"), fflin.FramePose("tool")]
+        outputs = [
+            fflin.FullState(),
+            fflin.Accelerometer("tool"),
+            fflin.FramePose("tool"),
+        ]
         robot = robot.replace(outputs=outputs)
     if name == "planar_detumble":
         robot = robot.replace(gravity=(1.0, 2.0, -9.0))
@@ -97,7 +107,9 @@ def test_in_motion_as_by_differences(name, frame, moving):
     reference = None if moving else pin.SE3.Random()
 
     def of(other):
-        return fflin.linearize(other, q, v, u, frame=frame, moving=moving, reference=reference)
+        return fflin.linearize(
+            other, q, v, u, frame=frame, moving=moving, reference=reference
+        )
 
     S = fflin.sensitivity(of(robot))
     names = [n for n, one in S.parameters.items() if one.bodies]
@@ -110,7 +122,9 @@ def test_in_motion_as_by_differences(name, frame, moving):
         step = (
             2e-3
             / np.abs(
-                np.linalg.eigvals(np.linalg.solve(inertia(robot.model, joints, kept), M_p))
+                np.linalg.eigvals(
+                    np.linalg.solve(inertia(robot.model, joints, kept), M_p)
+                )
             ).max()
         )
 
@@ -133,7 +147,9 @@ def test_springs_dampers_thrusters_and_wheels():
     S = fflin.sensitivity(fflin.linearize(robot, q, v, u))
     hinge = "hinge_left_1"
     thrusters = [i for i, item in enumerate(inputs) if isinstance(item, fflin.Thruster)]
-    wheels = [i for i, item in enumerate(inputs) if isinstance(item, fflin.ReactionWheel)]
+    wheels = [
+        i for i, item in enumerate(inputs) if isinstance(item, fflin.ReactionWheel)
+    ]
 
     def with_input(at, **fields):
         others = list(inputs)
@@ -142,11 +158,15 @@ def test_springs_dampers_thrusters_and_wheels():
 
     def tilted(size):
         item = inputs[thrusters[0]]
-        return with_input(thrusters[0], direction=np.add(item.direction, (0.0, size, 0.0)))
+        return with_input(
+            thrusters[0], direction=np.add(item.direction, (0.0, size, 0.0))
+        )
 
     def shifted(size):
         item = inputs[thrusters[1]]
-        return with_input(thrusters[1], position=np.add(item.position, (0.0, 0.0, size)))
+        return with_input(
+            thrusters[1], position=np.add(item.position, (0.0, 0.0, size))
+        )
 
     names = fflin.linearize(robot).input_names
     first = names.index(named_inputs(inputs)[thrusters[0]][1][0])
@@ -171,12 +191,18 @@ def test_springs_dampers_thrusters_and_wheels():
     rounding = 1e-14 * np.abs(S.lin.A).max()
     for name, (of, step) in cases.items():
         expected = [
-            fourth_order(lambda s, k=k, of=of: everything(fflin.linearize(of(s), q, v, u))[k], step)
+            fourth_order(
+                lambda s, k=k, of=of: everything(fflin.linearize(of(s), q, v, u))[k],
+                step,
+            )
             for k in (0, 1, 4)
         ]
         slope = S[name]
         for got, wanted in zip((slope.dA, slope.dB, slope.df0), expected, strict=True):
-            assert np.abs(got - wanted).max() <= 1e-8 * np.abs(wanted).max() + rounding / step, name
+            assert (
+                np.abs(got - wanted).max()
+                <= 1e-8 * np.abs(wanted).max() + rounding / step
+            ), name
         assert max(np.abs(wanted).max() for wanted in expected) > 0.0
 
 
@@ -202,7 +228,9 @@ def test_links_that_are_fixed_to_each_other_have_parameters_of_their_own():
     alone = 5.0 * S["target.mass"].dB  # differs by rounding: BLAS adds in another order
     assert np.abs(heavier.dB - alone).max() < 1e-12 * np.abs(alone).max()
     assert S.parameters["target.mass"].value == pytest.approx(50.0)
-    locked = fflin.sensitivity(fflin.linearize(fflin.load("servicer_7dof", lock=["joint_3"])))
+    locked = fflin.sensitivity(
+        fflin.linearize(fflin.load("servicer_7dof", lock=["joint_3"]))
+    )
     assert locked.parameters["link_3.mass"].value == pytest.approx(9.5)
 
 
@@ -243,7 +271,9 @@ def test_poles_move_as_differences_say():
     sure = np.isfinite(slopes[at])
     assert sure.sum() > 20
     # What rounding of poles leaves of a difference of steps of a gram.
-    assert np.abs(slopes[at] - expected)[sure].max() < 1e-6 * np.abs(expected).max() + 1e-8
+    assert (
+        np.abs(slopes[at] - expected)[sure].max() < 1e-6 * np.abs(expected).max() + 1e-8
+    )
 
 
 def test_its_own_check_finds_it_right_and_what_is_wrong_wrong():
@@ -275,13 +305,17 @@ def test_what_is_wrong_is_one_line():
 @pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
 def test_its_check_takes_wheels_whose_bodies_have_no_mass():
     robot = fflin.load("robots/inspector.toml")
-    found = fflin.sensitivity(fflin.linearize(robot)).check(["wheel_x.inertia", "wheel_z.inertia"])
+    found = fflin.sensitivity(fflin.linearize(robot)).check(
+        ["wheel_x.inertia", "wheel_z.inertia"]
+    )
     assert len(found) == 2 and max(found.values()) < 1e-8
 
 
 def test_a_body_whose_joint_has_a_dot_in_its_name_is_found_by_it():
     held = fflin.load("ets_vii")
-    robot = fflin.capture(fflin.load("servicer_7dof"), "tool", held, prefix="client").robot
+    robot = fflin.capture(
+        fflin.load("servicer_7dof"), "tool", held, prefix="client"
+    ).robot
     S = fflin.sensitivity(fflin.linearize(robot))
     assert S["client.joint_3.mass"].name == "client.link_3.mass"
 
@@ -290,7 +324,9 @@ def test_a_thruster_that_burns_on_a_link_and_a_spring_out_of_rest():
     robot = fflin.load("ets_vii")
     q, v, _ = random_point(robot, np.random.default_rng(2), degrees=60.0)
     jet = fflin.Thruster("tool", (0.1, 0.2, -0.1), (0.0, 0.6, 0.8), name="jet")
-    robot = robot.replace(inputs=[jet], stiffness={"joint_3": 5.0}, rest={"joint_3": 0.7})
+    robot = robot.replace(
+        inputs=[jet], stiffness={"joint_3": 5.0}, rest={"joint_3": 0.7}
+    )
 
     def moved(step):
         return robot.replace(inputs=[replace(jet, position=(0.1 + step, 0.2, -0.1))])
@@ -301,7 +337,9 @@ def test_a_thruster_that_burns_on_a_link_and_a_spring_out_of_rest():
     S = fflin.sensitivity(fflin.linearize(robot, q, v, [3.0]))
     for name, of in (("jet.position.x", moved), ("joint_3.stiffness", stiffer)):
         # In both all is linear.
-        ends = [everything(fflin.linearize(of(step), q, v, [3.0])) for step in (0.5, -0.5)]
+        ends = [
+            everything(fflin.linearize(of(step), q, v, [3.0])) for step in (0.5, -0.5)
+        ]
         for high, low, got in zip(*ends, derived(S[name]), strict=True):
             expected = high - low
             assert np.abs(got - expected).max() <= 1e-10 * np.abs(expected).max(), name
@@ -312,7 +350,9 @@ def test_rotors_are_no_parameters_of_bodies():
     model.armature = np.r_[np.zeros(6), np.linspace(0.1, 2.0, model.nv - 6)]
     robot = fflin.from_model(model)
     q, v, u = random_point(robot, np.random.default_rng(2))
-    found = fflin.sensitivity(fflin.linearize(robot, q, v, u)).check(["base.mass", "joint_3.com.x"])
+    found = fflin.sensitivity(fflin.linearize(robot, q, v, u)).check(
+        ["base.mass", "joint_3.com.x"]
+    )
     assert max(found.values()) < 1e-8
 
 
@@ -324,7 +364,11 @@ def test_its_table_has_what_a_tenth_of_each_changes_and_the_most_first():
     shares = [float(row.split()[-1]) for row in rows]
     assert shares == sorted(shares, reverse=True) and len(rows) == 80
     largest = np.abs(S.lin.B).max()
-    for name, step in (("link_7.density", 0.1), ("link_3.mass", 0.95), ("link_7.com.x", 0.01)):
+    for name, step in (
+        ("link_7.density", 0.1),
+        ("link_3.mass", 0.95),
+        ("link_7.com.x", 0.01),
+    ):
         [row] = [row for row in rows if row.split()[0] == name]
         expected = 100.0 * step * np.abs(S[name].dB).max() / largest
         assert float(row.split()[-1]) == pytest.approx(expected, rel=0.05)
@@ -338,7 +382,9 @@ def test_its_table_ranks_links_or_what_is_asked_for():
     S = fflin.sensitivity(fflin.linearize(fflin.load("planar_detumble")))
 
     def shown(only=None):
-        return [row.split() for row in S.table(999, only).split("B [%]\n")[1].splitlines()]
+        return [
+            row.split() for row in S.table(999, only).split("B [%]\n")[1].splitlines()
+        ]
 
     # joint_3 is hand and target together.
     assert "joint_3.density" in S.names and "joint_3.stiffness" in S.names
@@ -346,11 +392,14 @@ def test_its_table_ranks_links_or_what_is_asked_for():
     assert owners == {"base", "link_1", "link_2", "link_3", "hand", "target"}
     assert {row[0] for row in shown("mass")} == {f"{name}.mass" for name in owners}
     assert shown("*.mass") == shown("mass")
-    assert shown("link_2.mass") == [row for row in shown("link_?.mass") if "_2" in row[0]]
+    assert shown("link_2.mass") == [
+        row for row in shown("link_?.mass") if "_2" in row[0]
+    ]
     assert {row[0].partition(".")[0] for row in shown("hand")} == {"hand"}
     assert {row[0][:13] for row in shown("hand.inertia*")} == {"hand.inertia."}
     assert [row[0] for row in shown("joint_3.density")] == ["joint_3.density"]
-    assert {len(row) for row in shown("density")} == {6}  # name, no unit, 1, 0.1, and A and B
+    # name, no unit, 1, 0.1, and A and B
+    assert {len(row) for row in shown("density")} == {6}
     with pytest.raises(fflin.UnknownNameError, match="'masss'"):
         S.table(3, "masss")
     assert says(S.table(3, "joint_1.stiffness"), "none of these")
@@ -381,7 +430,9 @@ def test_every_place_and_direction_of_a_thruster(axis, torque):
         expected = B(torque=0.5) - B(torque=-0.5)
         got = S["jet.torque"].dB
         assert np.abs(got - expected).max() < 1e-12 * np.abs(B()).max()
-        drawn = fflin.uncertain(robot.replace(inputs=[jet]), {"jet.torque": 0.5}).samples(3, seed=1)
+        drawn = fflin.uncertain(
+            robot.replace(inputs=[jet]), {"jet.torque": 0.5}
+        ).samples(3, seed=1)
         assert all(0.15 < -each.inputs[0].torque < 0.45 for each in drawn)
 
 
@@ -394,5 +445,7 @@ def test_in_orbit_masses_change_what_the_field_does():
         v = speed * rng.normal(size=robot.nv)
         for reference in (None, base):
             lin = fflin.linearize(robot, q, v, frame=frame, reference=reference)
-            found = fflin.sensitivity(lin).check(["link_3.mass", "base.inertia.xy", "link_7.com.x"])
+            found = fflin.sensitivity(lin).check(
+                ["link_3.mass", "base.inertia.xy", "link_7.com.x"]
+            )
             assert max(found.values()) < 2e-9

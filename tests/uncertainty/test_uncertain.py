@@ -17,7 +17,12 @@ CASES = {
     "servicer_7dof": {
         "base.mass": 0.2,
         "link_3.density": 0.3,
-        "link_7": {"com.x": (-0.05, 0.02), "com.z": (-0.2, -0.1), "mass": 0.1, "density": 0.1},
+        "link_7": {
+            "com.x": (-0.05, 0.02),
+            "com.z": (-0.2, -0.1),
+            "mass": 0.1,
+            "density": 0.1,
+        },
         "link_7.inertia.xz": (-0.001, 0.001),
         "panel_left.stiffness": (80.0, 120.0),
         "panel_left.damping": (0.0, 1.0),
@@ -40,7 +45,11 @@ CASES = {
 def posed(robot, seed=0):
     """A configuration with joints that have no spring at random."""
     rng = np.random.default_rng(seed)
-    free = [j.name for j in robot.joints if "panel" not in j.name and j.name not in robot.stiffness]
+    free = [
+        j.name
+        for j in robot.joints
+        if "panel" not in j.name and j.name not in robot.stiffness
+    ]
     return fflin.configuration(robot, {name: rng.uniform(-2.0, 2.0) for name in free})
 
 
@@ -61,7 +70,10 @@ def test_the_fraction_is_the_model_linearised_again(name):
         assert np.abs(B - lin.B).max() < 1e-11 * np.abs(lin.B).max()
         assert (C == lin.C).all() and (D == lin.D).all()
     rows = lft.at(draws)
-    assert np.allclose(rows[1][5], B, rtol=1e-12, atol=0.0) and rows[0].shape == (6, *A.shape)
+    assert np.allclose(rows[1][5], B, rtol=1e-12, atol=0.0) and rows[0].shape == (
+        6,
+        *A.shape,
+    )
 
 
 @pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
@@ -109,7 +121,9 @@ def test_it_is_printed_saved_and_handed_on(tmp_path):
     assert closed.ninputs == plant.ninputs
     A, *_ = lft.at(delta)
     within = np.linalg.inv(np.eye(14) - of_w @ plant.D[:14, :14])
-    assert np.allclose(plant.A + plant.B[:, :14] @ within @ of_w @ plant.C[:14], A, atol=1e-12)
+    assert np.allclose(
+        plant.A + plant.B[:, :14] @ within @ of_w @ plant.C[:14], A, atol=1e-12
+    )
 
 
 def test_samples_are_rigid_bodies_and_corners_that_are_none_are_counted():
@@ -126,7 +140,9 @@ def test_samples_are_rigid_bodies_and_corners_that_are_none_are_counted():
     moments = np.linalg.eigvalsh(body.inertia)
     xx = of.ranges[0].parameter.value
     others = np.delete(moments, np.abs(moments - xx).argmin())
-    bad = 2 * sum(2.0 * max(m) > sum(m) for m in ([*others, 0.7 * xx], [*others, 1.3 * xx]))
+    bad = 2 * sum(
+        2.0 * max(m) > sum(m) for m in ([*others, 0.7 * xx], [*others, 1.3 * xx])
+    )
     worst = of.worst(fflin.lqr(fflin.linearize(robot)), samples=20)
     assert bad and worst.tried == 20 + 4 - bad + 1
     assert worst.excluded == of.draws(20)[1] + bad
@@ -196,16 +212,23 @@ def test_a_wheel_with_friction_is_no_thruster():
     for delta, made in zip(of.draws(3)[0], of.samples(3), strict=True):
         lin, values = fflin.linearize(made), of.values(delta)
         assert made.damping["w"] == values["w.damping"]
-        assert np.abs(of.lft().at(values)[0] - lin.A).max() < 1e-11 * np.abs(lin.A).max()
+        assert (
+            np.abs(of.lft().at(values)[0] - lin.A).max() < 1e-11 * np.abs(lin.A).max()
+        )
 
 
 def test_rotors_count_in_the_fraction():
     model = fflin.load("ets_vii").model.copy()
     model.armature = np.linspace(0.1, 2.0, model.nv)
-    of = fflin.uncertain(fflin.from_model(model), {"base.mass": 0.3, "joint_2.density": 0.3})
+    of = fflin.uncertain(
+        fflin.from_model(model), {"base.mass": 0.3, "joint_2.density": 0.3}
+    )
     delta = np.array([0.6, -0.8])
     lin, (A, B, *_) = fflin.linearize(of.at(of.values(delta))), of.lft().at(delta)
-    assert np.abs(A - lin.A).max() <= 1e-11 and np.abs(B - lin.B).max() < 1e-11 * np.abs(B).max()
+    assert (
+        np.abs(A - lin.A).max() <= 1e-11
+        and np.abs(B - lin.B).max() < 1e-11 * np.abs(B).max()
+    )
 
 
 def test_a_wheel_too_large_for_its_carrier_is_no_robot():
@@ -222,7 +245,10 @@ def test_a_range_that_leaves_hardly_any_robot_is_one_line():
     rod = {"inertia": np.diag([1.0, 1.0, 1e-9])}
     robot = fflin.load("cubesat").with_mass_properties({"base": rod})
     of = fflin.uncertain(robot, {"base.inertia.xx": 0.5, "base.inertia.yy": 0.5})
-    for call in (lambda: of.samples(1), lambda: of.worst(fflin.lqr(fflin.linearize(robot)))):
+    for call in (
+        lambda: of.samples(1),
+        lambda: of.worst(fflin.lqr(fflin.linearize(robot))),
+    ):
         with pytest.raises(fflin.InputError, match="physical"):
             call()
 
@@ -276,13 +302,18 @@ def test_tied_parameters_have_one_delta():
     robot = fflin.load("servicer_7dof", stiffness=PANELS)
     tied = {"panel_*.stiffness": {"range": 0.2, "tied": True}, "base.mass": 0.1}
     of = fflin.uncertain(robot, tied)
-    lft, apart = of.lft(), fflin.uncertain(robot, {"panel_*.stiffness": 0.2, "base.mass": 0.1})
+    lft, apart = (
+        of.lft(),
+        fflin.uncertain(robot, {"panel_*.stiffness": 0.2, "base.mass": 0.1}),
+    )
     assert of.names == lft.parameters == ("base.mass", "panel_*.stiffness")
     assert lft.repeats.tolist() == [3.0, 2.0] and len(apart.names) == 3
     assert lft.units == ("kg", "1") and (lft.middle[1], lft.half[1]) == (1.0, 0.2)
     for delta, made in zip(of.draws(5, seed=3)[0], of.samples(5, seed=3), strict=True):
         factor = 1.0 + 0.2 * delta[1]
-        assert made.stiffness == pytest.approx({name: factor * k for name, k in PANELS.items()})
+        assert made.stiffness == pytest.approx(
+            {name: factor * k for name, k in PANELS.items()}
+        )
         lin = fflin.linearize(made)
         # By deltas, by the names of the set, and by the same delta for each of them.
         for A, B, *_ in (
@@ -297,13 +328,18 @@ def test_tied_parameters_have_one_delta():
 
 def test_tied_parameters_share_a_value_between_ends_and_the_worst_names_it():
     robot = fflin.load("servicer_7dof", stiffness=PANELS)
-    of = fflin.uncertain(robot, {"panel_*.stiffness": {"range": (50.0, 90.0), "tied": True}})
+    of = fflin.uncertain(
+        robot, {"panel_*.stiffness": {"range": (50.0, 90.0), "tied": True}}
+    )
     assert of.lft().units == ("N m/rad",)
     for made in of.samples(3):
         left, right = made.stiffness.values()
         assert left == right and 50.0 <= left <= 90.0
     worst = of.worst(fflin.lqr(fflin.linearize(robot)), samples=3)
-    assert list(worst.gain.parameters) == ["panel_*.stiffness"] and worst.tried == 3 + 2 + 1
+    assert (
+        list(worst.gain.parameters) == ["panel_*.stiffness"]
+        and worst.tried == 3 + 2 + 1
+    )
 
 
 def test_a_tied_share_takes_what_is_below_zero_further_from_it():
@@ -311,7 +347,9 @@ def test_a_tied_share_takes_what_is_below_zero_further_from_it():
     robot = robot.with_mass_properties({"base": {"com": [0.01, -0.02, 0.03]}})
     of = fflin.uncertain(robot, {"base.com.*": {"range": 0.5, "tied": True}})
     more = of.at({"base.com.*": 1.5})._bare.model.inertias[1].lever
-    assert more == pytest.approx([0.015, -0.03, 0.045]) and not of.refusal(np.array([1.0]))
+    assert more == pytest.approx([0.015, -0.03, 0.045]) and not of.refusal(
+        np.array([1.0])
+    )
     lin, (_, B, *_) = fflin.linearize(of.at({"base.com.*": 1.5})), of.lft().at([1.0])
     assert np.abs(B - lin.B).max() < 1e-11 * np.abs(B).max()
 
@@ -322,7 +360,10 @@ def test_a_tie_that_is_unclear_is_refused():
     for given, said in (
         ({pattern: {"range": 0.2}}, "tied"),
         ({pattern: {"range": 0.2, "tied": "yes"}}, "tied"),
-        ({pattern: {"range": 0.2, "tied": True}, "panel_left.stiffness": 0.1}, "tied to other"),
+        (
+            {pattern: {"range": 0.2, "tied": True}, "panel_left.stiffness": 0.1},
+            "tied to other",
+        ),
         ({"link_3.*": {"range": (1.0, 2.0), "tied": True}}, "units"),
     ):
         with pytest.raises(fflin.InputError, match=said):

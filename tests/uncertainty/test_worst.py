@@ -44,7 +44,9 @@ def test_nothing_that_is_drawn_is_worse_than_what_is_found(servicer, drawn):
     draws, frequencies = of.draws(drawn, seed=9)[0], np.geomspace(0.02, 3.0, 20)
     assert found.damping.value <= -loops.undamped(draws).max()
     assert found.gain.value >= loops.gains(whole_of(loops), draws, frequencies).max()
-    assert found.margin.value <= 1.0 / loops.gains(disk_of(gain), draws, frequencies).max()
+    assert (
+        found.margin.value <= 1.0 / loops.gains(disk_of(gain), draws, frequencies).max()
+    )
     # What is said is of the robot that is said.
     robot = of.at(found.margin.parameters)
     lin = fflin.linearize(robot)
@@ -63,7 +65,9 @@ def test_nothing_that_is_drawn_is_worse_than_what_is_found(servicer, drawn):
 
 @pytest.mark.exhaustive
 @pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
-def test_of_many_signals_the_bound_asks_no_more_of_slycot_than_it_can(monkeypatch, servicer):
+def test_of_many_signals_the_bound_asks_no_more_of_slycot_than_it_can(
+    monkeypatch, servicer
+):
     slycot = pytest.importorskip("slycot")
     asked, own = [], slycot.ab13md
     monkeypatch.setattr(slycot, "ab13md", lambda *a: asked.append(len(a[0])) or own(*a))
@@ -71,7 +75,9 @@ def test_of_many_signals_the_bound_asks_no_more_of_slycot_than_it_can(monkeypatc
     four = of.worst(gain, samples=2)
     assert 0 < len(asked) < 60 and set(asked) == {14}
     asked.clear()
-    many = {f"link_{i}.{part}": 0.2 for i in range(1, 8) for part in ("mass", "density")}
+    many = {
+        f"link_{i}.{part}": 0.2 for i in range(1, 8) for part in ("mass", "density")
+    }
     lft = fflin.uncertain(of.robot, many).lft()
     bound = 1.0 / worst._safe(Loops(lft, gain.K))
     assert not asked and len(lft.D11) == 63
@@ -90,7 +96,10 @@ SETS = {
 
 def peak(F, B, C, D):
     """Return a gain that is reached, from a grid of frequencies and finer ones about its best."""
-    found, w = 0.0, np.concatenate(((0.0,), np.abs(np.linalg.eigvals(F)), np.geomspace(1e-4, 1e3)))
+    found, w = (
+        0.0,
+        np.concatenate(((0.0,), np.abs(np.linalg.eigvals(F)), np.geomspace(1e-4, 1e3))),
+    )
     for width in (0.1, 0.01, 1e-3):
         sizes = response_size(w, F, B, C, D)
         found = max(found, sizes.max())
@@ -110,21 +119,28 @@ def springy(request):
     robot = fflin.load(request.param)
     if "joint_3" in robot.joint_names:
         robot = robot.replace(stiffness={"joint_3": 50.0}, damping={"joint_3": 0.1})
-    of, gain = fflin.uncertain(robot, SETS[request.param]), fflin.lqr(fflin.linearize(robot))
+    of, gain = (
+        fflin.uncertain(robot, SETS[request.param]),
+        fflin.lqr(fflin.linearize(robot)),
+    )
     scale = np.sqrt(gain.R.diagonal())
     corners = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
     rows, figures = np.vstack((corners, of.draws(40, seed=0)[0])), []
     for delta in rows:
         lin = fflin.linearize(of.at(of.values(delta)))
         F, poles = lin.A - lin.B @ gain.K, np.linalg.eigvals(lin.A - lin.B @ gain.K)
-        disk = peak(F, lin.B / scale, -scale[:, None] * gain.K, 0.5 * np.eye(len(scale)))
+        disk = peak(
+            F, lin.B / scale, -scale[:, None] * gain.K, 0.5 * np.eye(len(scale))
+        )
         damping = (-poles.real / np.abs(poles)).min()
         figures.append((damping, 1.0 / disk, -peak(F, lin.B, lin.C, lin.D)))
     return of, gain, np.array(figures)
 
 
 @pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
-def test_no_corner_and_no_draw_built_again_is_worse_than_what_is_found(monkeypatch, springy):
+def test_no_corner_and_no_draw_built_again_is_worse_than_what_is_found(
+    monkeypatch, springy
+):
     monkeypatch.setattr(worst, "_safe", lambda loops: np.inf)
     of, gain, figures = springy
     least = of.worst(gain, samples=40)
@@ -165,7 +181,9 @@ def test_the_bound_by_scaling_is_that_of_textbooks():
         d = worst.perron(Z)
         return d * Z / d.mT, worst.bound_of(Z[None], (d[:, 0], 0.0 * d[:, 0]))
 
-    assert scaled(np.array([[1.0, 4.0], [0.25, 1.0]]))[1] == pytest.approx(2.0, rel=1e-6)
+    assert scaled(np.array([[1.0, 4.0], [0.25, 1.0]]))[1] == pytest.approx(
+        2.0, rel=1e-6
+    )
     for Z in np.random.default_rng(0).normal(size=(20, 5, 5)) + 0j:
         alike, bound = scaled(Z)
         assert np.abs(np.linalg.eigvals(Z)).max() * (1.0 - 1e-12) <= bound
@@ -235,7 +253,9 @@ def test_what_is_safe_is_stable_and_no_more_is_promised():
     pytest.importorskip("slycot")
     robot = fflin.load("ets_vii")
     gain = fflin.lqr(fflin.linearize(robot))
-    of = fflin.uncertain(robot, {"base.mass": 0.5, "link_6.mass": 0.5, "link_6.com.z": (-0.3, 0.3)})
+    of = fflin.uncertain(
+        robot, {"base.mass": 0.5, "link_6.mass": 0.5, "link_6.com.z": (-0.3, 0.3)}
+    )
     worst, lft = of.worst(gain, samples=10), of.lft()
     rng = np.random.default_rng(5)
     for delta in min(worst.safe, 1.0) * rng.uniform(-1.0, 1.0, (200, 3)):
@@ -279,7 +299,9 @@ WHEELED = {
     "wheels alone": wheeled,
     "speeds regulated": lambda: wheeled([fflin.BaseTorque()]),
     "position regulated": lambda: wheeled([fflin.BaseForce()]),
-    "wheels with friction": lambda: wheeled([fflin.BaseTorque()], damping={"wheel_1": 1e-5}),
+    "wheels with friction": lambda: wheeled(
+        [fflin.BaseTorque()], damping={"wheel_1": 1e-5}
+    ),
 }
 
 
@@ -295,7 +317,11 @@ WHEELED = {
 def test_stability_is_that_of_the_regulated_states(layout):
     """Worst figures compared with loops of robots built again, over their regulated states."""
     robot = WHEELED[layout]()
-    ranges = {"base.density": (0.6, 1.5), "base.inertia.xy": (-5e-4, 5e-4), "wheel_3.inertia": 0.5}
+    ranges = {
+        "base.density": (0.6, 1.5),
+        "base.inertia.xy": (-5e-4, 5e-4),
+        "wheel_3.inertia": 0.5,
+    }
     gain = fflin.lqr(fflin.linearize(robot))
     of = fflin.uncertain(robot, ranges)
     found = of.worst(gain, samples=5)
@@ -322,7 +348,9 @@ def test_stability_is_that_of_the_regulated_states(layout):
     # The figures are of the robots at the parameters that the result names.
     lin = fflin.linearize(of.at(found.damping.parameters))
     poles = np.linalg.eigvals(lin.A[np.ix_(kept, kept)] - lin.B[kept] @ K)
-    assert (-poles.real / np.abs(poles)).min() == pytest.approx(found.damping.value, rel=1e-6)
+    assert (-poles.real / np.abs(poles)).min() == pytest.approx(
+        found.damping.value, rel=1e-6
+    )
 
 
 def test_unstable_loops_of_wheels_are_counted():
@@ -346,7 +374,9 @@ def test_unstable_loops_of_wheels_are_counted():
     assert found.tried == len(tried) and 0 < count < len(tried)
     assert found.unstable == count and found.margin.value == 0.0
     # The limit of stability lies outside the guaranteed ranges.
-    unstable = [abs(delta[0]) for delta, rate in zip(tried, growth, strict=True) if rate >= 0.0]
+    unstable = [
+        abs(delta[0]) for delta, rate in zip(tried, growth, strict=True) if rate >= 0.0
+    ]
     assert 0.0 < found.safe <= min(unstable)
 
 

@@ -17,4 +17,6 @@ def motion(robots):
 def watch(browser):
     """Open pages that are closed after the test, and must not have complained by then."""
     with contextlib.ExitStack() as pages:
-        yield lambda *given, **options: pages.enter_context(Watched(browser, *given, **options))
+        yield lambda *given, **options: pages.enter_context(
+            Watched(browser, *given, **options)
+        )

@@ -18,14 +18,17 @@ def posed(robot, q):
     """Return the placements in the world of the shapes of a robot at q."""
     poses = body_poses(robot, q)
     return [
-        pin.XYZQUATToSE3(poses[shape.joint - ROOT]) * shape.placement for shape in shapes(robot)[0]
+        pin.XYZQUATToSE3(poses[shape.joint - ROOT]) * shape.placement
+        for shape in shapes(robot)[0]
     ]
 
 
 def test_panels_of_an_array_turn_about_the_frame_at_which_it_is_clamped():
     rigid = fflin.load("inspector", lock=["hinge_*"])
     rotation = np.array([[4.27], [0.0], [0.3]])
-    array = fflin.FlexibleAppendage("panel_left_1", 0.25, [[0], [0], [2.71]], rotation, name="left")
+    array = fflin.FlexibleAppendage(
+        "panel_left_1", 0.25, [[0], [0], [2.71]], rotation, name="left"
+    )
     robot = rigid.replace(appendages=[array])
     # At rest nothing is moved.
     before, after = posed(rigid, rigid.neutral()), posed(robot, robot.neutral())
@@ -48,11 +51,15 @@ def test_panels_of_an_array_turn_about_the_frame_at_which_it_is_clamped():
 
 def test_an_array_without_rotation_moves_along_its_momentum():
     t = np.array([[0.0], [1.0], [2.0]])
-    array = fflin.FlexibleAppendage("panel_left_1", 0.25, t, np.zeros((3, 1)), name="left")
+    array = fflin.FlexibleAppendage(
+        "panel_left_1", 0.25, t, np.zeros((3, 1)), name="left"
+    )
     robot = fflin.load("inspector", lock=["hinge_*"], appendages=[array])
     before = posed(robot, robot.neutral())
     after = posed(robot, fflin.configuration(robot, {"left_mode_1": 0.3}))
-    moved = [(b, a) for b, a in zip(before, after, strict=True) if not a.isApprox(b, 1e-12)]
+    moved = [
+        (b, a) for b, a in zip(before, after, strict=True) if not a.isApprox(b, 1e-12)
+    ]
     assert moved
     frame = robot.model.frames[robot.model.getFrameId("panel_left_1")].placement
     # A mass |t|^2 with the momentum t has moved by t / |t|^2 for a unit of the amplitude.
@@ -69,7 +76,9 @@ def test_noise_in_place_of_zero_does_not_change_how_an_array_bends(turns):
     for noise in (0.0, 1e-13):
         rng = np.random.default_rng(1)
         parts = (x + noise * rng.normal(size=(3, 2)) for x in (t, r))
-        array = fflin.FlexibleAppendage("panel_left_1", [0.25, 1.1], *parts, name="left")
+        array = fflin.FlexibleAppendage(
+            "panel_left_1", [0.25, 1.1], *parts, name="left"
+        )
         robot = rigid.replace(appendages=[array])
         moved = fflin.configuration(robot, {"left_mode_1": 0.3, "left_mode_2": -0.1})
         poses.append(posed(robot, moved))
@@ -78,7 +87,9 @@ def test_noise_in_place_of_zero_does_not_change_how_an_array_bends(turns):
 
 
 def test_appendages_of_the_root_link_and_slosh_are_balls():
-    boom = fflin.FlexibleAppendage("base", 0.3, [[2], [0], [0]], [[0], [6], [0]], name="boom")
+    boom = fflin.FlexibleAppendage(
+        "base", 0.3, [[2], [0], [0]], [[0], [6], [0]], name="boom"
+    )
     noise = [[1e-13], [2e-13], [0]]  # in place of zero
     twist = fflin.FlexibleAppendage("base", 0.3, noise, [[0], [0], [1]], name="twist")
     tank = fflin.Slosh("base", 20.0, (0.0, 0.2, 0.1), frequency=0.2, name="tank")
@@ -86,15 +97,21 @@ def test_appendages_of_the_root_link_and_slosh_are_balls():
     robot = rigid.replace(appendages=[boom, twist, tank])
     drawn = shapes(robot)[0][len(shapes(rigid)[0]) :]
     assert [shape.kind for shape in drawn] == ["sphere", "box", "sphere"]
-    q = fflin.configuration(robot, {"boom_mode_1": 0.1, "twist_mode_1": 0.2, "tank_x": 0.05})
+    q = fflin.configuration(
+        robot, {"boom_mode_1": 0.1, "twist_mode_1": 0.2, "tank_x": 0.05}
+    )
     at_rest, moved = posed(robot, robot.neutral())[-3:], posed(robot, q)[-3:]
     # The boom's mass is at r / t = 3 m, and moves by 1 / t for a unit of the amplitude.
     assert at_rest[0].translation == pytest.approx([0.0, 0.0, 3.0])
-    assert (moved[0].translation - at_rest[0].translation)[0] == pytest.approx(0.05, rel=1e-3)
+    assert (moved[0].translation - at_rest[0].translation)[0] == pytest.approx(
+        0.05, rel=1e-3
+    )
     assert at_rest[1].translation == pytest.approx([0.0, 0.0, 0.0])
     assert pin.log3(moved[1].rotation) == pytest.approx([0.0, 0.0, 0.2])
     assert at_rest[2].translation == pytest.approx(tank.position)
-    assert moved[2].translation - at_rest[2].translation == pytest.approx([0.05, 0.0, 0.0])
+    assert moved[2].translation - at_rest[2].translation == pytest.approx(
+        [0.05, 0.0, 0.0]
+    )
 
 
 def test_the_page_of_modes_plays_the_arrays():
@@ -104,11 +121,15 @@ def test_the_page_of_modes_plays_the_arrays():
     assert not notes
     packed = re.findall(r'"poses":"([^"]+)"', html)
     assert len(packed) == len(found.vibrations)
-    arrays = [robot.model.getJointId(f"{side}_mode_1") - ROOT for side in ("left", "right")]
+    arrays = [
+        robot.model.getJointId(f"{side}_mode_1") - ROOT for side in ("left", "right")
+    ]
     swings = []
     for each in packed[:2]:
         poses = np.frombuffer(base64.b64decode(each), "<f4").reshape(48, -1, 7)
-        turns = [pin.log3(pin.XYZQUATToSE3(pose.astype(float)).rotation) for pose in poses[0]]
+        turns = [
+            pin.log3(pin.XYZQUATToSE3(pose.astype(float)).rotation) for pose in poses[0]
+        ]
         swings.append([turns[k] - turns[0] for k in arrays])
     assert np.linalg.norm(swings, axis=-1).min() > 0.05  # [rad] relative to the bus
     # The slowest mode bends both arrays towards the same side, the next towards opposite sides.

@@ -41,27 +41,39 @@ def test_pictures(robots, motion, tmp_path):
 
 def test_times_of_pictures_do_not_concern_a_page(robots, motion, tmp_path):
     page = tmp_path / "m.html"
-    fflin.visualize(robots["planar_detumble"], motion, html=page, times=[9.0], open=False)
+    fflin.visualize(
+        robots["planar_detumble"], motion, html=page, times=[9.0], open=False
+    )
     assert page.stat().st_size > 1000
 
 
-def test_along_a_trajectory_pictures_are_taken_all_the_way(robots, motion, tmp_path, monkeypatch):
+def test_along_a_trajectory_pictures_are_taken_all_the_way(
+    robots, motion, tmp_path, monkeypatch
+):
     taken = []
     monkeypatch.setattr("fflin.view.capture.find_chromium", lambda: "")
-    monkeypatch.setattr("fflin.view.capture.take_png", lambda _, at: taken.append(at) or b"")
+    monkeypatch.setattr(
+        "fflin.view.capture.take_png", lambda _, at: taken.append(at) or b""
+    )
     for each in (motion, led(motion)):
         fflin.visualize(robots["planar_detumble"], each, png=tmp_path / "m.png")
-    np.testing.assert_allclose(taken, np.array([[0, 0.08, 0.25, 1.0], [0, 0.35, 0.7, 1.0]]) * 4.0)
+    np.testing.assert_allclose(
+        taken, np.array([[0, 0.08, 0.25, 1.0], [0, 0.35, 0.7, 1.0]]) * 4.0
+    )
 
 
 def test_without_chromium_one_line_says_how(robots, motion, tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(fflin.MissingPackageError, match="apt install chromium") as caught:
+    with pytest.raises(
+        fflin.MissingPackageError, match="apt install chromium"
+    ) as caught:
         fflin.visualize(robots["planar_detumble"], motion, png=tmp_path / "m.png")
     assert "\n" not in str(caught.value) and not list(tmp_path.iterdir())
 
 
-def test_a_chromium_that_does_not_answer_is_one_line(robots, motion, tmp_path, monkeypatch):
+def test_a_chromium_that_does_not_answer_is_one_line(
+    robots, motion, tmp_path, monkeypatch
+):
     program = tmp_path / "chromium"
     program.write_text("#!/bin/sh\nexec sleep 60\n")
     program.chmod(0o755)
@@ -69,7 +81,9 @@ def test_a_chromium_that_does_not_answer_is_one_line(robots, motion, tmp_path, m
     monkeypatch.setattr("fflin.view.capture._PATIENCE", 0.1)
     monkeypatch.setattr("fflin.view.capture._PER_PICTURE", 0.0)
     with pytest.raises(fflin.FileError, match="respond"):
-        fflin.visualize(robots["planar_detumble"], motion, png=tmp_path / "m.png", times=[0.0])
+        fflin.visualize(
+            robots["planar_detumble"], motion, png=tmp_path / "m.png", times=[0.0]
+        )
     assert not (tmp_path / "m.png").exists()
 
 
@@ -111,7 +125,9 @@ def test_the_browser_ends_with_the_one_who_films(tmp_path, sent, code):
     browsing = f"--user-data-dir={folder}".encode()
     try:
         with finishing(process):
-            wait_until(lambda: list(folder.glob("*/Default")), "the profile of Chromium")
+            wait_until(
+                lambda: list(folder.glob("*/Default")), "the profile of Chromium"
+            )
             assert running(browsing)
             process.send_signal(sent)
             _, error = process.communicate()
@@ -136,6 +152,8 @@ def running(argument):
     """Whether a process has an argument that begins so."""
     for file in Path("/proc").glob("[0-9]*/cmdline"):
         with contextlib.suppress(OSError):
-            if any(each.startswith(argument) for each in file.read_bytes().split(b"\0")):
+            if any(
+                each.startswith(argument) for each in file.read_bytes().split(b"\0")
+            ):
                 return True
     return False

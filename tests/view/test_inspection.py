@@ -99,7 +99,11 @@ def test_a_chart_enlarges_and_its_cursor_reads_all_curves(flown, watched):
     robot, _, _ = flown
     width, height = watched.do("[innerWidth, innerHeight]")
     box = enlarge(watched, CHART)
-    assert box["height"] > 0.5 * height and box["x"] >= 0 and box["x"] + box["width"] <= width
+    assert (
+        box["height"] > 0.5 * height
+        and box["x"] >= 0
+        and box["x"] + box["width"] <= width
+    )
     joints = [name for name in robot.joint_names if name not in robot.wheels]
     for share in (0.0, 0.4, 0.9):
         x = box["x"] + share * (box["width"] - 52)
@@ -114,7 +118,9 @@ def test_a_chart_enlarges_and_its_cursor_reads_all_curves(flown, watched):
     # Without the pointer it reads the time of the motion.
     watched.page.mouse.move(1, 1)
     watched.do("fflin.seek(12)")
-    assert read(watched)["joint_1"][0] == pytest.approx(column(flown, "joint_1", 12.0), rel=2e-3)
+    assert read(watched)["joint_1"][0] == pytest.approx(
+        column(flown, "joint_1", 12.0), rel=2e-3
+    )
     watched.page.keyboard.press("Escape")
     assert watched.page.locator("#large").is_hidden()
 
@@ -130,7 +136,9 @@ def test_a_hidden_curve_leaves_the_chart_and_its_csv(flown, watched):
     watched.page.locator("#large .curves button", has_text="joint_2").click()
     watched.page.mouse.move(1, 1)
     assert before > 100 and colours(watched, colour) < 0.1 * before
-    assert [name for name, (_, shown) in read(watched).items() if not shown] == ["joint_2"]
+    assert [name for name, (_, shown) in read(watched).items() if not shown] == [
+        "joint_2"
+    ]
     with watched.page.expect_download() as saved:
         watched.page.locator("#large .head button", has_text=".csv").click()
     assert saved.value.suggested_filename == "servicer_7dof_joints.csv"
@@ -148,7 +156,9 @@ def test_a_hidden_curve_leaves_the_chart_and_its_csv(flown, watched):
 
 def test_the_bar_keeps_its_rows_while_the_motion_plays(watched):
     def tops():
-        return [each.bounding_box()["y"] for each in watched.page.locator("#bar > *").all()]
+        return [
+            each.bounding_box()["y"] for each in watched.page.locator("#bar > *").all()
+        ]
 
     found = []
     for time in (0.0, 9.99, 20.0):
@@ -163,11 +173,15 @@ def test_the_bar_keeps_its_rows_while_the_motion_plays(watched):
 
 def test_a_large_window_has_charts_that_can_be_read(flown, browser):
     with Watched(browser, flown[2].as_uri() + "#pause", size=(1600, 900)) as watched:
-        tall = [each.bounding_box() for each in watched.page.locator(".plot canvas").all()]
+        tall = [
+            each.bounding_box() for each in watched.page.locator(".plot canvas").all()
+        ]
         assert min(box["height"] for box in tall) > 46.0
         panel = watched.page.locator("#panel").bounding_box()
         assert panel["width"] < 0.4 * 1600
-        assert all(box["y"] + box["height"] <= panel["y"] + panel["height"] for box in tall)
+        assert all(
+            box["y"] + box["height"] <= panel["y"] + panel["height"] for box in tall
+        )
 
 
 def screen(watched, point):
@@ -245,7 +259,9 @@ def test_views_keys_and_their_help(flown, watched):
     for t in (4.0, 11.0):  # the camera goes with the tool
         watched.do(f"fflin.seek({t})")
         data = robot.model.createData()
-        pin.framesForwardKinematics(robot.model, data, motion.q[np.argmin(np.abs(motion.t - t))])
+        pin.framesForwardKinematics(
+            robot.model, data, motion.q[np.argmin(np.abs(motion.t - t))]
+        )
         x, y, z = data.oMf[robot.model.getFrameId("tool")].translation
         target = watched.do("viewer.controls.target.toArray()")
         np.testing.assert_allclose(target, [x, z, -y], atol=1e-4)
@@ -254,7 +270,12 @@ def test_views_keys_and_their_help(flown, watched):
     follow = watched.page.get_by_role("button", name="follow")
     assert follow.get_attribute("aria-pressed") == "true"
     watched.do("fflin.seek(4)")
-    for key, time in (("ArrowRight", 4.2), ("ArrowLeft", 4.0), ("End", 20.0), ("Home", 0.0)):
+    for key, time in (
+        ("ArrowRight", 4.2),
+        ("ArrowLeft", 4.0),
+        ("End", 20.0),
+        ("Home", 0.0),
+    ):
         watched.page.keyboard.press(key)
         assert watched.do("fflin.state.time") == pytest.approx(time)
     watched.page.keyboard.press("Space")
@@ -294,18 +315,30 @@ def test_thrusters_and_wheels_are_drawn_where_they_are(flown, watched):
         q = motion.q[np.argmin(np.abs(motion.t - t))]
         base = pin.XYZQUATToSE3(q[:7])
         for k, thruster in enumerate(thrusters):
-            shown = pin.XYZQUATToSE3(np.array(marks(watched, ("root_joint", f"nozzle {k}"))))
+            shown = pin.XYZQUATToSE3(
+                np.array(marks(watched, ("root_joint", f"nozzle {k}")))
+            )
             np.testing.assert_allclose(
                 shown.translation, base.act(np.array(thruster.position)), atol=1e-5
             )
             np.testing.assert_allclose(
-                shown.rotation[:, 1], base.rotation @ np.array(thruster.direction), atol=1e-5
+                shown.rotation[:, 1],
+                base.rotation @ np.array(thruster.direction),
+                atol=1e-5,
             )
-        size = watched.do("JSON.parse(document.getElementById('data').textContent).size")
+        size = watched.do(
+            "JSON.parse(document.getElementById('data').textContent).size"
+        )
         for k, axis in enumerate(np.eye(3)[1:]):
-            shown = pin.XYZQUATToSE3(np.array(marks(watched, ("root_joint", f"wheel {k}"))))
-            np.testing.assert_allclose(shown.translation, base.act(0.1 * size * axis), atol=1e-5)
-            np.testing.assert_allclose(shown.rotation[:, 2], base.rotation @ axis, atol=1e-5)
+            shown = pin.XYZQUATToSE3(
+                np.array(marks(watched, ("root_joint", f"wheel {k}")))
+            )
+            np.testing.assert_allclose(
+                shown.translation, base.act(0.1 * size * axis), atol=1e-5
+            )
+            np.testing.assert_allclose(
+                shown.rotation[:, 2], base.rotation @ axis, atol=1e-5
+            )
             if axis[1]:  # it turns as its joint does
                 data = robot.model.createData()
                 pin.forwardKinematics(robot.model, data, q)

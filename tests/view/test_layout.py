@@ -69,7 +69,8 @@ def overlap(one, other):
 def test_nothing_overlaps_is_clipped_or_wraps(watched, size):
     watched.resize(*size)
     parts = [
-        boxes(watched, name) for name in ("header h1", "header p", "#panel", "#bar", "#legend")
+        boxes(watched, name)
+        for name in ("header h1", "header p", "#panel", "#bar", "#legend")
     ]
     assert all(len(part) == 1 for part in parts)
     for one, other in itertools.combinations(np.concatenate(parts), 2):
@@ -77,13 +78,29 @@ def test_nothing_overlaps_is_clipped_or_wraps(watched, size):
     for left, top, right, bottom in np.concatenate(parts):
         assert left >= 0 and top >= 0 and right <= size[0] and bottom <= size[1]
     inner = ".plot .name > *, .plot canvas"
-    for selector in (".readouts > *", ".plot > *", ".plot .keys > *", "#legend label", inner):
+    for selector in (
+        ".readouts > *",
+        ".plot > *",
+        ".plot .keys > *",
+        "#legend label",
+        inner,
+    ):
         for one, other in itertools.combinations(boxes(watched, selector), 2):
             assert not overlap(one, other), selector
     # Nothing is wider than its place: no scrollbar below, no dots for what is left out.
     wide = "(each) => each.scrollWidth > each.clientWidth + 1 && each.clientWidth > 0"
-    for selector in ("html", "#panel", "#panel *", "#bar > *", "#legend label", "header *"):
-        assert watched.do(f"[...document.querySelectorAll({selector!r})].some({wide})") is False
+    for selector in (
+        "html",
+        "#panel",
+        "#panel *",
+        "#bar > *",
+        "#legend label",
+        "header *",
+    ):
+        assert (
+            watched.do(f"[...document.querySelectorAll({selector!r})].some({wide})")
+            is False
+        )
     # Each label stands on one line.
     for selector in (
         ".readouts > *",
@@ -101,8 +118,13 @@ def test_nothing_overlaps_is_clipped_or_wraps(watched, size):
 
 
 def test_its_scrollbar_is_as_dark_as_the_page(watched):
-    assert watched.do("getComputedStyle(document.documentElement).colorScheme") == "dark"
-    assert watched.do("getComputedStyle(document.getElementById('panel')).scrollbarWidth") == "thin"
+    assert (
+        watched.do("getComputedStyle(document.documentElement).colorScheme") == "dark"
+    )
+    assert (
+        watched.do("getComputedStyle(document.getElementById('panel')).scrollbarWidth")
+        == "thin"
+    )
     if watched.name == "canadarm2":  # where all of it has room there is none
         watched.resize(800, 600)
         panel = "document.getElementById('panel')"
@@ -125,15 +147,22 @@ def test_every_curve_can_be_told(watched):
         keys = dict(kin[0]["keys"])
         assert len({*keys.values()}) == len(keys) > 0
         names = {label for plot in kin for label, _, _ in plot["lines"]}
-        assert names == {*keys} if len(names) <= 12 else len(keys) == 8 and {*keys} < names
+        assert (
+            names == {*keys} if len(names) <= 12 else len(keys) == 8 and {*keys} < names
+        )
         for plot in kin:
             for label, colour, _ in plot["lines"]:
                 assert colour == keys.get(label, "#8a93a5")
             widest = max(plot["lines"], key=lambda line: np.ptp(line[2]))
             assert widest[0] in keys
-    assert watched.page.locator(".pale span").all_text_contents() == ["reference"] * watched.led
+    assert (
+        watched.page.locator(".pale span").all_text_contents()
+        == ["reference"] * watched.led
+    )
     texts = watched.page.locator(".keys:not(.pale) span").all_text_contents()
-    assert texts == [name for kin in families.values() for name, _ in kin[0]["keys"] or []]
+    assert texts == [
+        name for kin in families.values() for name, _ in kin[0]["keys"] or []
+    ]
     swatches = watched.do("""[...document.querySelectorAll('.keys:not(.pale) span')].map((each) =>
         each.style.getPropertyValue('--swatch'))""")
     assert swatches == [c for kin in families.values() for _, c in kin[0]["keys"] or []]
@@ -162,7 +191,8 @@ def test_thrusters_are_named_by_the_colour_of_their_plume(watched):
     })()""")
     keys = watched.do("fflin.plots.find((plot) => plot.title === 'thrusters').keys")
     assert len(tints) == len(keys) == (12 if watched.name == "cubesat" else 4)
-    for tint, (_, colour) in zip(tints, keys, strict=True):  # to the last digit of a byte
+    # to the last digit of a byte
+    for tint, (_, colour) in zip(tints, keys, strict=True):
         shown, named = (bytes.fromhex(each[1:]) for each in (tint, colour))
         np.testing.assert_allclose([*shown], [*named], atol=1)
 
@@ -207,7 +237,9 @@ def test_what_was_passed_leads_to_its_time(watch, tmp_path):
     u[motion.t > 12.5, at[0]], u[motion.t > 3.0, at[1]] = 5.0, -9.0
     limits = np.array([[-4.0, 4.0], [-4.0, 4.0]])
     path = tmp_path / "m.html"
-    fflin.visualize(robot, replace(motion, u=u, limit_names=names, limits=limits), html=path)
+    fflin.visualize(
+        robot, replace(motion, u=u, limit_names=names, limits=limits), html=path
+    )
     watched = watch(path.as_uri() + "#pause", size=(800, 600))
     line = watched.page.locator(".passed")
     expected = "limit exceeded, worst of 2:\ntau_m.joint_2 -9 N m at 3.01 s, limit -4"
@@ -266,7 +298,9 @@ def test_curves_and_limits_are_drawn_where_the_data_have_them(watch, tmp_path):
     assert not near[np.argmin(np.abs(values - 8.5))].any()
 
 
-def test_a_reference_is_pale_under_its_curve_and_a_line_is_where_it_rests(watch, tmp_path):
+def test_a_reference_is_pale_under_its_curve_and_a_line_is_where_it_rests(
+    watch, tmp_path
+):
     robot = fflin.load("ets_vii")
     motion = settling(robot, 20.0)
     at = motion.state_names.index("q_m.joint_1")
@@ -325,5 +359,7 @@ def test_sliders_of_the_live_page_can_be_aimed_at(browser, name):
         for one, other in itertools.combinations(boxes(watched, ".slider > *"), 2):
             assert not overlap(one, other)
         clipped = "(each) => each.scrollWidth > each.clientWidth"
-        clipped = watched.do(f"[...document.querySelectorAll('.slider span')].some({clipped})")
+        clipped = watched.do(
+            f"[...document.querySelectorAll('.slider span')].some({clipped})"
+        )
         assert not clipped

@@ -67,7 +67,10 @@ async def state(connection):
 
 def addresses():
     """This machine's addresses other than loopback."""
-    with contextlib.suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+    with (
+        contextlib.suppress(OSError),
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe,
+    ):
         probe.connect(("192.0.2.1", 9))  # sends nothing
         yield probe.getsockname()[0]
     yield "127.0.0.2"
@@ -128,7 +131,13 @@ def test_it_sends_where_the_robot_is_and_takes_the_sliders(live, robots):
         first = await state(connection)
         await connection.write_message(json.dumps({"joints": {"joint_2": 0.7}}))
         second = await state(connection)
-        for nonsense in ("", "{", "[]", '{"joints": {"none": 1}}', '{"joints": {"joint_2": "x"}}'):
+        for nonsense in (
+            "",
+            "{",
+            "[]",
+            '{"joints": {"none": 1}}',
+            '{"joints": {"joint_2": "x"}}',
+        ):
             await connection.write_message(nonsense)
         await connection.write_message(json.dumps({"neutral": True}))
         third = await state(connection)
@@ -159,7 +168,8 @@ def test_what_is_nested_too_deep_ends_its_connection_alone(opening, live, caplog
         while await received(connection) is not None:
             pass
         await state(other)
-        await other.write_message(json.dumps({"joints": {"joint_2": 10**400}}))  # passed over
+        # passed over
+        await other.write_message(json.dumps({"joints": {"joint_2": 10**400}}))
         await other.write_message(json.dumps({"joints": {"joint_2": 0.5}}))
         after = await state(other)
         for each in (connection, other):
@@ -180,7 +190,10 @@ def test_a_running_simulation_is_shown_as_it_runs(robots):
     seen = []
     with fflin.visualize(robot, open=False, speed=4.0) as live:
         show = live.show
-        live.show = lambda q, t: (seen.append((t, q.copy(), time.monotonic())), show(q, t))
+        live.show = lambda q, t: (
+            seen.append((t, q.copy(), time.monotonic())),
+            show(q, t),
+        )
         begun = time.monotonic()
         motion = fflin.simulate(robot, v0=v, duration=2.0, callback=live)
         assert json.loads(live._state)["time"] == pytest.approx(2.0)
@@ -200,7 +213,11 @@ def test_a_slow_browser_gets_the_newest_state_and_not_all(live, robots):
     with socket.create_connection(("127.0.0.1", live.port)) as slow:
         host = f"127.0.0.1:{live.port}"
         lines = ["GET /socket HTTP/1.1", f"Host: {host}", f"Origin: http://{host}"]
-        lines += ["Connection: Upgrade", "Upgrade: websocket", "Sec-WebSocket-Version: 13"]
+        lines += [
+            "Connection: Upgrade",
+            "Upgrade: websocket",
+            "Sec-WebSocket-Version: 13",
+        ]
         lines += ["Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==", "", ""]
         slow.sendall("\r\n".join(lines).encode())
         wait_until(lambda: live._clients, "the connection")
@@ -294,7 +311,9 @@ def test_the_page_follows_in_a_browser(live, robots, browser):
         watched.wait("fflin.state.time === 0.25")
         data = robot.model.createData()
         pin.forwardKinematics(robot.model, data, q)
-        for name, placement in zip(list(robot.model.names)[ROOT:], data.oMi[ROOT:], strict=True):
+        for name, placement in zip(
+            list(robot.model.names)[ROOT:], data.oMi[ROOT:], strict=True
+        ):
             pose = watched.pose(["meshcat", "robot", name])
             assert pin.XYZQUATToSE3(np.array(pose)).isApprox(placement, 1e-6)
         moved = watched.picture()

@@ -19,7 +19,8 @@ def area(vertices, faces):
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize(
     "robot",
-    [pytest.param(name, marks=pytest.mark.exhaustive) for name in ("panda", "anymal")] + ["kinova"],
+    [pytest.param(name, marks=pytest.mark.exhaustive) for name in ("panda", "anymal")]
+    + ["kinova"],
 )
 def test_collada_has_the_triangles_of_pinocchios_loader(robot):
     paths = {s.mesh for s in shapes(fflin.load(robot))[0] if s.mesh}
@@ -33,7 +34,10 @@ def test_collada_has_the_triangles_of_pinocchios_loader(robot):
         corners = np.concatenate([v[f].reshape(-1, 3) for v, f, _ in parts])
         # Assimp leaves out triangles without area.
         assert len(corners) / 3 == pytest.approx(len(faces), rel=1e-3)
-        for ours, theirs in ((corners.min(0), vertices.min(0)), (corners.max(0), vertices.max(0))):
+        for ours, theirs in (
+            (corners.min(0), vertices.min(0)),
+            (corners.max(0), vertices.max(0)),
+        ):
             np.testing.assert_allclose(ours, theirs, atol=1e-6)
         if len(parts) == 1:  # of several, coal 3.0 mixes up the vertices
             whole = area(*parts[0][:2])
@@ -68,8 +72,11 @@ def test_collada_composes_the_transforms_of_its_nodes(tmp_path):
     path.write_text(COLLADA)
     ((vertices, faces, color),) = _colored(path)
     assert color == pytest.approx((1.0, 0.5, 0.0, 1.0), abs=1 / 255) and len(faces) == 3
-    theirs = 0.01 * _triangles(path)[0]  # Pinocchio's loader pays no heed to the unit either
-    assert {tuple(x) for x in np.round(vertices, 6)} == {tuple(x) for x in np.round(theirs, 6)}
+    # Pinocchio's loader pays no heed to the unit either
+    theirs = 0.01 * _triangles(path)[0]
+    assert {tuple(x) for x in np.round(vertices, 6)} == {
+        tuple(x) for x in np.round(theirs, 6)
+    }
 
 
 def test_a_mesh_that_is_mended_is_read_again(tmp_path):
@@ -123,7 +130,9 @@ NODES = """<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version
         ),
         (
             "".join(
-                f'<node id="n{k}">' + 2 * f'<instance_node url="#n{k + 1}"/>' + "</node>"
+                f'<node id="n{k}">'
+                + 2 * f'<instance_node url="#n{k + 1}"/>'
+                + "</node>"
                 for k in range(40)
             ),
             "nodes",
@@ -142,7 +151,9 @@ def test_meshes_do_not_wait_for_pipes(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     triangle = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
     (tmp_path / "a.obj").write_text(f"mtllib pipe\n{triangle}")
-    buffers = '{"asset": {"version": "2.0"}, "buffers": [{"uri": "pip%65", "byteLength": 9}]}'
+    buffers = (
+        '{"asset": {"version": "2.0"}, "buffers": [{"uri": "pip%65", "byteLength": 9}]}'
+    )
     (tmp_path / "a.gltf").write_text(buffers)
     for name in ("a.obj", "a.gltf"):
         with pytest.raises(ValueError, match="not a regular file"):

@@ -90,7 +90,9 @@ def test_the_base_swings_against_what_bends(shown):
 
     def centre(at):
         masses = [inertia.mass for inertia in inertias]
-        points = [T[:3, :3] @ i.lever + T[:3, 3] for T, i in zip(at, inertias, strict=True)]
+        points = [
+            T[:3, :3] @ i.lever + T[:3, 3] for T, i in zip(at, inertias, strict=True)
+        ]
         return np.average(points, axis=0, weights=masses)
 
     rest = poses(robot, found.lin.q)
@@ -101,7 +103,8 @@ def test_the_base_swings_against_what_bends(shown):
         # Half of there less back is the swing to the second order.
         swing = (there - back) / 2.0
         held = rest + swing
-        held[:] = np.linalg.inv(rest[0] + swing[0]) @ held  # as if the base did not move
+        # as if the base did not move
+        held[:] = np.linalg.inv(rest[0] + swing[0]) @ held
         way = np.linalg.norm(centre(rest + swing) - com)
         moved = np.linalg.norm(centre(rest[0] @ held) - com)
         assert way < 0.05 * moved  # sin x is x to the third order of half a radian
@@ -113,7 +116,9 @@ def test_a_mode_is_picked_by_name_and_frequency(shown):
     _, found, watched = shown
     rows = watched.page.locator(".choices button")
     assert rows.count() == 3
-    assert watched.page.locator(".figures").first.locator("span").all_text_contents() == [
+    assert watched.page.locator(".figures").first.locator(
+        "span"
+    ).all_text_contents() == [
         *("rad/s", "Hz", "damping"),
     ]
     for index, mode in enumerate(found.vibrations):
@@ -127,7 +132,11 @@ def test_a_mode_is_picked_by_name_and_frequency(shown):
         half = len(mode.shape) // 2
         largest = found.state_names[int(np.abs(mode.shape[:half]).argmax())]
         body, part = next(iter(mode.energy.items()))
-        assert row.locator("b").text_content().startswith(f"{body} {100.0 * part:.0f}\u00a0%")
+        assert (
+            row.locator("b")
+            .text_content()
+            .startswith(f"{body} {100.0 * part:.0f}\u00a0%")
+        )
         shape = watched.page.locator(".shape span").first.text_content()
         assert shape == largest
     watched.page.keyboard.press("ArrowUp")
@@ -155,7 +164,8 @@ def test_it_plays_at_a_rate_to_be_watched(shown):
 
 
 def test_what_cannot_be_shown_is_one_line_and_no_file(robots, tmp_path, monkeypatch):
-    monkeypatch.setenv("PATH", str(tmp_path))  # without Chromium the reasons are the same
+    # without Chromium the reasons are the same
+    monkeypatch.setenv("PATH", str(tmp_path))
     page, bent = tmp_path / "m.html", fflin.load("servicer_7dof", stiffness=STIFF)
     rigid = robots["ets_vii"]
     found = fflin.modes(fflin.linearize(bent))

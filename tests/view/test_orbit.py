@@ -22,15 +22,21 @@ def pages(tmp_path_factory):
 
 
 def test_what_pages_are_told(pages):
-    lvlh, hill, plain = (page_data(pages / f"{x}.html") for x in ("lvlh", "hill", "hybrid"))
+    lvlh, hill, plain = (
+        page_data(pages / f"{x}.html") for x in ("lvlh", "hill", "hybrid")
+    )
     assert "orbit" not in plain and "up" not in plain
     orbit = fflin.CircularOrbit(700e3)
     for data in (lvlh, hill):
-        assert data["orbit"]["distance"] == pytest.approx(orbit.radius / orbit.body_radius)
+        assert data["orbit"]["distance"] == pytest.approx(
+            orbit.radius / orbit.body_radius
+        )
         assert data["orbit"]["rate"] == orbit.mean_motion
         # The axes of the screen are those of the frame, in another order.
         Q = np.array(data["up"])
-        assert np.allclose(Q @ Q.T, np.eye(3)) and np.linalg.det(Q) == pytest.approx(1.0)
+        assert np.allclose(Q @ Q.T, np.eye(3)) and np.linalg.det(Q) == pytest.approx(
+            1.0
+        )
         assert "700 km over earth" in data["subtitle"]
     assert np.allclose(lvlh["up"], [[1, 0, 0], [0, 0, -1], [0, 1, 0]])
     assert np.allclose(hill["up"], [[0, 1, 0], [1, 0, 0], [0, 0, -1]])
@@ -51,12 +57,15 @@ def look(watched, towards, up=(0, 1, 0)):
 @pytest.mark.browser
 @pytest.mark.parametrize("frame", ["lvlh", "hill"])
 def test_the_earth_is_below_in_its_true_size_and_goes_back(pages, watch, frame):
-    watched = watch((pages / f"{frame}.html").as_uri() + "#pause", size=SIZE, painted=True)
+    watched = watch(
+        (pages / f"{frame}.html").as_uri() + "#pause", size=SIZE, painted=True
+    )
     orbit = fflin.CircularOrbit(700e3)
     dip = np.arccos(orbit.body_radius / orbit.radius)
     level = look(watched, (-np.cos(dip), -np.sin(dip), 0.0))
     blue = level[:, WIDTH // 2 - 10 : WIDTH // 2 + 10, 2].mean(axis=1)
-    assert abs(int(blue.argmax()) - HEIGHT / 2) < 8  # the rim of the air is at the horizon
+    # the rim of the air is at the horizon
+    assert abs(int(blue.argmax()) - HEIGHT / 2) < 8
     assert blue[: HEIGHT // 4].max() < 0.3 * blue.max()
     assert blue[3 * HEIGHT // 4 :].min() > 0.3 * blue.max()
     # Straight down, ahead being up: what was below is behind after some seconds.

@@ -63,9 +63,12 @@ def largest_difference(watched, robot, q, node="robot"):
 @pytest.mark.browser
 def test_bodies_stand_where_forward_kinematics_puts_them(settled, watch):
     robot, motion, path = settled
-    watched = watch(path.as_uri() + "#pause")  # not painted: drawing takes most of the time
+    # not painted: drawing takes most of the time
+    watched = watch(path.as_uri() + "#pause")
     for t in (0.0, 1.3, 5.0, 11.9, 20.0):
-        watched.do(f"viewer.animator.pause(); viewer.animator.seek({t}); viewer.render()")
+        watched.do(
+            f"viewer.animator.pause(); viewer.animator.seek({t}); viewer.render()"
+        )
         q = motion.q[np.argmin(np.abs(motion.t - t))]
         assert largest_difference(watched, robot, q) < EXACT, t
     # And they would not pass for those of another time.
@@ -88,7 +91,10 @@ def test_pieces_stand_where_the_urdf_puts_them(settled, watched):
             return {{matrix: m.matrixWorld.toArray(), kind: m.geometry.type}};
         }})()""")
         world = np.reshape(matrix["matrix"], (4, 4)).T
-        upright = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1.0]]) @ world
+        upright = (
+            np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1.0]])
+            @ world
+        )
         expected = (placed[names[shape.joint]] * shape.placement).homogeneous
         if matrix["kind"] == "CylinderGeometry":  # along y there, along z in URDF
             upright = upright @ np.array(
@@ -110,7 +116,9 @@ def test_slider_play_speed_and_keys_work(settled, watched):
     page = watched.page
     slider = page.locator("#bar input[type=range]")
     slider.fill("7.5")
-    assert watched.do("fflin.state.time") == 7.5 and not watched.do("fflin.state.playing")
+    assert watched.do("fflin.state.time") == 7.5 and not watched.do(
+        "fflin.state.playing"
+    )
     assert page.locator("#bar output").text_content().startswith("7.50 /")
     before = watched.pose(["meshcat", "robot", "root_joint"])
     watched.do("fflin.seek(0)")
@@ -149,10 +157,14 @@ def test_the_panel_says_what_the_motion_says(settled, watched):
         angle = np.degrees(np.linalg.norm(pin.log3(base.rotation)))
         assert float(values[0].split()[0]) == pytest.approx(angle, rel=6e-3)
         distance = np.linalg.norm(base.translation)
-        assert float(values[1].split()[0]) == pytest.approx(distance, rel=6e-3, abs=1e-9)
+        assert float(values[1].split()[0]) == pytest.approx(
+            distance, rel=6e-3, abs=1e-9
+        )
         assert values[3] == "1.0e-13"  # the motion's own
     plots = watched.page.locator(".plot .name").all_text_contents()
-    assert plots[0].startswith("attitude error") and any("joint torques" in p for p in plots)
+    assert plots[0].startswith("attitude error") and any(
+        "joint torques" in p for p in plots
+    )
     # The cursor moves with the slider, and a click moves the slider.
     canvas = watched.page.locator(".plot canvas").first
     for t in (2, 12):
@@ -171,7 +183,9 @@ def test_the_panel_says_what_the_motion_says(settled, watched):
             return bright.indexOf(Math.max(...bright)) / width;
         })()""")
         ruled = canvas.bounding_box()["width"] - 44  # figures stand in the rest
-        assert column * canvas.bounding_box()["width"] == pytest.approx(t / 20.0 * ruled, abs=2.5)
+        assert column * canvas.bounding_box()["width"] == pytest.approx(
+            t / 20.0 * ruled, abs=2.5
+        )
     canvas.click(position={"x": ruled / 4, "y": 20})
     assert watched.do("fflin.state.time") == pytest.approx(5.0, abs=0.1)
     watched.page.keyboard.press("Escape")  # the click has enlarged the chart
@@ -211,14 +225,20 @@ def test_all_of_the_motion_is_within_the_view(settled, watched, width, height):
     """Robot, target and tips of forces lie in what the panels leave free, and fill it well."""
     _, motion, _ = settled
     watched.resize(width, height)
-    points = watched.do("JSON.parse(document.getElementById('data').textContent).points")
+    points = watched.do(
+        "JSON.parse(document.getElementById('data').textContent).points"
+    )
     seen = on_screen(watched, points)
-    panel, bar = (watched.page.locator(name).bounding_box() for name in ("#panel", "#bar"))
+    panel, bar = (
+        watched.page.locator(name).bounding_box() for name in ("#panel", "#bar")
+    )
     low, high = seen.min(axis=0), seen.max(axis=0)
     assert bar["x"] >= 0 and bar["x"] + bar["width"] <= width
     for item in watched.page.locator("#bar > *").all():
         box = item.bounding_box()
-        assert box["x"] >= bar["x"] and box["x"] + box["width"] <= bar["x"] + bar["width"]
+        assert (
+            box["x"] >= bar["x"] and box["x"] + box["width"] <= bar["x"] + bar["width"]
+        )
     assert low.min() > 0 and high[0] < width and high[1] < bar["y"]
     assert high[0] < panel["x"] or high[1] < panel["y"]  # beside the panel, or above it
     assert (high - low).max() > 0.4 * min(width, height)
@@ -268,7 +288,9 @@ def test_forces_trails_and_the_legend(settled, watched):
                 pushed = HOME.rotation @ motion.u[index, 3:6]
             arrow = np.array(tip) - base.translation
             lengths.append(np.linalg.norm(arrow) / np.linalg.norm(pushed))
-            np.testing.assert_allclose(arrow / lengths[-1], pushed, rtol=1e-4, atol=1e-3)
+            np.testing.assert_allclose(
+                arrow / lengths[-1], pushed, rtol=1e-4, atol=1e-3
+            )
         assert lengths[0] == pytest.approx(lengths[1], rel=1e-4)
     # Trails are drawn as far as tool and centre of mass have come, and by a line's width exact.
     model, data = robot.model, robot.model.createData()
@@ -333,7 +355,10 @@ def test_no_complaint_and_no_request(settled, watched):
 def test_a_lab_with_meshes_plumes_and_a_prediction(robots, watch, tmp_path):
     robot = fflin.load("panda")
     robot = robot.replace(
-        inputs=[*robot.inputs, fflin.Thruster("panda_link0", (0.1, 0, 0), (0, 0, 1), "up")],
+        inputs=[
+            *robot.inputs,
+            fflin.Thruster("panda_link0", (0.1, 0, 0), (0, 0, 1), "up"),
+        ],
     )
     motion = settling(robot, duration=2.0, predicted=True)
     path = tmp_path / "panda.html"
@@ -379,7 +404,8 @@ def test_a_lab_with_meshes_plumes_and_a_prediction(robots, watch, tmp_path):
     })()""")
     assert drawn["robot"] == drawn["target"] == drawn["linear"] > 100_000
     node = (
-        "viewer.scene_tree.find(['meshcat', 'robot', 'root_joint', 'plume 0']).object.children[0]"
+        "viewer.scene_tree.find(['meshcat', 'robot', 'root_joint', 'plume 0'])"
+        ".object.children[0]"
     )
     assert watched.do(f"{node}.visible")
     # The gas leaves the thruster against its push.
@@ -393,31 +419,41 @@ def test_a_lab_with_meshes_plumes_and_a_prediction(robots, watch, tmp_path):
     link = link * robot.model.frames[robot.model.getFrameId("panda_link0")].placement
     np.testing.assert_allclose(gas[0], link.act(np.array([0.1, 0, 0])), atol=EXACT)
     away = np.subtract(gas[1], gas[0])
-    np.testing.assert_allclose(away / np.linalg.norm(away), -link.rotation[:, 2], atol=EXACT)
+    np.testing.assert_allclose(
+        away / np.linalg.norm(away), -link.rotation[:, 2], atol=EXACT
+    )
     strong = watched.do(f"{node}.children[0].scale.y")
     watched.do("fflin.seek(2)")
     assert watched.do(f"{node}.children[0].scale.y") < strong
     assert np.median(watched.picture()[:40]) > 150
 
 
-@pytest.mark.parametrize(("name", "limit"), [("servicer_7dof", 3e6), *exhaustive(("talos", 8e6))])
+@pytest.mark.parametrize(
+    ("name", "limit"), [("servicer_7dof", 3e6), *exhaustive(("talos", 8e6))]
+)
 @pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
 def test_the_files_are_small(name, limit, tmp_path):
     robot = fflin.load(name)
     path = tmp_path / "motion.html"
-    fflin.visualize(robot, settling(robot, duration=20.0, predicted=True), html=path, fps=30)
+    fflin.visualize(
+        robot, settling(robot, duration=20.0, predicted=True), html=path, fps=30
+    )
     assert os.path.getsize(path) < limit
 
 
 def test_the_floor_lies_below_all_of_the_motion_and_the_target(tmp_path):
     robot = fflin.load("ur5").replace(gravity=(0.0, 0.0, -9.81))
-    start = fflin.configuration(robot, base=pin.SE3(np.eye(3), np.array([0.5, 0.0, 2.0])))
+    start = fflin.configuration(
+        robot, base=pin.SE3(np.eye(3), np.array([0.5, 0.0, 2.0]))
+    )
     motion = fflin.simulate(robot, None, q0=start, duration=0.2)
     path = tmp_path / "high.html"
     fflin.visualize(robot, motion, html=path, target=robot.neutral())
     shown = page_data(path)
     assert shown["scene"] == "lab" and shown["floor"][2] < 0.1
-    assert min(z for _, _, z in shown["points"]) == pytest.approx(shown["floor"][2], abs=1e-4)
+    assert min(z for _, _, z in shown["points"]) == pytest.approx(
+        shown["floor"][2], abs=1e-4
+    )
     assert not shown["follow"]
 
 
@@ -484,7 +520,8 @@ def test_a_reference_moves_and_is_shown_where_it_is(led_page):
         watched.do(f"fflin.seek({t})")
         index = np.argmin(np.abs(motion.t - t))
         target = state.to_pinocchio(motion.target[index])[0]
-        assert largest_difference(watched, robot, target, "target") < 2e-3  # between two frames
+        # between two frames
+        assert largest_difference(watched, robot, target, "target") < 2e-3
         base, to = (pin.XYZQUATToSE3(q[:7]) for q in (motion.q[index], target))
         angle = np.degrees(np.linalg.norm(pin.log3(to.actInv(base).rotation)))
         value = watched.page.locator(".readouts b").first.text_content()
@@ -548,6 +585,8 @@ def test_a_reference_adds_little_to_the_page(led_page):
     rows = len(shown["t"]) * 3 / 16
     assert rows < 130 < len(motion.t)
     added = sum(len(each["points"]) for each in shown["followed"])
-    added += sum(len(line["reference"]) for plot in shown["plots"] for line in plot["lines"])
+    added += sum(
+        len(line["reference"]) for plot in shown["plots"] for line in plot["lines"]
+    )
     # Two paths of three single floats and three joints, in base64.
     assert added <= 16 / 3 * rows * (2 * 3 + 3) + 40

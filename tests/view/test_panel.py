@@ -40,7 +40,9 @@ def every(motion):
 
 def limited(motion, limits):
     """Return the motion with limits {name: (least, largest)}."""
-    return replace(motion, limit_names=tuple(limits), limits=np.array(list(limits.values())))
+    return replace(
+        motion, limit_names=tuple(limits), limits=np.array(list(limits.values()))
+    )
 
 
 def test_errors_are_those_of_the_pose(robots):
@@ -48,15 +50,21 @@ def test_errors_are_those_of_the_pose(robots):
     robot = robots["ets_vii"]  # its joints are continuous
     turns = dict(zip(robot.joint_names, (0.3, 3.0, -1.0, 0.0, 1.0, -3.0), strict=True))
     target = fflin.configuration(robot, turns, random_pose(rng, 50.0))
-    step = np.concatenate((rng.normal(size=3), np.radians(37.0) * np.array([0.6, 0, 0.8])))
+    step = np.concatenate(
+        (rng.normal(size=3), np.radians(37.0) * np.array([0.6, 0, 0.8]))
+    )
     v = np.concatenate((np.zeros(6), [0.1, 0.7, 0.2, 0, 0, -1.1]))
     q = pin.integrate(robot.model, target, v)
     base = pin.XYZQUATToSE3(target[:7]) * pin.SE3(pin.exp3(step[3:]), step[:3])
     q[:7] = pin.SE3ToXYZQUAT(base)
     found = errors(robot, np.array([target, q]), target[None], robot.wheels)
     np.testing.assert_allclose(found["attitude"][1], [0, 37.0], atol=1e-6)
-    np.testing.assert_allclose(found["position"][1], [0, np.linalg.norm(step[:3])], atol=1e-12)
-    np.testing.assert_allclose(found["largest joint"][1], np.degrees([0, 1.1]), atol=1e-7)
+    np.testing.assert_allclose(
+        found["position"][1], [0, np.linalg.norm(step[:3])], atol=1e-12
+    )
+    np.testing.assert_allclose(
+        found["largest joint"][1], np.degrees([0, 1.1]), atol=1e-7
+    )
     assert "largest prismatic joint" not in found
 
 
@@ -64,20 +72,29 @@ def test_errors_from_a_target_that_moves_are_those_of_the_same_moment(robots):
     robot = robots["ets_vii"]
     rng = np.random.default_rng(3)
     targets = np.array(
-        [pin.integrate(robot.model, robot.neutral(), v) for v in rng.normal(size=(4, robot.nv))]
+        [
+            pin.integrate(robot.model, robot.neutral(), v)
+            for v in rng.normal(size=(4, robot.nv))
+        ]
     )
     step = np.concatenate(
         (np.zeros(3), np.radians(20.0) * np.array([0, 0.6, 0.8]), 0.2 * np.ones(6))
     )
-    q = np.array([pin.integrate(robot.model, each, s * step) for s, each in enumerate(targets)])
+    q = np.array(
+        [pin.integrate(robot.model, each, s * step) for s, each in enumerate(targets)]
+    )
     found = errors(robot, q, targets, robot.wheels)
     np.testing.assert_allclose(found["attitude"][1], [0, 20, 40, 60], atol=1e-6)
-    np.testing.assert_allclose(found["largest joint"][1], np.degrees([0, 0.2, 0.4, 0.6]), atol=1e-7)
+    np.testing.assert_allclose(
+        found["largest joint"][1], np.degrees([0, 0.2, 0.4, 0.6]), atol=1e-7
+    )
 
 
 def test_metres_are_not_taken_for_degrees_nor_wheels_for_joints():
     robot = fflin.load("panda")  # its fingers slide
-    robot = robot.replace(inputs=[*robot.inputs, fflin.ReactionWheel((0, 0, 1), inertia=1e-3)])
+    robot = robot.replace(
+        inputs=[*robot.inputs, fflin.ReactionWheel((0, 0, 1), inertia=1e-3)]
+    )
     target = robot.neutral()
     q = fflin.configuration(robot, {"panda_joint2": -0.1, "panda_finger_joint1": 0.03})
     robot.joint("wheel_1").place(q, 2.0)
@@ -87,7 +104,10 @@ def test_metres_are_not_taken_for_degrees_nor_wheels_for_joints():
     motion = settling(robot, 1.0)
     shown = panel(robot, motion, every(motion), target[None])
     labels = {each["label"]: each["unit"] for each in shown["readouts"]}
-    assert labels["largest joint error"] == "°" and labels["largest prismatic joint error"] == "m"
+    assert (
+        labels["largest joint error"] == "°"
+        and labels["largest prismatic joint error"] == "m"
+    )
     assert subtitle(robot) == f"{robot.n - 1} joints, 1 wheel, 17.45 kg"
 
 
@@ -122,7 +142,9 @@ def test_plots_have_the_units_of_the_model():
     drawn = charts({"plots": shown})
     for joint in robot.joints:
         of, by = (
-            ("prismatic joints", "joint forces") if joint.prismatic else ("joints", "joint torques")
+            ("prismatic joints", "joint forces")
+            if joint.prismatic
+            else ("joints", "joint torques")
         )
         x = motion.x[every(motion), motion.state_names.index(f"q_m.{joint.name}")]
         u = motion.u[every(motion), motion.input_names.index(f"tau_m.{joint.name}")]
@@ -132,14 +154,18 @@ def test_plots_have_the_units_of_the_model():
 
 def test_wheels_have_charts_of_their_own():
     """Speed, torque and momentum against saturation, and nothing of them among the joints."""
-    wheels = [fflin.ReactionWheel((0, 0, 1), name=f"w{k}", inertia=1e-3 * k) for k in (1, 2)]
+    wheels = [
+        fflin.ReactionWheel((0, 0, 1), name=f"w{k}", inertia=1e-3 * k) for k in (1, 2)
+    ]
     robot = fflin.load("planar_detumble")
     robot = robot.replace(inputs=[*robot.inputs, *wheels])
     motion = settling(robot, 1.0)
     x = motion.x.copy()
     speeds = [motion.state_names.index(f"qdot_m.w{k}") for k in (1, 2)]
     x[:, speeds] = np.outer(motion.t, [3.0, -5.0])
-    motion = limited(replace(motion, x=x), {"qdot_m.w1": (-4.0, 4.0), "qdot_m.w2": (-99.0, 99.0)})
+    motion = limited(
+        replace(motion, x=x), {"qdot_m.w1": (-4.0, 4.0), "qdot_m.w2": (-99.0, 99.0)}
+    )
     shown = panel(robot, motion, every(motion), np.zeros((0, robot.nq)))
     drawn, t = charts(shown), motion.t[every(motion)]
     np.testing.assert_allclose(drawn["wheel speed"]["w1"], 3.0 * t, rtol=1e-6)
@@ -162,9 +188,13 @@ def test_a_limit_is_drawn_where_a_curve_comes_to_a_third_of_it(robots, share):
     u = motion.u.copy()
     u[:, at] = -1.0 - np.arange(len(at))
     most = {name: (k + 1.0) / share for k, name in enumerate(names)}
-    motion = limited(replace(motion, u=u), {name: (-x, np.inf) for name, x in most.items()})
+    motion = limited(
+        replace(motion, u=u), {name: (-x, np.inf) for name, x in most.items()}
+    )
     shown = panel(robot, motion, every(motion), robot.neutral()[None])
-    expected = {name.partition(".")[2]: [-x] * (share > 1 / 3) for name, x in most.items()}
+    expected = {
+        name.partition(".")[2]: [-x] * (share > 1 / 3) for name, x in most.items()
+    }
     assert limits_drawn(shown)["joint torques"] == expected
 
 
@@ -176,7 +206,9 @@ def test_rates_of_joints_are_shown_where_they_come_near_a_limit(robots):
     motion = replace(motion, x=x)
     for limit, shown in ((3.0, False), (1.0, True)):
         name = f"qdot_m.{robot.joint_names[0]}"
-        plots = panel(robot, limited(motion, {name: (-limit, limit)}), every(motion), motion.q[:1])
+        plots = panel(
+            robot, limited(motion, {name: (-limit, limit)}), every(motion), motion.q[:1]
+        )
         rates = limits_drawn(plots).get("joint rates")
         assert rates == ({robot.joint_names[0]: [-1.0]} if shown else None)
 
@@ -203,9 +235,13 @@ def test_without_a_target_nothing_is_called_an_error(robots):
     titles = [each["title"] for each in shown["plots"]]
     assert labels[0] == titles[0] == "attitude change"
     assert not any("error" in text for text in labels + titles)
-    expected = errors(robot, motion.q[every(motion)], motion.q[:1], motion.wheels)["attitude"][1]
+    expected = errors(robot, motion.q[every(motion)], motion.q[:1], motion.wheels)[
+        "attitude"
+    ][1]
     assert expected[0] < 1e-6 < 1.0 < expected[-1]
-    np.testing.assert_allclose(charts(shown)[titles[0]][""], expected, rtol=1e-6, atol=1e-5)
+    np.testing.assert_allclose(
+        charts(shown)[titles[0]][""], expected, rtol=1e-6, atol=1e-5
+    )
 
 
 def test_what_was_passed_is_told_with_its_time(robots):
@@ -231,7 +267,9 @@ def test_what_is_followed_goes_with_joints_and_wheels():
     goal = np.tile(robot.neutral(), (len(rows), 1))
     shown = panel(robot, motion, rows, goal)
     followed = {
-        plot["title"]: {line["label"]: floats(line["reference"]) for line in plot["lines"]}
+        plot["title"]: {
+            line["label"]: floats(line["reference"]) for line in plot["lines"]
+        }
         for plot in shown["plots"]
     }
     for joint in robot.joint_names[:3]:
@@ -247,4 +285,6 @@ def test_what_is_followed_goes_with_joints_and_wheels():
     # Of a target that stands still nothing is said to be followed.
     shown = panel(robot, motion, rows, robot.neutral()[None])
     assert shown["rest"] is None
-    assert not any(line["reference"] for plot in shown["plots"] for line in plot["lines"])
+    assert not any(
+        line["reference"] for plot in shown["plots"] for line in plot["lines"]
+    )

@@ -60,9 +60,15 @@ def test_a_body_flies_to_the_grasp_and_is_held(watch, tmp_path):
     ):
         watched.do(f"fflin.seek({t})")
         here = frames(part._robot, part.q[row_at(part, t - start)])
-        assert apart(shown(watched, "held", "payload", "root_joint"), here["payload"]) < EXACT, t
+        assert (
+            apart(shown(watched, "held", "payload", "root_joint"), here["payload"])
+            < EXACT
+        ), t
         for joint in ("joint_3", "joint_7"):  # jammed or not
-            assert apart(shown(watched, "robot", joint), here[joint]) < EXACT, (joint, t)
+            assert apart(shown(watched, "robot", joint), here[joint]) < EXACT, (
+                joint,
+                t,
+            )
     # The phases are named, the one at the time is marked, and each leads to its beginning.
     buttons = watched.page.locator(".phases button")
     assert buttons.all_text_contents() == [
@@ -77,9 +83,14 @@ def test_a_body_flies_to_the_grasp_and_is_held(watch, tmp_path):
         assert pressed == [str(k == other).lower() for other in range(3)]
     assert "joint_3 jammed" in watched.page.locator("#stamp").text_content()
     # What flies is named and weighed, and what is caught has a colour of its own and edges.
-    for t, name, kept in ((0.0, "servicer_7dof", 0.0), (4.5, "servicer_7dof + payload", 500.0)):
+    for t, name, kept in (
+        (0.0, "servicer_7dof", 0.0),
+        (4.5, "servicer_7dof + payload", 500.0),
+    ):
         watched.do(f"fflin.seek({t})")
-        said = [watched.page.locator(f"header {tag}").text_content() for tag in ("h1", "p")]
+        said = [
+            watched.page.locator(f"header {tag}").text_content() for tag in ("h1", "p")
+        ]
         assert said[0] == name
         assert f", {flown.robot.mass + kept:.4g} kg, 13 s" in said[1]
         body, edges = watched.do(
@@ -88,12 +99,19 @@ def test_a_body_flies_to_the_grasp_and_is_held(watch, tmp_path):
             "found.push([x.type, x.material.opacity, x.material.color.getHex(), x.visible]); }); "
             "return found; })()"
         )
-        assert body[0] == "Mesh" and body[1] > 0.8 and edges[0] == "LineSegments" and edges[3]
+        assert (
+            body[0] == "Mesh"
+            and body[1] > 0.8
+            and edges[0] == "LineSegments"
+            and edges[3]
+        )
         red, green, blue = (body[2] >> shift & 255 for shift in (16, 8, 0))
         assert red > 1.2 * green > 1.2 * blue
     box = watched.page.get_by_label("payload", exact=True)
     box.uncheck(force=True)
-    assert not watched.do("viewer.scene_tree.find(['meshcat', 'held', 'payload']).object.visible")
+    assert not watched.do(
+        "viewer.scene_tree.find(['meshcat', 'held', 'payload']).object.visible"
+    )
     assert "target" in watched.page.locator("#legend").text_content()
 
 
@@ -116,7 +134,9 @@ def test_a_payload_with_joints_comes_with_them(watch, tmp_path):
         body = shown(watched, "held", "payload", name)
         assert apart(body, here[f"payload.{name}"]) < EXACT
     undamped = other.replace(damping=0.0)
-    back = fflin.simulate(undamped, None, q0=flown.caught.payload_q, v0=-v, duration=4.0)
+    back = fflin.simulate(
+        undamped, None, q0=flown.caught.payload_q, v0=-v, duration=4.0
+    )
     was = frames(undamped, back.q[-1])
     for name in names:
         assert apart(first[name], was[name]) < EXACT
@@ -126,9 +146,13 @@ def test_a_payload_with_joints_comes_with_them(watch, tmp_path):
 def test_in_orbit_a_payload_came_as_it_flies_there(frame):
     orbit = fflin.CircularOrbit(mean_motion=0.05, mu=1e9, body="rock", body_radius=1e3)
     payload = fflin.load("cubesat", orbit=orbit)
-    q = fflin.configuration(payload, base=pin.SE3(np.eye(3), np.array([3.0, -2.0, 1.0])))
+    q = fflin.configuration(
+        payload, base=pin.SE3(np.eye(3), np.array([3.0, -2.0, 1.0]))
+    )
     v = 0.1 * np.array([1.0, -2.0, 1.0, 0.5, 0.3, -0.4])
-    flown = fflin.simulate(payload, None, q0=q, v0=v, duration=8.0, dt=0.05, frame=frame)
+    flown = fflin.simulate(
+        payload, None, q0=q, v0=v, duration=8.0, dt=0.05, frame=frame
+    )
     end = SimpleNamespace(payload=payload, payload_q=flown.q[-1], payload_v=flown.v[-1])
     first, *_, last = _flight(end, frame, np.array([-8.0, -4.0, -0.05]))
     assert first[0] == pytest.approx(q, abs=1e-6)

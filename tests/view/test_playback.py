@@ -25,10 +25,14 @@ def test_arrows_are_the_wrench_that_acts_on_the_base(robots, frame):
     u = rng.normal(size=6)
     state = fflin.StateMap(robot, reference=reference, frame=frame)
     film = play_back(state, q[None], u[None])
-    lin = fflin.linearize(robot, q, np.zeros(robot.nv), u, frame=frame, reference=reference)
+    lin = fflin.linearize(
+        robot, q, np.zeros(robot.nv), u, frame=frame, reference=reference
+    )
     # f0 has the accelerations of the base: d omega/dt and d v/dt in the frame's axes.
     base = pin.XYZQUATToSE3(film.poses[0, 0])
-    local = np.concatenate((base.rotation.T @ film.force[0], base.rotation.T @ film.torque[0]))
+    local = np.concatenate(
+        (base.rotation.T @ film.force[0], base.rotation.T @ film.torque[0])
+    )
     data = robot.model.createData()
     tau = np.zeros(robot.nv)
     tau[:6] = local
@@ -79,19 +83,27 @@ def test_the_centre_of_mass_moves_straight_when_nothing_pushes(robots):
 
 def test_plumes_stand_where_thrusters_push(robots):
     thruster = fflin.Thruster("tool", (0.1, -0.2, 0.3), (0, 3, 4))
-    robot = robots["servicer_7dof"].replace(inputs=[fflin.JointTorque("joint_1"), thruster])
+    robot = robots["servicer_7dof"].replace(
+        inputs=[fflin.JointTorque("joint_1"), thruster]
+    )
     rng = np.random.default_rng(1)
     q, _, u = random_point(robots["servicer_7dof"], rng)
     (nozzle,) = Page(robot, q, "space", None, None).nozzles
-    name, path, position, direction = (nozzle[k] for k in ("name", "path", "position", "direction"))
+    name, path, position, direction = (
+        nozzle[k] for k in ("name", "path", "position", "direction")
+    )
     assert name == fflin.linearize(robot).input_names[1]
     joint = robot.model.getJointId(path[-1])
     position, direction = np.array(position), np.array(direction)
     data = robot.model.createData()
     pin.framesForwardKinematics(robot.model, data, q)
     tool = data.oMf[robot.model.getFrameId("tool")]
-    np.testing.assert_allclose(data.oMi[joint].act(position), tool.act(np.array([0.1, -0.2, 0.3])))
-    np.testing.assert_allclose(data.oMi[joint].rotation @ direction, tool.rotation @ [0, 0.6, 0.8])
+    np.testing.assert_allclose(
+        data.oMi[joint].act(position), tool.act(np.array([0.1, -0.2, 0.3]))
+    )
+    np.testing.assert_allclose(
+        data.oMi[joint].rotation @ direction, tool.rotation @ [0, 0.6, 0.8]
+    )
     state = fflin.StateMap(robot)
     film = play_back(state, q[None], u[None, :2])
     assert film.thrust.tolist() == [[u[1]]]

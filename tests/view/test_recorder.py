@@ -10,7 +10,8 @@ import umsgpack
 def test_the_recorder_keeps_the_last_value_of_a_property_per_path():
     from fflin.view.page import Recorder, Visualizer
 
-    g = importlib.import_module("meshcat.geometry")  # after fflin.scene, which quiets it
+    # after fflin.scene, which quiets it
+    g = importlib.import_module("meshcat.geometry")
 
     forwarded = []
     window = Recorder(forwarded.append)

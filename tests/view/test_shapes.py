@@ -41,14 +41,18 @@ def test_shapes_stand_where_pinocchio_puts_them(name):
     file = find_robot(name)
     model = pin.buildModelFromUrdf(str(file.path), pin.JointModelFreeFlyer())
     geometry = pin.buildGeomFromUrdf(
-        model, str(file.path), pin.GeometryType.VISUAL, [str(p) for p in file.package_dirs]
+        model,
+        str(file.path),
+        pin.GeometryType.VISUAL,
+        [str(p) for p in file.package_dirs],
     )
     theirs = sorted(
         (model.names[g.parentJoint], *np.round(g.placement.homogeneous, 9).ravel())
         for g in geometry.geometryObjects
     )
     ours = sorted(
-        (robot.model.names[s.joint], *np.round(s.placement.homogeneous, 9).ravel()) for s in found
+        (robot.model.names[s.joint], *np.round(s.placement.homogeneous, 9).ravel())
+        for s in found
     )
     assert not notes
     assert [row[0] for row in ours] == [row[0] for row in theirs]
@@ -65,7 +69,9 @@ def test_locked_joints_carry_their_shapes_along():
     def placed(robot, q):
         data = robot.model.createData()
         pin.forwardKinematics(robot.model, data, q)
-        return [data.oMi[s.joint].act(s.placement).homogeneous for s in shapes(robot)[0]]
+        return [
+            data.oMi[s.joint].act(s.placement).homogeneous for s in shapes(robot)[0]
+        ]
 
     np.testing.assert_allclose(placed(free, q), placed(locked, r), atol=1e-12)
 
@@ -74,7 +80,9 @@ def test_inertia_boxes_have_the_inertia_of_the_bodies():
     """A uniform box of a body's mass at the box's place has the body's inertia."""
     rng = np.random.default_rng(1)
     root = pin.Model()
-    joint = root.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "root_joint")
+    joint = root.addJoint(
+        0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "root_joint"
+    )
     for k in range(4):
         box = pin.Inertia.FromBox(rng.uniform(1, 9), *rng.uniform(0.2, 2.0, 3))
         root.appendBodyToJoint(joint, box, pin.SE3.Random())
@@ -98,7 +106,9 @@ def test_a_material_gives_colour_and_opacity(tmp_path):
     assert not notes
     assert box.color == (1.0, 0.0, 0.0, 0.5) and box.size == (1.0, 2.0, 3.0)
     np.testing.assert_allclose(box.placement.translation, [1, 2, 3])
-    np.testing.assert_allclose(box.placement.rotation @ [1, 0, 0], [0, 1, 0], atol=1e-12)
+    np.testing.assert_allclose(
+        box.placement.rotation @ [1, 0, 0], [0, 1, 0], atol=1e-12
+    )
     assert other.mesh == mesh and other.color is None
 
 
@@ -152,7 +162,9 @@ def test_meshes_are_found_where_urdfs_say(tmp_path):
     elsewhere = tmp_path / "r.urdf"
     assert find_mesh("package://pkg/m.stl", elsewhere, ()) is None
     assert find_mesh("package://pkg/m.stl", elsewhere, (tmp_path / "ws",)) == mesh
-    robot = fflin.load(write(tmp_path, "package://pkg/m.stl"), package_dirs=[tmp_path / "ws"])
+    robot = fflin.load(
+        write(tmp_path, "package://pkg/m.stl"), package_dirs=[tmp_path / "ws"]
+    )
     assert not shapes(robot)[1]
     assert not shapes(fflin.load(robot.urdf, package_dirs=tmp_path / "ws"))[1]
     with pytest.raises(fflin.InputError, match="package_dirs"):
@@ -176,7 +188,9 @@ def test_a_mesh_is_scaled_and_mirrored_and_then_placed(tmp_path):
     page = Page(robot, robot.neutral(), "space", None, None)
     pieces = [umsgpack.unpackb(each) for each in page.window.commands()]
     pieces = [each["object"] for each in pieces if each["type"] == "set_object"]
-    (piece,) = (each for each in pieces if each["geometries"][0]["type"] == "BufferGeometry")
+    (piece,) = (
+        each for each in pieces if each["geometries"][0]["type"] == "BufferGeometry"
+    )
     data = piece["geometries"][0]["data"]["attributes"]["position"]["array"].data
     vertices = np.frombuffer(data, dtype="<f4").reshape(-1, 3)
     matrix = np.reshape(piece["object"]["matrix"], (4, 4)).T

@@ -64,7 +64,9 @@ def test_nothing_is_left_behind_by_bad_input(robots, motion, tmp_path):
 def test_a_robot_without_a_motion_rests_on_its_page(fields, tmp_path):
     robot = fflin.load("cubesat", **fields)
     made = fflin.visualize(robot, html=tmp_path / "still.html")
-    assert made == tmp_path / "still.html" and "meshcat" in made.read_text(encoding="utf-8")
+    assert made == tmp_path / "still.html" and "meshcat" in made.read_text(
+        encoding="utf-8"
+    )
     with pytest.raises(fflin.InputError, match="q"):
         fflin.visualize(robot, html=tmp_path / "other.html", q=np.zeros(3))
 
@@ -106,7 +108,10 @@ def test_the_tool_is_the_end_of_the_longest_chain(robots):
         warnings.simplefilter("ignore")
         panda = fflin.load("panda", lock=["panda_finger_joint1"])
     name = tool_frame(panda)
-    assert panda.model.frames[panda.model.getFrameId(name)].parentJoint == panda.model.njoints - 1
+    assert (
+        panda.model.frames[panda.model.getFrameId(name)].parentJoint
+        == panda.model.njoints - 1
+    )
 
 
 def test_a_page_is_opened_where_no_file_is_named(robots, motion, monkeypatch):
@@ -152,7 +157,12 @@ def test_view_on_the_command_line(capsys, monkeypatch):
 def test_simulate_on_the_command_line(capsys, tmp_path, monkeypatch):
     page = tmp_path / "loop.html"
     command = ["simulate", "cubesat", "--rpy", "30", "0", "0", "--duration", "5"]
-    assert main([*command, "--html", str(page), "--scene", "lab", "--fps", "10", "--follow"]) == 0
+    assert (
+        main(
+            [*command, "--html", str(page), "--scene", "lab", "--fps", "10", "--follow"]
+        )
+        == 0
+    )
     assert f"wrote {page}: " in capsys.readouterr().out
     text = page.read_text()
     assert '<body class="lab motion">' in text and '"follow":true' in text
@@ -168,7 +178,9 @@ def test_simulate_on_the_command_line(capsys, tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
     assert main([*command, "--png", str(tmp_path / "m.png")]) == 2
     lines = hear_lines(capsys.readouterr().err).splitlines()
-    assert len(lines) == 2 and "folder" in lines[0] and "apt install chromium" in lines[1]
+    assert (
+        len(lines) == 2 and "folder" in lines[0] and "apt install chromium" in lines[1]
+    )
     page = ["--html", str(tmp_path / "m.html"), "-o", str(tmp_path / "m.npz")]
     (tmp_path / "folder.html").mkdir()
     for wrong, message in (
@@ -210,5 +222,8 @@ def test_a_name_that_is_no_files_name_does_no_harm(robots, monkeypatch):
 
 
 def test_assets_are_part_of_the_package():
-    names = {path.name for path in Path(fflin.__file__).parent.joinpath("view", "assets").iterdir()}
+    names = {
+        path.name
+        for path in Path(fflin.__file__).parent.joinpath("view", "assets").iterdir()
+    }
     assert {"page.html", "style.css", "main.js", "sky.js"} <= names

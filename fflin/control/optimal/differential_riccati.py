@@ -64,7 +64,9 @@ def transitions(early: Array, late: Array, h: Array) -> Array:
     Hamiltonian system has the solution ``x1 = T x0 - G l1`` and ``l0 = W x0 + T' l1``. In a short
     interval, G and W are positive semidefinite.
     """
-    mixed = np.concatenate((HEAVY * early + LIGHT * late, LIGHT * early + HEAVY * late), axis=1)
+    mixed = np.concatenate(
+        (HEAVY * early + LIGHT * late, LIGHT * early + HEAVY * late), axis=1
+    )
     both = _constant(mixed, 0.5 * np.concatenate((h, h)))
     return joined(both[:, : len(h)], both[:, len(h) :])
 
@@ -113,14 +115,22 @@ def _intervals(at: Callable[[Array], Array], knots: Array) -> list[_Interval]:
     middle = 0.5 * (a + b)
     start = np.concatenate((a, a, middle))
     h = np.concatenate((b, middle, b)) - start
-    coefficients = at(np.concatenate((start + GAUSS[0] * h, start + GAUSS[1] * h, knots)))
+    coefficients = at(
+        np.concatenate((start + GAUSS[0] * h, start + GAUSS[1] * h, knots))
+    )
     early, late, ends = np.split(coefficients, (3 * count, 6 * count), axis=1)
-    maps = transitions(early, late, h).reshape(3, 3, count, *coefficients.shape[2:]).swapaxes(0, 2)
+    maps = (
+        transitions(early, late, h)
+        .reshape(3, 3, count, *coefficients.shape[2:])
+        .swapaxes(0, 2)
+    )
     times, ends = knots.tolist(), ends.swapaxes(0, 1)
     return [(times[k], times[k + 1], maps[k], ends[k : k + 2]) for k in range(count)]
 
 
-def solve_back(at: Callable[[Array], Array], knots: Array, P: Array) -> tuple[Array, Array]:
+def solve_back(
+    at: Callable[[Array], Array], knots: Array, P: Array
+) -> tuple[Array, Array]:
     """Integrate backwards from P at the last knot, and return the times and the values of P.
 
     The function `at` returns the coefficients (3, k, nx, nx) at times (k,). If P changes too fast,
@@ -158,7 +168,9 @@ def solve_back(at: Callable[[Array], Array], knots: Array, P: Array) -> tuple[Ar
     return np.array(times[::-1]), np.array(values[::-1])
 
 
-def samples_back(stages: Iterable[tuple[Array, Array]], P: Array) -> tuple[Array, Array, float]:
+def samples_back(
+    stages: Iterable[tuple[Array, Array]], P: Array
+) -> tuple[Array, Array, float]:
     """Return K of all samples, P at all sample times, and the largest relative residual.
 
     K and P begin with the last sample. The first P is the argument `P`.
@@ -178,7 +190,9 @@ def samples_back(stages: Iterable[tuple[Array, Array]], P: Array) -> tuple[Array
         P = _symmetric(law.T @ total @ law)
         if not np.isfinite(P).all():
             raise np.linalg.LinAlgError("P changes too fast")
-        worst = max(worst, imbalance(np.array((P, -total[:nx, :nx], total[:nx, nx:] @ K))))
+        worst = max(
+            worst, imbalance(np.array((P, -total[:nx, :nx], total[:nx, nx:] @ K)))
+        )
         gains.append(K)
         costs.append(P)
     return np.array(gains), np.array(costs), worst
@@ -208,7 +222,9 @@ def imbalance(terms: Array) -> float:
 
 
 def _apart(first: Array, second: Array) -> float:
-    return float(np.linalg.norm(first - second)) / max(float(np.linalg.norm(second)), 1e-300)
+    return float(np.linalg.norm(first - second)) / max(
+        float(np.linalg.norm(second)), 1e-300
+    )
 
 
 def _symmetric(matrix: Array) -> Array:

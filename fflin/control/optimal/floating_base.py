@@ -88,7 +88,9 @@ class FloatingBase:
         for k, turn in enumerate(turns):
             if rotating:
                 drift = h[k] * middle.inverse[k]
-                half = R[k] @ pin.exp3(0.5 * (turn + drift @ (R[k].T @ self.angular_momentum)))
+                half = R[k] @ pin.exp3(
+                    0.5 * (turn + drift @ (R[k].T @ self.angular_momentum))
+                )
                 turn = turn + drift @ (half.T @ self.angular_momentum)  # noqa: PLW2901
             R[k + 1] = R[k] @ pin.exp3(turn)
         return R
@@ -104,7 +106,9 @@ class FloatingBase:
         sliding = (terms.sliding @ rates[..., None])[..., 0]
         nu = np.zeros((len(t), 6 + joints.shape[1]))
         nu[:, :3] = omega
-        nu[:, 3:6] = (falling[:, None] @ R)[:, 0] - np.cross(omega, terms.center) - sliding
+        nu[:, 3:6] = (
+            (falling[:, None] @ R)[:, 0] - np.cross(omega, terms.center) - sliding
+        )
         nu[:, 6:] = rates
         states = np.zeros((len(t), self._state.nx))
         states[:, 6 : 6 + joints.shape[1]] = joints

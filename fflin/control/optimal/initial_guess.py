@@ -87,7 +87,9 @@ def _of_trajectory(shooting: Shooting, motion: Trajectory, start: Point) -> Knot
     return q, v, u.copy()
 
 
-def _of_joints(shooting: Shooting, guess: JointMotion, start: Point, end: Point) -> Knots:
+def _of_joints(
+    shooting: Shooting, guess: JointMotion, start: Point, end: Point
+) -> Knots:
     """Return the knots and inputs of a motion whose joint positions a function returns."""
     function("guess", guess, "(t)")
     robot = shooting.state.robot
@@ -103,7 +105,10 @@ def _of_joints(shooting: Shooting, guess: JointMotion, start: Point, end: Point)
                 row[robot.joint_names.index(name)] = position
         else:
             row[:] = vector(
-                label, value, robot.n, "joint positions in the order of robot.joint_names"
+                label,
+                value,
+                robot.n,
+                "joint positions in the order of robot.joint_names",
             )
     base = None
     if conserves_momentum(robot):
@@ -123,7 +128,12 @@ def _needs_loops(shooting: Shooting, asked: Mask) -> bool:
 
 
 def _with_loops(
-    shooting: Shooting, start: Point, end: Point, asked: Mask, bounds: Array, weights: Array
+    shooting: Shooting,
+    start: Point,
+    end: Point,
+    asked: Mask,
+    bounds: Array,
+    weights: Array,
 ) -> Knots:
     """Return knots and inputs of a motion whose joint loops rotate the base to the goal."""
     state = shooting.state

@@ -63,10 +63,13 @@ def curvature(base: FloatingBase, joints: Array) -> Array:
     n = len(joints)
     steps = _STEP * np.eye(n)
     W = base.terms(np.vstack((joints, joints + steps, joints - steps))).coupling
-    derivatives = (W[1 : n + 1] - W[n + 1 :]) / (2.0 * _STEP)  # [i, :, j]: derivative of W_j by i
+    # [i, :, j]: derivative of W_j by i
+    derivatives = (W[1 : n + 1] - W[n + 1 :]) / (2.0 * _STEP)
     slope = derivatives.transpose(0, 2, 1)
     columns = W[0].T
-    F: Array = slope - slope.transpose(1, 0, 2) + np.cross(columns[:, None], columns[None])
+    F: Array = (
+        slope - slope.transpose(1, 0, 2) + np.cross(columns[:, None], columns[None])
+    )
     return F
 
 
@@ -98,8 +101,10 @@ class Loops:
     path: Array  # joint positions (K, n) to which the loops are added
     moved: Indices  # indices of the joints that move in loops (m,)
     target: Array  # rotation (3, 3) of the base at the end
-    asked: Mask  # components (3,) of the rotation vector of the attitude error that must vanish
-    bounds: Array  # limits of the joint positions and rates (2, 2, n): lower and upper, then kind
+    # components (3,) of the rotation vector of the attitude error that must vanish
+    asked: Mask
+    # limits of the joint positions and rates (2, 2, n): lower and upper, then kind
+    bounds: Array
     weights: Array  # weights of the squared torques of the joints `moved` (m,)
 
     @cached_property
@@ -116,7 +121,12 @@ class Loops:
         """
         s = (self.t - self.t[0]) / (self.t[-1] - self.t[0])
         phase = 2.0 * np.pi * circles * s**2 * (3.0 - 2.0 * s)
-        columns = [1.0 - np.cos(phase), np.sin(phase), 1.0 - np.cos(2 * phase), np.sin(2 * phase)]
+        columns = [
+            1.0 - np.cos(phase),
+            np.sin(phase),
+            1.0 - np.cos(2 * phase),
+            np.sin(2 * phase),
+        ]
         return np.array(columns).T
 
     def joints(self, basis: Array, coefficients: Array) -> Array:
@@ -151,8 +161,12 @@ class Loops:
         """
         inertia = self.base.inertia(self.middle)[np.ix_(self.moved, self.moved)]
         rates = np.gradient(basis, self.t, axis=0)
-        factor = np.linalg.qr(np.gradient(rates, self.t, axis=0), "r") / np.sqrt(len(self.t))
-        torques: Array = factor @ (coefficients * self.scale) @ inertia * np.sqrt(self.weights)
+        factor = np.linalg.qr(np.gradient(rates, self.t, axis=0), "r") / np.sqrt(
+            len(self.t)
+        )
+        torques: Array = (
+            factor @ (coefficients * self.scale) @ inertia * np.sqrt(self.weights)
+        )
         return torques
 
     @property
@@ -195,7 +209,9 @@ class Loops:
         effort. The path without loops must miss the target.
         """
         near = _NEAR * float(np.linalg.norm(self.error(self.path)))
-        postures = np.random.default_rng(0).uniform(-1.0, 1.0, (_POSTURES, len(self.moved)))
+        postures = np.random.default_rng(0).uniform(
+            -1.0, 1.0, (_POSTURES, len(self.moved))
+        )
         postures[0] = 0.0
         best = self.path
         least = np.inf
@@ -207,7 +223,9 @@ class Loops:
             for coefficients in coarse.improved(circles, postures):
                 basis = self.basis(circles)
                 joints = self.joints(basis, coefficients)
-                error = float(np.linalg.norm(self.error(joints)) + self.beyond(joints).max())
+                error = float(
+                    np.linalg.norm(self.error(joints)) + self.beyond(joints).max()
+                )
                 effort = float(np.square(self.torques(basis, coefficients)).sum())
                 # Prefer a small error; if several errors are small, prefer a small effort.
                 if (max(error, near), effort) < (max(least, near), least_effort):
@@ -222,7 +240,9 @@ class Loops:
         def error(coefficients: Array) -> Array:
             """Return the error of the attitude and the violations of limits."""
             joints = self.joints(basis, coefficients)
-            return np.concatenate((self.error(joints), self.beyond(joints).max(axis=0).ravel()))
+            return np.concatenate(
+                (self.error(joints), self.beyond(joints).max(axis=0).ravel())
+            )
 
         ellipses = sorted(
             self.ellipses(circles, postures),

@@ -95,13 +95,16 @@ class Models(NamedTuple):
     ends: Array  # Jacobians of the interval ends (N, nx, nx + 2 nu)
     rows: sp.csr_array  # one row for each limit
     at_knots: tuple[Indices, Indices]  # knot and state of the first rows
-    within: tuple[Indices, Indices, Indices]  # interval, part and state of the other rows
+    # interval, part and state of the other rows
+    within: tuple[Indices, Indices, Indices]
 
     def room(self, trial: Trial) -> Array:
         """Return the lower and upper limits (2, m) of the rows about a trial."""
         knot, limit = self.at_knots
         k, part, state = self.within
-        room: Array = np.hstack((trial.knots[:, knot, limit], trial.inside[:, k, part, state]))
+        room: Array = np.hstack(
+            (trial.knots[:, knot, limit], trial.inside[:, k, part, state])
+        )
         return room
 
 
@@ -112,8 +115,10 @@ class Step(NamedTuple):
     du: Array  # steps of the inputs (N + 1, nu)
     gaps: Array  # multipliers of the gaps (N, nx)
     outside: float  # sum of the violations of the goal and the limits after the step
-    gradient: Array  # of the Lagrangian before the step, with respect to the inputs (N + 1, nu)
-    complementarity: float  # sum of products of multipliers and distances from the limits
+    # of the Lagrangian before the step, with respect to the inputs (N + 1, nu)
+    gradient: Array
+    # sum of products of multipliers and distances from the limits
+    complementarity: float
     moved: Array  # displacements of the rows of the limits (m,)
 
 
@@ -134,7 +139,8 @@ class Search(NamedTuple):
     limits: Array  # limits of inputs (2, nu)
     size: Array  # magnitudes of the limits of states (nx,), 0 for states without limits
     cost: Array  # weights of squared inputs (N + 1, nu)
-    parts: int  # number of equal parts per interval; limits can apply at the end of each part
+    # number of equal parts per interval; limits can apply at the end of each part
+    parts: int
     report: Callable[[str], None]  # receives a line of text in each iteration
     price: float = _PRICE
 
@@ -180,14 +186,19 @@ class Search(NamedTuple):
                     trial, models, near, step, price, limited, saved
                 )
                 if moved is None and (exceeding & ~limited).any():
-                    moved = trial  # repeat the step with more limits within the intervals
+                    # repeat the step with more limits within the intervals
+                    moved = trial
                 small = saved <= _SAVED * self._merit(trial, price, limited)
                 if moved is not None or small:
                     break
                 near = _MORE * near
             if moved is None:
                 # After failed attempts, the reduction is small only because the cost was raised.
-                if not small or attempt > 0 or bool((near <= 1.1 * _LEAST * first).all()):
+                if (
+                    not small
+                    or attempt > 0
+                    or bool((near <= 1.1 * _LEAST * first).all())
+                ):
                     break
                 near = np.maximum(_LESS * near, _LEAST * first)
                 continue
@@ -254,7 +265,10 @@ class Search(NamedTuple):
 
     def _promised(self, trial: Trial, step: Step) -> float:
         """Return the merit function after a step, according to the linear models."""
-        return float((self.cost * (trial.u + step.du) ** 2).sum()) / 2.0 + self.price * step.outside
+        return (
+            float((self.cost * (trial.u + step.du) ** 2).sum()) / 2.0
+            + self.price * step.outside
+        )
 
     def _corrected(
         self,
@@ -289,7 +303,11 @@ class Search(NamedTuple):
             gain = before - self._merit(end, price, exceeding)
             if gain >= _SOME * saved and gain > most:
                 best, most = end, gain
-            if gain >= _ENOUGH * saved or not np.isfinite(gain) or correction == corrections:
+            if (
+                gain >= _ENOUGH * saved
+                or not np.isfinite(gain)
+                or correction == corrections
+            ):
                 break
             if end.gap > gap:  # the corrections do not converge
                 break
@@ -306,8 +324,12 @@ class Search(NamedTuple):
         """Report the cost relative to the cost of the guess, and the largest violation."""
         cost = float((self.cost * trial.u**2).sum())
         inside = excess(trial.inside)[limited]
-        most = max(trial.gap, float(excess(trial.knots).max()), float(inside.max(initial=0.0)))
-        self.report(f"{phase}: cost {cost:.4g} of the guess, largest violation {most:.2g}")
+        most = max(
+            trial.gap, float(excess(trial.knots).max()), float(inside.max(initial=0.0))
+        )
+        self.report(
+            f"{phase}: cost {cost:.4g} of the guess, largest violation {most:.2g}"
+        )
 
     def _trial(self, q: Array, v: Array, u: Array) -> Trial:
         shooting = self.shooting
@@ -334,7 +356,9 @@ class Search(NamedTuple):
         if not max(trial.outside(limited), trial.gap) < np.inf:
             return None
         try:
-            ends, inside = self.shooting.jacobians(trial.q, trial.v, trial.u, self.parts)
+            ends, inside = self.shooting.jacobians(
+                trial.q, trial.v, trial.u, self.parts
+            )
         except (InputError, np.linalg.LinAlgError):  # the motion has diverged
             return None
         # Soft limits apply to states at knots and to states within intervals. The latter depend on
@@ -347,7 +371,9 @@ class Search(NamedTuple):
         columns = k[:, None] * nw + np.r_[:nw, nw + nx : 2 * nw]
         starts = np.arange(len(k) + 1) * columns.shape[1]
         entries = inside[k, part, state].ravel(), columns.ravel(), starts
-        rows = sp.vstack((at_knots, sp.csr_array(entries, (len(k), knots * nw))), format="csr")
+        rows = sp.vstack(
+            (at_knots, sp.csr_array(entries, (len(k), knots * nw))), format="csr"
+        )
         return Models(ends, rows, (knot, limit), (k, part, state))
 
     def _step(
@@ -374,7 +400,9 @@ class Search(NamedTuple):
         cost, g = np.hstack((of_x + near, self.cost)), np.hstack((of_x, effort))
         scale = np.concatenate((np.ones(nx), self.cost.sum(axis=0) ** -0.5))
         limits = self.limits[:, None] - u
-        solution = solve_stages(ends, missed, cost, g, limits, rows, room, prices, scale)
+        solution = solve_stages(
+            ends, missed, cost, g, limits, rows, room, prices, scale
+        )
         if solution is None:
             return None
         z, du, gaps, multipliers = solution
@@ -384,7 +412,9 @@ class Search(NamedTuple):
         gradient = effort + forces[:, nx:] + _by_costates(ends, forces[:, :nx])
         # A goal has equal limits. Its errors count as violations.
         slack = np.where(multipliers > 0.0, room[1], -room[0]) * (room[1] > room[0])
-        products = np.abs(multipliers) * np.where(multipliers == 0.0, 0.0, np.abs(slack))
+        products = np.abs(multipliers) * np.where(
+            multipliers == 0.0, 0.0, np.abs(slack)
+        )
         return Step(z, du, gaps, outside, gradient, float(products.sum()), moved)
 
     def _is_hopeless(self, trial: Trial, step: Step, left: list[float]) -> bool:
@@ -399,7 +429,9 @@ class Search(NamedTuple):
             before = left[-1 - _STAGNANT]
         return min(left[-_STAGNANT:]) > max(_HOPELESS, 0.9 * before)
 
-    def _closed(self, trial: Trial, limited: Mask, near: Array, left: list[float]) -> Trial:
+    def _closed(
+        self, trial: Trial, limited: Mask, near: Array, left: list[float]
+    ) -> Trial:
         """Close the gaps between intervals by the smallest steps of the knots and the inputs.
 
         The steps also remove the violations of the goal and the limits. If a gap remains, return

@@ -101,7 +101,9 @@ class Riccati:
     In continuous time, it is ``A' P + P A - (P B + N) R^-1 (P B + N)' + Q = 0``.
     """
 
-    def __init__(self, A: Array, B: Array, Q: Array, R: Array, N: Array | None, dt: float) -> None:
+    def __init__(
+        self, A: Array, B: Array, Q: Array, R: Array, N: Array | None, dt: float
+    ) -> None:
         if N is not None and not N.any():
             N = None
         self.A, self.B, self.Q, self.R, self.N = A, B, Q, R, N
@@ -138,7 +140,9 @@ class Riccati:
         residual = _norm(defect) / max(size, _TINY)
         if not math.isfinite(residual + size):
             raise np.linalg.LinAlgError("the weights or the model overflow")
-        return _Trial(P, defect, residual, self._rounding(P, factor, Y) / max(size, _TINY))
+        return _Trial(
+            P, defect, residual, self._rounding(P, factor, Y) / max(size, _TINY)
+        )
 
     def _rounding(self, P: Array, factor: Array, Y: Array) -> float:
         """Return the norm of the rounding errors of the residual matrix; see `_Trial`."""

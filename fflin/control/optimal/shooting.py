@@ -62,14 +62,18 @@ class Shooting:
         """Return the step z (nx,) from `start` to `end`, with zero change of the wheel angles."""
         state = self.state
         difference = pin.difference(state.robot.model, start[0], end[0])
-        z = np.concatenate((state.velocities(difference), state.velocities(end[1] - start[1])))
+        z = np.concatenate(
+            (state.velocities(difference), state.velocities(end[1] - start[1]))
+        )
         z[self.wheels] = 0.0
         return z
 
     def moved(self, q: Array, v: Array, z: Array) -> Point:
         """Return the knots q, v after steps z (N + 1, nx), one for each knot."""
         model, (difference, rates) = self.state.robot.model, np.split(z, 2, axis=1)
-        return integrate_rows(model, q, self.state.spread(difference)), v + self.state.spread(rates)
+        return integrate_rows(
+            model, q, self.state.spread(difference)
+        ), v + self.state.spread(rates)
 
     def motions(self, q: Array, v: Array, u: Array, steps: int = 0) -> Motions:
         """Integrate each interval from its first knot; q, v and the inputs u have N + 1 rows each.
@@ -95,7 +99,10 @@ class Shooting:
 
     def missed(self, q: Array, v: Array, motions: Motions) -> Array:
         """Return the gaps (N, nx): the steps from a knot to the end of the motion before it."""
-        knots, ends = zip(q[1:], v[1:], strict=True), zip(*(x[:, -1] for x in motions), strict=True)
+        knots, ends = (
+            zip(q[1:], v[1:], strict=True),
+            zip(*(x[:, -1] for x in motions), strict=True),
+        )
         return np.array([self.between(*pair) for pair in zip(knots, ends, strict=True)])
 
     def flown(self, start: Point, u: Array) -> Point:
@@ -140,7 +147,9 @@ class Shooting:
             if np.abs(missed - before).max() <= accuracy:
                 break
 
-    def jacobians(self, q: Array, v: Array, u: Array, parts: int = 1) -> tuple[Array, Array]:
+    def jacobians(
+        self, q: Array, v: Array, u: Array, parts: int = 1
+    ) -> tuple[Array, Array]:
         """Return the Jacobians of the interval ends, and of points within the intervals.
 
         The first array (N, nx, nx + 2 nu) contains the Jacobians of the interval ends with respect
@@ -175,7 +184,12 @@ class Shooting:
             total = np.zeros_like(Z)
             rate = np.zeros_like(Z)
             before = Z
-            for i, fraction, weight in ((0, 0.0, 1.0), (1, 0.5, 2.0), (1, 0.5, 2.0), (2, 1.0, 1.0)):
+            for i, fraction, weight in (
+                (0, 0.0, 1.0),
+                (1, 0.5, 2.0),
+                (1, 0.5, 2.0),
+                (2, 1.0, 1.0),
+            ):
                 rate = F[i][0] @ (Z + fraction * h * rate) + F[i][1]
                 total = total + weight * rate
             Z = Z + h / 6.0 * total
@@ -204,13 +218,20 @@ class Shooting:
         # The final rate of the rotation vector is a least-squares solution, because the Jacobian of
         # the exponential map is singular after full rotations about the axis.
         jacobian = pin.Jexp3(difference[PIN_ANGULAR])
-        rates[1, PIN_ANGULAR] = np.linalg.lstsq(jacobian, rates[1, PIN_ANGULAR], rcond=1e-6)[0]
-        late, bend = 3 * difference - 2 * rates[0] - rates[1], rates.sum(axis=0) - 2 * difference
+        rates[1, PIN_ANGULAR] = np.linalg.lstsq(
+            jacobian, rates[1, PIN_ANGULAR], rcond=1e-6
+        )[0]
+        late, bend = (
+            3 * difference - 2 * rates[0] - rates[1],
+            rates.sum(axis=0) - 2 * difference,
+        )
         displacements = s * (rates[0] + s * (late + s * bend))
         v = (rates[0] + s * (2 * late + 3 * s * bend)) / T
         q = np.array([pin.integrate(model, start[0], step) for step in displacements])
         q[:, :3] = start[0][:3] + displacements[:, PIN_LINEAR]
-        for turn, rate in zip(displacements[:, PIN_ANGULAR], v[:, PIN_ANGULAR], strict=True):
+        for turn, rate in zip(
+            displacements[:, PIN_ANGULAR], v[:, PIN_ANGULAR], strict=True
+        ):
             rate[:] = pin.Jexp3(turn) @ rate
         v[:, PIN_LINEAR] = (v[:, None, PIN_LINEAR] @ rotation_matrices(q[:, 3:7]))[:, 0]
         q[-1], v[-1] = end

@@ -20,7 +20,15 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError
-from fflin.base.validation import Array, FrozenArrays, as_double, number, quantity, shaped, truth
+from fflin.base.validation import (
+    Array,
+    FrozenArrays,
+    as_double,
+    number,
+    quantity,
+    shaped,
+    truth,
+)
 from fflin.robot.inputs import Vector3, three_numbers, unit_vector
 
 # First positive root x of J_1'(x) = 0, where J_1 is a Bessel function. The first lateral sloshing
@@ -104,7 +112,12 @@ class FlexibleAppendage(FrozenArrays):
                 "damping ratio for all"
             )
         damping = np.broadcast_to(damping, modes).copy()
-        known = (frequency > 0.0) & (frequency < _FASTEST) & (damping >= 0.0) & (damping <= 1.0)
+        known = (
+            (frequency > 0.0)
+            & (frequency < _FASTEST)
+            & (damping >= 0.0)
+            & (damping <= 1.0)
+        )
         for mode in np.flatnonzero(~known)[:1].tolist():
             raise InputError(
                 f"mode {mode + 1} of {label} has the frequency {frequency[mode]:g} Hz and the "
@@ -192,7 +205,9 @@ class FlexibleAppendage(FrozenArrays):
         frequency, L, inertia = read_superelement(
             op4, asm, origin=origin, modes=modes, length=length, mass=mass
         )
-        return cls(frame, frequency, L[:3], L[3:], damping, name, inertia=inertia, rigid=rigid)
+        return cls(
+            frame, frequency, L[:3], L[3:], damping, name, inertia=inertia, rigid=rigid
+        )
 
     @property
     def title(self) -> str:
@@ -202,7 +217,9 @@ class FlexibleAppendage(FrozenArrays):
     @property
     def modes(self) -> tuple[str, ...]:
         """Names of the modes, which are coordinates of the robot."""
-        return tuple(f"{self.title}_mode_{k}" for k in range(1, 1 + len(self.frequency)))
+        return tuple(
+            f"{self.title}_mode_{k}" for k in range(1, 1 + len(self.frequency))
+        )
 
     @property
     def participation(self) -> Array:
@@ -214,7 +231,10 @@ class FlexibleAppendage(FrozenArrays):
         """Stiffness and damping of the modes, as {"stiffness": {mode: value}, "damping": ...}."""
         omega = 2.0 * math.pi * self.frequency
         values = {"stiffness": omega**2, "damping": 2.0 * self.damping * omega}
-        return {key: dict(zip(self.modes, x.tolist(), strict=True)) for key, x in values.items()}
+        return {
+            key: dict(zip(self.modes, x.tolist(), strict=True))
+            for key, x in values.items()
+        }
 
     def __str__(self) -> str:
         from fflin.base.tables import grid
@@ -223,7 +243,9 @@ class FlexibleAppendage(FrozenArrays):
         rows = [["mode", "f [Hz]", "damping", "m_x", "m_y", "m_z", "I_x", "I_y", "I_z"]]
         modes = zip(self.modes, self.frequency, self.damping, squares, strict=True)
         for mode, f, ratio, sizes in modes:
-            rows.append([mode, f"{f:.5g}", f"{ratio:.3g}", *(f"{x:.3g}" for x in sizes)])
+            rows.append(
+                [mode, f"{f:.5g}", f"{ratio:.3g}", *(f"{x:.3g}" for x in sizes)]
+            )
         sums = squares.sum(axis=0)
         head = f"{self.title}: clamped at frame '{self.frame}'"
         totals = {"all modes": sums}
@@ -232,8 +254,13 @@ class FlexibleAppendage(FrozenArrays):
             totals |= {"rigid": rigid, "residual": rigid - sums}
             at = ", ".join(f"{x:.4g}" for x in body.lever)
             head += f"\n{body.mass:.5g} kg, centre of mass ({at}) m in the frame"
-        rows += [[name, "", "", *(f"{x:.4g}" for x in values)] for name, values in totals.items()]
-        about = "effective masses m [kg] and moments of inertia I [kg m^2] about the frame"
+        rows += [
+            [name, "", "", *(f"{x:.4g}" for x in values)]
+            for name, values in totals.items()
+        ]
+        about = (
+            "effective masses m [kg] and moments of inertia I [kg m^2] about the frame"
+        )
         return f"{head}\n{about}\n\n{grid(rows, 'l')}"
 
 
@@ -300,7 +327,9 @@ class Slosh:
         for name, unit in (("mass", "kg"), ("frequency", "Hz"), ("length", "m")):
             value = getattr(self, name)
             if value is not None or name == "mass":
-                object.__setattr__(self, name, quantity(f"{name} of {label}", value, unit))
+                object.__setattr__(
+                    self, name, quantity(f"{name} of {label}", value, unit)
+                )
         if self.frequency is None and self.length is None:
             raise InputError(
                 f"{label} has neither a frequency nor a length; give the frequency [Hz] of a mass "
@@ -308,7 +337,9 @@ class Slosh:
             )
         ratio = number(f"damping of {label}", self.damping)
         if not 0.0 <= ratio <= 1.0:
-            raise InputError(f"damping of {label} is {ratio:g}, expected a ratio from 0 to 1")
+            raise InputError(
+                f"damping of {label} is {ratio:g}, expected a ratio from 0 to 1"
+            )
         if ratio and self.frequency is None:
             raise InputError(
                 f"{label} has the damping ratio {ratio:g}, but without a frequency, because a "
@@ -317,7 +348,11 @@ class Slosh:
             )
         position = three_numbers(f"position of {label}", self.position)
         axis = unit_vector(f"axis of {label}", self.axis)
-        for name, checked in (("damping", ratio), ("position", position), ("axis", axis)):
+        for name, checked in (
+            ("damping", ratio),
+            ("position", position),
+            ("axis", axis),
+        ):
             object.__setattr__(self, name, checked)
 
     @classmethod
@@ -389,13 +424,17 @@ class Slosh:
         share = 2.0 * math.tanh(k * height) / (k * height * (_FIRST_ROOT**2 - 1.0))
         omega = math.sqrt(acceleration * k * math.tanh(k * height))
         at = height - 2.0 / k * math.tanh(0.5 * k * height)
-        center = np.array(three_numbers("bottom of the tank", bottom)) + at * np.array(along)
+        center = np.array(three_numbers("bottom of the tank", bottom)) + at * np.array(
+            along
+        )
         position = tuple(center.tolist())
         frequency = omega / (2.0 * math.pi)
         length = None
         if truth("pendulum", pendulum):
             length = acceleration / omega**2
-        return cls(frame, share * liquid, position, frequency, length, along, damping, name)
+        return cls(
+            frame, share * liquid, position, frequency, length, along, damping, name
+        )
 
     @property
     def title(self) -> str:
@@ -464,4 +503,6 @@ def _check_names(frame: object, name: object) -> None:
     for key, value in names.items():
         printable = isinstance(value, str) and value.strip() and value.isprintable()
         if not printable or (key == "name" and set(str(value)) & set("*?[]")):
-            raise InputError(f"{key} of an appendage is {value!r}, expected a name without *?[]")
+            raise InputError(
+                f"{key} of an appendage is {value!r}, expected a name without *?[]"
+            )

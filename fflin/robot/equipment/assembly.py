@@ -25,7 +25,12 @@ import pinocchio as pin
 from fflin.base.errors import FflinWarning, InputError
 from fflin.base.names import stands_for_any
 from fflin.base.validation import Array, frozen
-from fflin.robot.equipment.appendages import Appendage, FlexibleAppendage, Slosh, rigid_inertia
+from fflin.robot.equipment.appendages import (
+    Appendage,
+    FlexibleAppendage,
+    Slosh,
+    rigid_inertia,
+)
 from fflin.robot.inputs import Input, ReactionWheel, checked_inputs, named_wheels
 from fflin.robot.joints import ROOT, Joint, find_frame
 from fflin.robot.mass_properties import as_inertia, link_mass
@@ -104,7 +109,9 @@ def equipped(
                 )
             taken.add(part.joint.name)
         model = _with_mounted(model, bodies, parts)
-        placed = [joint.within(model) for joint in (*joints, *(part.joint for part in parts))]
+        placed = [
+            joint.within(model) for joint in (*joints, *(part.joint for part in parts))
+        ]
         joints = tuple(sorted(placed, key=lambda joint: joint.idx_v))
         followers = tuple(follower.within(model) for follower in followers)
     names = [joint.name for joint in joints]
@@ -120,7 +127,9 @@ def equipped(
         for item in items:
             fields[name] |= item.springs[name]
     # Remember only the names of removed wheels and modes. All other removed joints were locked.
-    removed = (name for name in (*robot._removed, *gone) if name not in before.joint_names)
+    removed = (
+        name for name in (*robot._removed, *gone) if name not in before.joint_names
+    )
     changed: dict[str, Any] = {
         **fields,
         "model": model,
@@ -139,7 +148,9 @@ def equipped(
     )
 
 
-def _without(table: Mapping[str, object], gone: list[str], left: list[str]) -> dict[str, object]:
+def _without(
+    table: Mapping[str, object], gone: list[str], left: list[str]
+) -> dict[str, object]:
     """Return a mapping without the keys that match only removed joints.
 
     Mappings inside this mapping are reduced in the same way.
@@ -160,8 +171,12 @@ def _without(table: Mapping[str, object], gone: list[str], left: list[str]) -> d
 def with_appendages(robot: Robot, appendages: object) -> Robot:
     """Return a robot with new appendages (flexible or slosh), whose modes become joints."""
     given = [appendages] if isinstance(appendages, Appendage) else appendages
-    if not isinstance(given, Sequence) or not all(isinstance(item, Appendage) for item in given):
-        raise InputError(f"appendages is {given!r}, expected a list of FlexibleAppendage and Slosh")
+    if not isinstance(given, Sequence) or not all(
+        isinstance(item, Appendage) for item in given
+    ):
+        raise InputError(
+            f"appendages is {given!r}, expected a list of FlexibleAppendage and Slosh"
+        )
     bare = robot._bare
     taken = set[int]()
     for item in given:
@@ -181,7 +196,10 @@ def with_appendages(robot: Robot, appendages: object) -> Robot:
             owner = f"link '{item.frame}'"
         if not item.rigid:
             _compare_inertia(
-                item, item.inertia, present_inertia.se3Action(placement.inverse()), owner
+                item,
+                item.inertia,
+                present_inertia.se3Action(placement.inverse()),
+                owner,
             )
             continue
         if joint in taken:
@@ -220,14 +238,18 @@ class Mounted(NamedTuple):
     armature: float = 0.0
 
 
-def _with_mounted(model: pin.Model, bodies: list[pin.Inertia], parts: list[Mounted]) -> pin.Model:
+def _with_mounted(
+    model: pin.Model, bodies: list[pin.Inertia], parts: list[Mounted]
+) -> pin.Model:
     """Return a model with new joints for `parts`; the old joints get the inertias `bodies`.
 
     In the order of the indices, a new joint comes after all other joints on its carrier.
     """
     new, names = with_marked_frames(model)
     for part in parts:
-        on = part.carrier if isinstance(part.carrier, str) else model.names[part.carrier]
+        on = (
+            part.carrier if isinstance(part.carrier, str) else model.names[part.carrier]
+        )
         # `appendModel` needs the frame of the carrier's joint, but a model that was built in code
         # may lack it.
         if not new.existFrame(on, pin.FrameType.JOINT):
@@ -235,7 +257,9 @@ def _with_mounted(model: pin.Model, bodies: list[pin.Inertia], parts: list[Mount
         alone = pin.Model()
         alone.addJoint(0, part.motion, pin.SE3.Identity(), part.joint.name)
         alone.addJointFrame(1)
-        new = pin.appendModel(new, alone, new.getFrameId(on, pin.FrameType.JOINT), part.placement)
+        new = pin.appendModel(
+            new, alone, new.getFrameId(on, pin.FrameType.JOINT), part.placement
+        )
     restore_names(new, names)
     carry_over(model, new)
     for name, body in zip(model.names, bodies, strict=True):
@@ -250,7 +274,9 @@ def _with_mounted(model: pin.Model, bodies: list[pin.Inertia], parts: list[Mount
     return new
 
 
-def with_marked_frames(model: pin.Model, mark: str = "") -> tuple[pin.Model, dict[str, str]]:
+def with_marked_frames(
+    model: pin.Model, mark: str = ""
+) -> tuple[pin.Model, dict[str, str]]:
     """Return a copy of a model with unique marks as frame names, and {mark: original name}.
 
     When Pinocchio joins or reduces models, it finds frames by name, but a link and a joint may
@@ -329,9 +355,13 @@ def _mounted_wheels(
             )
         bodies[joint] = rest
         placement = pin.SE3(turned_to(axis), np.zeros(3))
-        rotor_inertia = pin.Inertia(0.0, np.zeros(3), np.diag([0.0, 0.0, wheel.inertia]))
+        rotor_inertia = pin.Inertia(
+            0.0, np.zeros(3), np.diag([0.0, 0.0, wheel.inertia])
+        )
         turning = Joint(name, unbounded=True)
-        parts.append(Mounted(turning, joint, placement, pin.JointModelRUBZ(), rotor_inertia))
+        parts.append(
+            Mounted(turning, joint, placement, pin.JointModelRUBZ(), rotor_inertia)
+        )
     return parts
 
 
@@ -392,7 +422,9 @@ def _mounted_modes(
         for item, placement, _ in items:
             if isinstance(item, Slosh):
                 at = placement * np.array(item.position)
-                bodies[joint] = bodies[joint] - pin.Inertia(item.mass, at, np.zeros((3, 3)))
+                bodies[joint] = bodies[joint] - pin.Inertia(
+                    item.mass, at, np.zeros((3, 3))
+                )
                 parts += _liquid(item, joint, placement)
             else:
                 columns += _columns(item, body, placement)
@@ -416,7 +448,9 @@ def _mounted_modes(
     return parts
 
 
-def effective_shares(model: pin.Model, appendages: Sequence[Appendage]) -> dict[str, Array]:
+def effective_shares(
+    model: pin.Model, appendages: Sequence[Appendage]
+) -> dict[str, Array]:
     """Return the effective masses and moments of inertia (6,) of each mode, as {mode: values}.
 
     Each value is a fraction of the corresponding mass or moment of the rigid inertia, along the
@@ -472,7 +506,9 @@ def _least_eigenvalue(mass: Array, center: Array, inertia: Array, L: Array) -> A
     # In `M` and `modes`, moments are about the centre of mass, and the unit of length is the radius
     # of gyration `size`.
     trace = np.trace(inertia, axis1=1, axis2=2)
-    size = np.sqrt(np.maximum(trace, 1e-300) / np.maximum(2.0 * mass, 1e-300))[:, None, None]
+    size = np.sqrt(np.maximum(trace, 1e-300) / np.maximum(2.0 * mass, 1e-300))[
+        :, None, None
+    ]
     t, r = np.split(L, 2)
     modes = np.empty((len(mass), *L.shape))
     modes[:, :3] = t
@@ -487,7 +523,9 @@ def _least_eigenvalue(mass: Array, center: Array, inertia: Array, L: Array) -> A
     return least
 
 
-def first_impossible(robot: Robot, bodies: Mapping[int, tuple[Array, Array, Array]]) -> int | None:
+def first_impossible(
+    robot: Robot, bodies: Mapping[int, tuple[Array, Array, Array]]
+) -> int | None:
     """Return the index of the first sample in which a body has too little inertia for its modes.
 
     `bodies` maps joint indices of the bare robot to the masses (N,), centres of mass (N, 3) and
@@ -517,7 +555,9 @@ class Column(NamedTuple):
     moment: float
 
 
-def _columns(item: FlexibleAppendage, body: pin.Inertia, placement: pin.SE3) -> list[Column]:
+def _columns(
+    item: FlexibleAppendage, body: pin.Inertia, placement: pin.SE3
+) -> list[Column]:
     """Return the modes of an appendage whose frame has the given placement on its body."""
     T = placement.rotation @ item.translation
     R = placement.rotation @ item.rotation
@@ -526,7 +566,9 @@ def _columns(item: FlexibleAppendage, body: pin.Inertia, placement: pin.SE3) -> 
     mass = max(float(np.square(T).sum()), _LEAST_SCALE * body.mass)
     moment = max(float(np.square(R).sum()), _LEAST_SCALE * least_moment)
     rows = zip(item.modes, T.T, R.T, strict=True)
-    return [Column(name, t, r, placement.translation, mass, moment) for name, t, r in rows]
+    return [
+        Column(name, t, r, placement.translation, mass, moment) for name, t, r in rows
+    ]
 
 
 def _smooth_step(x: float) -> float:
@@ -592,7 +634,9 @@ def _square_over(vector: Array, scale: float) -> float:
     return square / scale
 
 
-def _ball(joint: int, body: pin.Inertia, column: Column, lighter: float = 1.0) -> Mounted:
+def _ball(
+    joint: int, body: pin.Inertia, column: Column, lighter: float = 1.0
+) -> Mounted:
     """Return the ball that models a mode by (16.4) to (16.6).
 
     `joint` is the joint that carries the body. `lighter` is the mass of the ball, as a fraction of
@@ -639,7 +683,9 @@ def _ball(joint: int, body: pin.Inertia, column: Column, lighter: float = 1.0) -
     rotor = 1.0 - float(t @ v + r @ w)
     if abs(rotor) < 1e-13:
         rotor = 0.0
-    mode = Joint(column.name, prismatic=not turning, kind="modal", scale=scale, rotation=rotation)
+    mode = Joint(
+        column.name, prismatic=not turning, kind="modal", scale=scale, rotation=rotation
+    )
     inertia = pin.Inertia(mass, R.T @ -offset, moment * np.eye(3))
     placement = pin.SE3(R, column.p + at.center + offset)
     return Mounted(mode, joint, placement, motion, inertia, rotor / scale**2)

@@ -45,7 +45,13 @@ _SHARE = 1e-6
 
 
 def read_superelement(
-    op4: object, asm: object, *, origin: object, modes: int | None, length: str, mass: str
+    op4: object,
+    asm: object,
+    *,
+    origin: object,
+    modes: int | None,
+    length: str,
+    mass: str,
 ) -> tuple[Array, Array, Array]:
     """Return (frequencies, L, M_rr) of a superelement; see `FlexibleAppendage.from_nastran`.
 
@@ -91,7 +97,8 @@ def read_superelement(
         ),
         "the modal mass or stiffness matrix is not positive definite; expected independent modes "
         "that are clamped at the boundary": not squares[0] > 0.0,
-        f"the rigid mass is {inertia[0, 0]:g}, expected more than 0": not inertia[0, 0] > 0.0,
+        f"the rigid mass is {inertia[0, 0]:g}, expected more than 0": not inertia[0, 0]
+        > 0.0,
     }
     for fault in (fault for fault, present in faults.items() if present):
         raise InputError(f"{path}: {fault}")
@@ -115,7 +122,9 @@ def _read_as(path: Path, kind: str) -> Iterator[None]:
     except FflinError:
         raise
     except ImportError:
-        raise InputError("Nastran files need pyYeti: pip install 'fflin[nastran]'") from None
+        raise InputError(
+            "Nastran files need pyYeti: pip install 'fflin[nastran]'"
+        ) from None
     except Exception as error:  # pyYeti may raise any error
         raise InputError(f"{path} cannot be read as {kind}: {reason(error)}") from None
 
@@ -149,7 +158,12 @@ def _boundary(path: Path) -> tuple[Mask, Array, Array]:
     if kept:
         keep = kept[0]
     boundary = np.asarray(boundary_mask, dtype=bool)
-    if not boundary.any() or boundary.all() or not np.isfinite(points).all() or not len(points):
+    if (
+        not boundary.any()
+        or boundary.all()
+        or not np.isfinite(points).all()
+        or not len(points)
+    ):
         raise InputError(
             f"{path} lacks boundary grids (GRID) with coordinates or modes (SPOINT); expected "
             "both, as in a Craig-Bampton superelement"
@@ -169,10 +183,14 @@ def _complete(path: Path) -> str:
         nonlocal size
         read.append(file)
         if len(read) > _MOST_FILES:
-            raise InputError(f"{path} includes more than {_MOST_FILES} files, or includes itself")
+            raise InputError(
+                f"{path} includes more than {_MOST_FILES} files, or includes itself"
+            )
         content = read_file(file, "Nastran", _LARGEST_TEXT - size)
         size += len(content)
-        return _INCLUDE.sub(lambda match: text_of(included(file, match[1])), content.decode())
+        return _INCLUDE.sub(
+            lambda match: text_of(included(file, match[1])), content.decode()
+        )
 
     def included(file: Path, written: str) -> Path:
         # A bare file name is relative to the file that includes it, any other path to the first.
@@ -205,7 +223,8 @@ def _matrices(path: Path, size: int) -> list[Array]:
 
         file_matrices = op4.read(str(path), sparse=False)
         by_name = {
-            str(name).lower(): np.asarray(x, dtype=float) for name, x in file_matrices.items()
+            str(name).lower(): np.asarray(x, dtype=float)
+            for name, x in file_matrices.items()
         }
     matrices = []
     for kind, names in (("mass", _MASS), ("stiffness", _STIFFNESS)):

@@ -65,7 +65,8 @@ class Pose(NamedTuple):
 
     xyz: tuple[float, ...] = (0.0, 0.0, 0.0)  # [m]
     rpy: tuple[float, ...] = (0.0, 0.0, 0.0)  # roll, pitch, yaw about fixed axes [rad]
-    quaternion: tuple[float, ...] | None = None  # x y z w of unit length, in place of rpy
+    # x y z w of unit length, in place of rpy
+    quaternion: tuple[float, ...] | None = None
 
     @property
     def placement(self) -> pin.SE3:
@@ -104,7 +105,8 @@ class JointElement(NamedTuple):
     origin: Pose  # placement of the child's frame in the parent's frame
     mimic: Mimic | None  # as in the file, where the leader may be a mimic joint too
     axis: tuple[float, ...] = (1.0, 0.0, 0.0)  # in the child's frame, of any length
-    limits: dict[str, float] | None = None  # lower, upper, effort and velocity, if given
+    # lower, upper, effort and velocity, if given
+    limits: dict[str, float] | None = None
     damping: float = 0.0  # [N m s/rad | N s/m]
     friction: float = 0.0  # [N m | N]
 
@@ -118,7 +120,9 @@ def read_link(name: str, element: Element) -> Link:
     """Read a <link>, or raise `UrdfError` if it is invalid."""
     element.refuse_near_miss("inertial")
     for misplaced in element.find_all("mass"):
-        raise misplaced.error(f"<mass> is directly in {element.title}; put it into an <inertial>")
+        raise misplaced.error(
+            f"<mass> is directly in {element.title}; put it into an <inertial>"
+        )
     inertial = element.find("inertial")
     if inertial is None:
         return Link(name, element)
@@ -126,14 +130,18 @@ def read_link(name: str, element: Element) -> Link:
     weight = inertial.require("mass", "value")
     inertia = inertial.require("inertia", *INERTIA, *_BELOW_DIAGONAL)
     for below, above in _BELOW_DIAGONAL.items():
-        if below in inertia.attributes and inertia.number(below) != inertia.number(above):
+        if below in inertia.attributes and inertia.number(below) != inertia.number(
+            above
+        ):
             raise inertia.error(
                 f"{below} of {inertia.title} is {inertia.number(below):g}, but {above} is "
                 f"{inertia.number(above):g}; an inertia is symmetric, so make them equal"
             )
     mass = weight.number("value")
     if mass < 0.0:
-        raise weight.error(f"{weight.title} is {mass:g} kg, expected 0 or more; correct it")
+        raise weight.error(
+            f"{weight.title} is {mass:g} kg, expected 0 or more; correct it"
+        )
     xx, xy, xz, yy, yz, zz = map(inertia.number, INERTIA)
     tensor = np.array(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz)))
     return Link(name, element, mass, read_pose(inertial), tensor)
@@ -159,11 +167,15 @@ def read_pose(element: Element) -> Pose:
     if "quat_xyzw" not in given:
         return Pose(xyz, rpy)
     if "rpy" in given:
-        raise origin.error(f"{origin.title} has both rpy and quat_xyzw; keep one of them")
+        raise origin.error(
+            f"{origin.title} has both rpy and quat_xyzw; keep one of them"
+        )
     quaternion = origin.vector("quat_xyzw", 4)
     length = float(np.hypot.reduce(quaternion))
     if not abs(length - 1.0) <= _QUATERNION_SLACK:
-        raise origin.error(f"quat_xyzw of {origin.title} has length {length:g}, expected 1")
+        raise origin.error(
+            f"quat_xyzw of {origin.title} has length {length:g}, expected 1"
+        )
     return Pose(xyz, rpy, tuple(float(entry / length) for entry in quaternion))
 
 
@@ -175,14 +187,23 @@ def read_joint(name: str, element: Element) -> JointElement:
         raise element.error(
             f"{title} has the unknown type {quoted(kind)}; use {', '.join(FREEDOM)}"
         )
-    element.refuse_near_miss("parent", "child", "origin", "axis", "limit", "dynamics", "mimic")
+    element.refuse_near_miss(
+        "parent", "child", "origin", "axis", "limit", "dynamics", "mimic"
+    )
     for child in element.children:
         if child.tag.endswith(":mimic"):
-            raise child.error(f"<{child.tag}> in {title} is not known to URDF; write it as <mimic>")
-    parent, below = (element.require(end, "link").text("link") for end in ("parent", "child"))
+            raise child.error(
+                f"<{child.tag}> in {title} is not known to URDF; write it as <mimic>"
+            )
+    parent, below = (
+        element.require(end, "link").text("link") for end in ("parent", "child")
+    )
     mimic = None
     if mimic_element := element.find("mimic", "joint", "multiplier", "offset"):
-        numbers = mimic_element.number("multiplier", 1.0), mimic_element.number("offset", 0.0)
+        numbers = (
+            mimic_element.number("multiplier", 1.0),
+            mimic_element.number("offset", 0.0),
+        )
         mimic = Mimic(mimic_element.text("joint"), *numbers)
     joint = JointElement(name, element, kind, parent, below, read_pose(element), mimic)
     # Read the axis, dynamics and limits only of joints with one degree of freedom. Do not check the
@@ -215,7 +236,9 @@ def _limits(element: Element) -> dict[str, float]:
     An invalid limit causes only a note, because A and B do not depend on limits.
     """
     limits: dict[str, float] = {}
-    for name in (x for x in ("lower", "upper", "effort", "velocity") if x in element.attributes):
+    for name in (
+        x for x in ("lower", "upper", "effort", "velocity") if x in element.attributes
+    ):
         written = element.attributes[name]
         value = decimal(written.strip())
         if math.isnan(value) or (value < 0.0 and name in ("effort", "velocity")):
@@ -237,7 +260,11 @@ def _limits(element: Element) -> dict[str, float]:
 
 def resolve_mimics(joints: dict[str, JointElement]) -> dict[str, Mimic]:
     """Return {mimic joint: its rule relative to an independent joint}; omit fixed joints."""
-    written = {name: joint.mimic for name, joint in joints.items() if joint.mimic and joint.freedom}
+    written = {
+        name: joint.mimic
+        for name, joint in joints.items()
+        if joint.mimic and joint.freedom
+    }
     resolved: dict[str, Mimic] = {}
     for name in written:
         chain = [name]
@@ -245,7 +272,9 @@ def resolve_mimics(joints: dict[str, JointElement]) -> dict[str, Mimic]:
             leader, element = written[follower].leader, joints[follower].element
             if leader not in joints:
                 error = unknown("joint", leader[:60], [name[:60] for name in joints])
-                raise element.error(f"{element.title} mimics a joint that does not exist: {error}")
+                raise element.error(
+                    f"{element.title} mimics a joint that does not exist: {error}"
+                )
             for joint_name in (follower, leader):
                 if joints[joint_name].freedom != 1:
                     raise element.error(
@@ -263,7 +292,9 @@ def resolve_mimics(joints: dict[str, JointElement]) -> dict[str, Mimic]:
             leader, multiplier, offset = written[follower]
             above = resolved.get(leader, Mimic(leader, 1.0, 0.0))
             resolved[follower] = Mimic(
-                above.leader, multiplier * above.multiplier, multiplier * above.offset + offset
+                above.leader,
+                multiplier * above.multiplier,
+                multiplier * above.offset + offset,
             )
     return {name: resolved[name] for name in written}
 
@@ -279,12 +310,17 @@ def read_tree(root: Element) -> tuple[dict[str, Link], dict[str, JointElement]]:
     for child in root.children:
         for inner in (child, *child.iterate()):
             nested = inner.tag == "robot" or inner is not child
-            if nested and marks.get(inner.tag, {""}) <= {part.tag for part in inner.children}:
+            if nested and marks.get(inner.tag, {""}) <= {
+                part.tag for part in inner.children
+            }:
                 raise inner.error(
                     f"a <{inner.tag}> is inside a <{child.tag}>, where URDF ignores it; put "
                     f"{quoted(inner.attributes.get('name', ''))} directly into <robot>"
                 )
-    links = {name: read_link(name, element) for name, element in _by_name(root, "link").items()}
+    links = {
+        name: read_link(name, element)
+        for name, element in _by_name(root, "link").items()
+    }
     if not links:
         raise root.error("<robot> has no <link>; add one")
     if len(links) > _LINK_LIMIT:
@@ -292,7 +328,10 @@ def read_tree(root: Element) -> tuple[dict[str, Link], dict[str, JointElement]]:
             f"<robot> has {len(links)} links, expected at most {_LINK_LIMIT}; merge links that are "
             "fixed to each other"
         )
-    joints = {name: read_joint(name, element) for name, element in _by_name(root, "joint").items()}
+    joints = {
+        name: read_joint(name, element)
+        for name, element in _by_name(root, "joint").items()
+    }
     _check_tree(root, links, joints)
     return links, joints
 
@@ -310,7 +349,9 @@ def _by_name(root: Element, tag: str) -> dict[str, Element]:
     return elements
 
 
-def _check_tree(root: Element, links: dict[str, Link], joints: dict[str, JointElement]) -> None:
+def _check_tree(
+    root: Element, links: dict[str, Link], joints: dict[str, JointElement]
+) -> None:
     """Raise `UrdfError` unless the joints connect the links into one tree that is not too deep."""
     above: dict[str, JointElement] = {}
     children: dict[str, list[str]] = {}
@@ -319,7 +360,9 @@ def _check_tree(root: Element, links: dict[str, Link], joints: dict[str, JointEl
         for end, name in (("parent", joint.parent), ("child", joint.child)):
             if name not in links:
                 error = unknown("link", name[:60], [link[:60] for link in links])
-                raise joint.element.error(f"the {end} of {title} does not exist: {error}")
+                raise joint.element.error(
+                    f"the {end} of {title} does not exist: {error}"
+                )
         if other := above.get(joint.child):
             raise joint.element.error(
                 f"link {quoted(joint.child)} is the child of {title} and of {other.element.title} "
@@ -375,7 +418,9 @@ def inertia_notes(links: Iterable[Link], model: pin.Model, origin: str) -> list[
     for link in links:
         least, middle, largest = np.linalg.eigvalsh(link.inertia).tolist()
         if is_impossible(link.mass or 0.0, (least, middle, largest)):
-            joint = model.frames[model.getFrameId(link.name, pin.FrameType.BODY)].parentJoint
+            joint = model.frames[
+                model.getFrameId(link.name, pin.FrameType.BODY)
+            ].parentJoint
             of_body = np.linalg.eigvalsh(model.inertias[joint].inertia)[0]
             if abs(least) > _LOST_IN_BODY * of_body:
                 raise link.element.error(
@@ -387,7 +432,9 @@ def inertia_notes(links: Iterable[Link], model: pin.Model, origin: str) -> list[
             unequal.append(link.name)
         if not link.mass and link.inertia.any():
             weightless.append(link.name)
-    lost = f"the inertia of {named('link', negligible)} has a negative principal moment, "
+    lost = (
+        f"the inertia of {named('link', negligible)} has a negative principal moment, "
+    )
     notes = (
         (negligible, f"{lost}negligible compared with the links it is fixed to"),
         # The largest principal moment of these links exceeds the sum of the other two.

@@ -14,11 +14,24 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.errors import InputError, MissingPackageError, UrdfError, listed, require_known
+from fflin.base.errors import (
+    InputError,
+    MissingPackageError,
+    UrdfError,
+    listed,
+    require_known,
+)
 from fflin.base.process import import_path_without
 from fflin.base.writing import remember
 from fflin.robot.urdf import description
-from fflin.robot.urdf.description import INERTIA, UNLIMITED, JointElement, Link, Mimic, Pose
+from fflin.robot.urdf.description import (
+    INERTIA,
+    UNLIMITED,
+    JointElement,
+    Link,
+    Mimic,
+    Pose,
+)
 from fflin.robot.urdf.xml import Element, enumerated, named, notes_of, parse
 
 SIZE_LIMIT = 64 * 2**20  # bytes
@@ -51,7 +64,8 @@ _IGNORED = {
 class Urdf(NamedTuple):
     """Checked content of a robot's file."""
 
-    model: pin.Model  # free-flyer root joint, zero gravity; mimic joints move freely in it
+    # free-flyer root joint, zero gravity; mimic joints move freely in it
+    model: pin.Model
     sha256: str  # digest of the file and of the xacro arguments, without included files
     links: dict[str, Link]  # in the order of the file
     joints: dict[str, JointElement]
@@ -60,7 +74,9 @@ class Urdf(NamedTuple):
     notes: tuple[str, ...]  # warnings, one line each
 
 
-def describe(document: bytes, path: Path, arguments: Mapping[str, str] = NO_ARGUMENTS) -> Urdf:
+def describe(
+    document: bytes, path: Path, arguments: Mapping[str, str] = NO_ARGUMENTS
+) -> Urdf:
     """Read a URDF or xacro file; `document` contains the bytes of the file at `path`.
 
     `arguments` are the values {name: text} of the arguments of a xacro file.
@@ -73,7 +89,9 @@ def describe(document: bytes, path: Path, arguments: Mapping[str, str] = NO_ARGU
     # In this case, make a continuous leader a revolute joint without limits.
     for name, (leader, multiplier, _) in mimics.items():
         turning = joints[leader].type == "continuous"
-        if turning and not (joints[name].type == "continuous" and multiplier.is_integer()):
+        if turning and not (
+            joints[name].type == "continuous" and multiplier.is_integer()
+        ):
             limits = (joints[leader].limits or {}) | _UNBOUNDED
             joints[leader] = joints[leader]._replace(type="revolute", limits=limits)
     root_joint = "root_joint"
@@ -93,7 +111,11 @@ def describe(document: bytes, path: Path, arguments: Mapping[str, str] = NO_ARGU
         raise UrdfError(
             f"{path}: Pinocchio cannot build the model: {' '.join(str(error).split())[:300]}"
         ) from None
-    names = {"universe", root_joint, *(joint.name for joint in joints.values() if joint.freedom)}
+    names = {
+        "universe",
+        root_joint,
+        *(joint.name for joint in joints.values() if joint.freedom),
+    }
     if set(model.names) != names or len(names) != model.njoints:
         raise UrdfError(
             f"{path}: the joints that Pinocchio built differ from the joints in the file; rename "
@@ -102,8 +124,13 @@ def describe(document: bytes, path: Path, arguments: Mapping[str, str] = NO_ARGU
     model.gravity.setZero()
     # File names may contain bytes that are not valid text. Escape these bytes.
     model.name = name or path.stem.encode(errors="backslashreplace").decode()
-    notes += [*notes_of(root), *description.inertia_notes(links.values(), model, path.stem)]
-    meshes = {e.attributes.get("filename", "") for e in root.iterate() if e.tag == "mesh"}
+    notes += [
+        *notes_of(root),
+        *description.inertia_notes(links.values(), model, path.stem),
+    ]
+    meshes = {
+        e.attributes.get("filename", "") for e in root.iterate() if e.tag == "mesh"
+    }
     digest = hashlib.sha256(document)
     if arguments:
         digest.update(json.dumps(dict(arguments), sort_keys=True).encode())
@@ -154,16 +181,24 @@ def ignored(
             yield field, names, f"{origin}: {effect} unused: {enumerated(names)}"
     zero: dict[tuple[str, ...], list[str]] = {}
     for limit in ("effort", "velocity"):
-        names = tuple(joint.name for joint in moving if (joint.limits or {}).get(limit) == 0.0)
+        names = tuple(
+            joint.name for joint in moving if (joint.limits or {}).get(limit) == 0.0
+        )
         zero.setdefault(names, []).append(limit)
     for names, limits in zero.items():
         if names:
-            affected = named("joint", names) if len(names) < 3 else f"{len(names)} joints"
-            warning = f"{origin}: {', '.join(limits)} 0 of {affected}: no limit (or passive)"
+            affected = (
+                named("joint", names) if len(names) < 3 else f"{len(names)} joints"
+            )
+            warning = (
+                f"{origin}: {', '.join(limits)} 0 of {affected}: no limit (or passive)"
+            )
             yield "passive", names, warning
 
 
-def write_urdf(name: str, links: Mapping[str, Link], joints: Mapping[str, JointElement]) -> str:
+def write_urdf(
+    name: str, links: Mapping[str, Link], joints: Mapping[str, JointElement]
+) -> str:
     """Return the text of a URDF with given links and joints, and with numbers in full precision."""
     parts = []
     for link in links.values():
@@ -177,11 +212,17 @@ def write_urdf(name: str, links: Mapping[str, Link], joints: Mapping[str, JointE
     for joint in joints.values():
         kind = joint.type
         limits = _UNBOUNDED if joint.limits is None else joint.limits
-        inside = _tag("parent", {"link": joint.parent}) + _tag("child", {"link": joint.child})
+        inside = _tag("parent", {"link": joint.parent}) + _tag(
+            "child", {"link": joint.child}
+        )
         inside += _origin(joint.origin) + _tag("axis", {"xyz": joint.axis})
-        inside += _tag("dynamics", {"damping": joint.damping, "friction": joint.friction})
+        inside += _tag(
+            "dynamics", {"damping": joint.damping, "friction": joint.friction}
+        )
         if kind in ("revolute", "prismatic") or joint.limits:
-            inside += _tag("limit", {"effort": UNLIMITED, "velocity": UNLIMITED} | limits)
+            inside += _tag(
+                "limit", {"effort": UNLIMITED, "velocity": UNLIMITED} | limits
+            )
         parts.append(_tag("joint", {"name": joint.name, "type": kind}, inside))
     # urdfdom reads quat_xyzw only if the version of the URDF is 1.1 or higher. In version 1.2, the
     # lower and upper limits of revolute and prismatic joints would be mandatory.
@@ -244,7 +285,10 @@ def _expand(
         ) from None
     messages = done.stderr.decode(errors="replace").splitlines()
     if done.returncode:
-        why = " ".join(messages[-1:]) or f"its process ended with exit code {done.returncode}"
+        why = (
+            " ".join(messages[-1:])
+            or f"its process ended with exit code {done.returncode}"
+        )
         raise UrdfError(f"{failed}: {why[:300]}")
     line, _, urdf = done.stdout.partition(b"\n")
     head = json.loads(line)

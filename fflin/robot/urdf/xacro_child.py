@@ -36,12 +36,16 @@ def main(path: str, limit: float, arguments: str) -> None:
                 resolve_packages=False,
                 rootdir=Path(path).parent,
             ).to_urdf_string()
-    except Exception as error:  # xacro evaluates Python expressions, which may raise anything
+    except (
+        Exception
+    ) as error:  # xacro evaluates Python expressions, which may raise anything
         sys.exit(" ".join(str(error).split()) or type(error).__name__)
     # The list contains all included documents and YAML files, without repetition.
     files = sorted(set(xacro.all_includes))
     texts = [document, *(Path(file).read_text(errors="replace") for file in files)]
-    declared = re.findall(r"""<xacro:arg\s[^>]*?name\s*=\s*["']([^"']*)""", " ".join(texts))
+    declared = re.findall(
+        r"""<xacro:arg\s[^>]*?name\s*=\s*["']([^"']*)""", " ".join(texts)
+    )
     head = json.dumps({"files": files, "arguments": sorted(set(declared))})
     sys.stdout.buffer.write(f"{head}\n{urdf}".encode())
 

@@ -28,7 +28,8 @@ _NEAR = 0.6
 
 _SPACE = " \t\r\n"
 _DECIMAL = re.compile(
-    r"[+-]?(([0-9]+\.?[0-9]*|\.[0-9]+)(e[+-]?[0-9]+)?|inf(inity)?)", re.IGNORECASE | re.ASCII
+    r"[+-]?(([0-9]+\.?[0-9]*|\.[0-9]+)(e[+-]?[0-9]+)?|inf(inity)?)",
+    re.IGNORECASE | re.ASCII,
 )
 
 
@@ -48,7 +49,8 @@ class Element:
     attributes: dict[str, str]
     line: int  # line of its start tag
     origin: str  # name of the document in errors: the path of the file
-    owner: str = ""  # innermost link or joint that this element is or belongs to, as "joint 'a'"
+    # innermost link or joint that this element is or belongs to, as "joint 'a'"
+    owner: str = ""
     children: list[Element] = field(default_factory=list)
     # {warning: line numbers}; all elements of a document share this dictionary.
     notes: dict[str, list[int]] = field(default_factory=dict)
@@ -90,7 +92,9 @@ class Element:
             return None
         child = children[0]
         if attributes:
-            for name in (x for x in child.attributes if x not in attributes and ":" not in x):
+            for name in (
+                x for x in child.attributes if x not in attributes and ":" not in x
+            ):
                 if nearest(name.lower(), attributes, _NEAR):
                     raise child.error(
                         f"{child.title} has an unknown attribute {quoted(name)}; known: "
@@ -135,7 +139,9 @@ class Element:
         value = self.attributes.get(name)
         if value is None or not value.strip():
             problem = "has no" if value is None else "has an empty"
-            raise self.error(f"{self.title} {problem} '{name}'; write <{self.tag} {name}=\"...\">")
+            raise self.error(
+                f"{self.title} {problem} '{name}'; write <{self.tag} {name}=\"...\">"
+            )
         return value
 
     def number(self, name: str, default: float | None = None) -> float:
@@ -153,7 +159,11 @@ class Element:
         text = self.text(name)
         entries = re.split(rf"[{_SPACE}]+", text.strip(_SPACE))
         values = tuple(map(decimal, entries))
-        wrong = [entry for entry, x in zip(entries, values, strict=True) if not abs(x) <= _LARGEST]
+        wrong = [
+            entry
+            for entry, x in zip(entries, values, strict=True)
+            if not abs(x) <= _LARGEST
+        ]
         if len(values) != size or wrong:
             given = f"{quoted(text)}, which has {len(values)} entries"
             if len(values) == size:
@@ -218,10 +228,14 @@ def parse(document: bytes, origin: str) -> Element:
             owner = f"{tag} {quoted(attributes['name'])}"
         element = Element(tag, attributes, line, origin, owner, [], top.notes)
         if len(opened) > _DEPTH_LIMIT:
-            raise element.error(f"more than {_DEPTH_LIMIT} elements deep; find the missing end tag")
+            raise element.error(
+                f"more than {_DEPTH_LIMIT} elements deep; find the missing end tag"
+            )
         nonlocal count
         if (count := count + 1) > _ELEMENT_LIMIT:
-            raise element.error(f"more than {_ELEMENT_LIMIT} elements; reduce it to the robot")
+            raise element.error(
+                f"more than {_ELEMENT_LIMIT} elements; reduce it to the robot"
+            )
         opened[-1].children.append(element)
         opened.append(element)
 
@@ -252,5 +266,7 @@ def parse(document: bytes, origin: str) -> Element:
     except UrdfError:
         raise
     except (LookupError, ValueError) as error:
-        raise UrdfError(f"{origin}: cannot be decoded ({error}); save it as UTF-8") from None
+        raise UrdfError(
+            f"{origin}: cannot be decoded ({error}); save it as UTF-8"
+        ) from None
     return top.children[0]

@@ -42,7 +42,11 @@ def hinge(document, name="robot.urdf"):
     data = model.createData()
     q = pin.neutral(model)
     jacobian = pin.computeJointJacobian(model, data, q, 2)
-    return model.jointPlacements[2].homogeneous, jacobian[:, 6:], model.inertias[2].matrix()
+    return (
+        model.jointPlacements[2].homogeneous,
+        jacobian[:, 6:],
+        model.inertias[2].matrix(),
+    )
 
 
 H = math.sqrt(0.5)
@@ -75,7 +79,9 @@ H = math.sqrt(0.5)
             ),
             arm(
                 child=inertial(
-                    "2", INERTIA.replace('izz="1"', 'izz="1.5"'), '<origin xyz="0 0 0"/>'
+                    "2",
+                    INERTIA.replace('izz="1"', 'izz="1.5"'),
+                    '<origin xyz="0 0 0"/>',
                 )
             ),
         ),
@@ -136,7 +142,9 @@ def test_the_root_joint_takes_a_free_name():
     ("attributes", "name"), [('name="kit"', "kit"), ("", "file"), ('name=" "', "file")]
 )
 def test_name_of_the_model(attributes, name):
-    assert read(robot(link("base"), attributes=attributes), "file.urdf").model.name == name
+    assert (
+        read(robot(link("base"), attributes=attributes), "file.urdf").model.name == name
+    )
 
 
 def test_names_come_through_unchanged():
@@ -152,12 +160,20 @@ def test_mimics_are_resolved_to_the_independent_leader():
         '<mimic joint="j3" multiplier="-3" offset="1"/>',
     )
     # j1 = 2 j2 + 0.5 = 2 (-3 j3 + 1) + 0.5
-    assert read(document).mimics == {"j1": Mimic("j3", -6.0, 2.5), "j2": Mimic("j3", -3.0, 1.0)}
+    assert read(document).mimics == {
+        "j1": Mimic("j3", -6.0, 2.5),
+        "j2": Mimic("j3", -3.0, 1.0),
+    }
 
 
 def test_mimics_in_the_other_order_resolve_alike():
-    document = three("", '<mimic joint="j1" offset="1"/>', '<mimic joint="j2" multiplier="4"/>')
-    assert read(document).mimics == {"j2": Mimic("j1", 1.0, 1.0), "j3": Mimic("j1", 4.0, 4.0)}
+    document = three(
+        "", '<mimic joint="j1" offset="1"/>', '<mimic joint="j2" multiplier="4"/>'
+    )
+    assert read(document).mimics == {
+        "j2": Mimic("j1", 1.0, 1.0),
+        "j3": Mimic("j1", 4.0, 4.0),
+    }
 
 
 @pytest.mark.parametrize(
@@ -172,7 +188,9 @@ def test_mimics_in_the_other_order_resolve_alike():
 )
 def test_turns_of_a_continuous_leader_count(tmp_path, kind, multiplier, counted):
     follow = AXIS + f'<mimic joint="j" multiplier="{multiplier}" offset="0.25"/>'
-    off_axis = '<inertial><origin xyz="0.5 0.25 0"/>' + INERTIAL.partition("<inertial>")[2]
+    off_axis = (
+        '<inertial><origin xyz="0.5 0.25 0"/>' + INERTIAL.partition("<inertial>")[2]
+    )
     path = tmp_path / "r.urdf"
     path.write_text(
         robot(
@@ -310,7 +328,12 @@ def test_a_xacro_without_end_is_one_line(endless, monkeypatch):
     pytest.importorskip("xacrodoc")
     monkeypatch.setattr(expansion, "XACRO_LIMIT", 1.0)
     with pytest.raises(fflin.UrdfError, match=r"xacro.* 1 s"):
-        read(arm(child=endless, attributes='name="r" xmlns:xacro="http://www.ros.org/wiki/xacro"'))
+        read(
+            arm(
+                child=endless,
+                attributes='name="r" xmlns:xacro="http://www.ros.org/wiki/xacro"',
+            )
+        )
 
 
 @pytest.mark.process
@@ -318,7 +341,9 @@ def test_xacro_includes_from_its_own_folder(tmp_path):
     pytest.importorskip("xacrodoc")
     namespace = 'xmlns:xacro="http://www.ros.org/wiki/xacro"'
     (tmp_path / "parts").mkdir()
-    (tmp_path / "parts/arm.xacro").write_text(robot(inertial("3"), attributes=namespace))
+    (tmp_path / "parts/arm.xacro").write_text(
+        robot(inertial("3"), attributes=namespace)
+    )
     path = tmp_path / "r.xacro"
     include = '<xacro:include filename="parts/arm.xacro"/>'
     for _ in range(2):  # nothing of the first expansion is left over
@@ -340,15 +365,24 @@ def test_the_stack_size_of_threads_is_left_as_it_was():
 
 
 def test_wrong_and_infinite_limits_are_none():
-    for limit in ('lower="-inf" upper="inf" effort="inf"', 'lower="" upper="-" effort="-1"'):
+    for limit in (
+        'lower="-inf" upper="inf" effort="inf"',
+        'lower="" upper="-" effort="-1"',
+    ):
         model = read(arm(inside=f"{AXIS}<limit {limit}/>")).model
-        assert model.lowerPositionLimit[7] < -1e300 and model.upperPositionLimit[7] > 1e300
+        assert (
+            model.lowerPositionLimit[7] < -1e300 and model.upperPositionLimit[7] > 1e300
+        )
         assert model.effortLimit[6] > 1e300
 
 
 def test_a_note_is_told_once_for_all_its_lines():
-    document = robot(*(link(name) for name in "abc"), joint("j", "a", "b"), joint("k", "a", "c"))
-    (note,) = read(document.replace('<mass value="1"', '<mass unit="kg" value="1"')).notes
+    document = robot(
+        *(link(name) for name in "abc"), joint("j", "a", "b"), joint("k", "a", "c")
+    )
+    (note,) = read(
+        document.replace('<mass value="1"', '<mass unit="kg" value="1"')
+    ).notes
     assert says(note, "robot.urdf:2: ", "'unit'", "<mass>", "2 more times")
 
 

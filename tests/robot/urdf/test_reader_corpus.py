@@ -52,7 +52,9 @@ def command_of():
 
 def test_corpus_is_large_and_its_names_differ():
     assert len(CASES) >= 150
-    assert not [name for name, n in Counter(case.name for case in CASES).items() if n > 1]
+    assert not [
+        name for name, n in Counter(case.name for case in CASES).items() if n > 1
+    ]
     assert {case.expected for case in CASES} == {ACCEPT, WARN, REFUSE}
 
 

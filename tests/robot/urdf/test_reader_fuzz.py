@@ -20,7 +20,14 @@ def test_fuzz(tmp_path):
         # In a process of its own, for a crash must not take the tests along.
         [
             *("sh", "-c", 'ulimit -v 4194304; exec "$@"', "sh"),
-            *(sys.executable, "-m", "tests.support.fuzz_reader", str(count), seed, str(tmp_path)),
+            *(
+                sys.executable,
+                "-m",
+                "tests.support.fuzz_reader",
+                str(count),
+                seed,
+                str(tmp_path),
+            ),
         ],
         capture_output=True,
         text=True,

@@ -34,8 +34,12 @@ def assert_same(model: pin.Model, expected: pin.Model) -> None:
     assert model.name == expected.name
     assert list(model.parents) == list(expected.parents)
     # Their text holds type, indices and axis.
-    assert [str(joint) for joint in model.joints] == [str(joint) for joint in expected.joints]
-    for placement, other in zip(model.jointPlacements, expected.jointPlacements, strict=True):
+    assert [str(joint) for joint in model.joints] == [
+        str(joint) for joint in expected.joints
+    ]
+    for placement, other in zip(
+        model.jointPlacements, expected.jointPlacements, strict=True
+    ):
         assert np.array_equal(placement.homogeneous, other.homogeneous)
     for inertia, other in zip(model.inertias, expected.inertias, strict=True):
         assert np.array_equal(inertia.matrix(), other.matrix())
@@ -66,7 +70,9 @@ def test_all_files_are_there():
 READ = [p for p in FILES if p.name not in REFUSED] + sorted(BUNDLED.glob("*.urdf"))
 
 
-@pytest.mark.parametrize("path", mostly(READ, *READ[::4], *READ[-8:]), ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path", mostly(READ, *READ[::4], *READ[-8:]), ids=lambda path: path.stem
+)
 def test_same_model_as_pinocchio(path):
     expected = pin.buildModelFromUrdf(str(path), pin.JointModelFreeFlyer())
     model = describe(path.read_bytes(), path).model
@@ -77,7 +83,9 @@ def test_same_model_as_pinocchio(path):
 @pytest.mark.parametrize("name", REFUSED)
 def test_refused_with_a_reason(name):
     path = next(p for p in FILES if p.name == name)
-    with pytest.raises(fflin.UrdfError, match=rf"{name}:\d+: .*{re.escape(REFUSED[name])}"):
+    with pytest.raises(
+        fflin.UrdfError, match=rf"{name}:\d+: .*{re.escape(REFUSED[name])}"
+    ):
         describe(path.read_bytes(), path)
 
 

@@ -14,13 +14,67 @@ import fflin
 ROBOTS = Path(__file__).parents[3] / "robots"
 
 VALUES = (
-    *("", " ", "nan", "inf", "-inf", "1e999", "2,0", "2kg", "0x2", "1e40", "-1", "0", "1e-300"),
-    *("0 0", "0 0 0", "0 0 0 0", "1 0 0", "0,0,1", "0 0 1e200", "1e-9 0 0", "\u0663", "a" * 5000),
-    *("base", "root_joint", "universe", "world", "link_1", "joint_1", "tool", "\U0001f916", "&<>"),
+    *(
+        "",
+        " ",
+        "nan",
+        "inf",
+        "-inf",
+        "1e999",
+        "2,0",
+        "2kg",
+        "0x2",
+        "1e40",
+        "-1",
+        "0",
+        "1e-300",
+    ),
+    *(
+        "0 0",
+        "0 0 0",
+        "0 0 0 0",
+        "1 0 0",
+        "0,0,1",
+        "0 0 1e200",
+        "1e-9 0 0",
+        "\u0663",
+        "a" * 5000,
+    ),
+    *(
+        "base",
+        "root_joint",
+        "universe",
+        "world",
+        "link_1",
+        "joint_1",
+        "tool",
+        "\U0001f916",
+        "&<>",
+    ),
 )
-TYPES = ("fixed", "revolute", "continuous", "prismatic", "planar", "floating", "spherical", "x")
+TYPES = (
+    "fixed",
+    "revolute",
+    "continuous",
+    "prismatic",
+    "planar",
+    "floating",
+    "spherical",
+    "x",
+)
 TAGS = (
-    *("robot", "link", "joint", "inertial", "mass", "inertia", "origin", "axis", "parent", "child"),
+    *(
+        "robot",
+        "link",
+        "joint",
+        "inertial",
+        "mass",
+        "inertia",
+        "origin",
+        "axis",
+        "parent",
+        "child",
+    ),
     *("limit", "dynamics", "mimic", "Link", "x", "visual", "gazebo"),
 )
 # Beyond 1e4 between neighbours M is ill-conditioned, which is not the reader's to judge.
@@ -31,7 +85,15 @@ mutation = st.tuples(
     st.sampled_from(
         (
             *("drop", "duplicate", "move", "tag", "mimic"),
-            *("drop attribute", "copy attribute", "value", "type", "scale", "rename", "swap ends"),
+            *(
+                "drop attribute",
+                "copy attribute",
+                "value",
+                "type",
+                "scale",
+                "rename",
+                "swap ends",
+            ),
         )
     ),
     position,
@@ -46,7 +108,9 @@ def mutate(root: ET.Element, kind: str, i: int, j: int, k: int) -> None:
     if not parents:
         return
     # What lies in visuals is ignored, so it is picked seldom.
-    elements = [e for e in parents if i % 10 == 0 or not _ignored(e, parents)] or list(parents)
+    elements = [e for e in parents if i % 10 == 0 or not _ignored(e, parents)] or list(
+        parents
+    )
     element, other = elements[i % len(elements)], elements[j % len(elements)]
     attributes = sorted(element.attrib)
     attribute = attributes[k % len(attributes)] if attributes else "name"
@@ -68,7 +132,9 @@ def mutate(root: ET.Element, kind: str, i: int, j: int, k: int) -> None:
     elif kind == "drop attribute":
         element.attrib.pop(attribute, None)
     elif kind == "copy attribute":
-        element.set(attribute, other.get(attribute, next(iter(other.attrib.values()), "")))
+        element.set(
+            attribute, other.get(attribute, next(iter(other.attrib.values()), ""))
+        )
     elif kind == "value":
         element.set(attribute, VALUES[j % len(VALUES)])
     elif kind == "type":
@@ -80,11 +146,15 @@ def mutate(root: ET.Element, kind: str, i: int, j: int, k: int) -> None:
             numbers = [float(text) for text in element.get(attribute, "").split()]
         except ValueError:
             return
-        element.set(attribute, " ".join(repr(x * SCALES[j % len(SCALES)]) for x in numbers))
+        element.set(
+            attribute, " ".join(repr(x * SCALES[j % len(SCALES)]) for x in numbers)
+        )
     elif kind == "rename":
         names = [e for e in root if "name" in e.attrib]
         if names:
-            names[i % len(names)].set("name", names[j % len(names)].get("name", "") + "x" * (k % 2))
+            names[i % len(names)].set(
+                "name", names[j % len(names)].get("name", "") + "x" * (k % 2)
+            )
     elif kind == "swap ends":
         for joint in root.findall("joint")[i % 8 : i % 8 + 1]:
             ends = joint.find("parent"), joint.find("child")
@@ -101,11 +171,15 @@ def _ignored(element: ET.Element, parents: dict[ET.Element, ET.Element]) -> bool
 
 
 def _mass(root: ET.Element) -> float:
-    return math.fsum(float(m.get("value", "nan")) for m in root.findall("link/inertial/mass"))
+    return math.fsum(
+        float(m.get("value", "nan")) for m in root.findall("link/inertial/mass")
+    )
 
 
 @pytest.mark.fuzz
-@pytest.mark.parametrize("path", sorted(ROBOTS.glob("*.urdf")), ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path", sorted(ROBOTS.glob("*.urdf")), ids=lambda path: path.stem
+)
 @settings(
     max_examples=150,
     deadline=None,
@@ -130,7 +204,9 @@ def test_mutated(path, mutations, tmp_path, capfd):
             assert str(error).startswith(f"{mutated}:")
     else:
         # Nothing was passed over: all joints that move are there, and all mass.
-        moving = [j.get("name") for j in root.findall("joint") if j.get("type") != "fixed"]
+        moving = [
+            j.get("name") for j in root.findall("joint") if j.get("type") != "fixed"
+        ]
         followers = [follower.joint.name for follower in robot.followers]
         assert sorted([*robot.joint_names, *followers]) == sorted(moving)
         assert math.isclose(robot.mass, _mass(root), rel_tol=1e-12)
