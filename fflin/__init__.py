@@ -51,6 +51,7 @@ _PUBLIC = {
         "linear.fit": "line_up",
         "control.weights": "bryson sampled_cost",
         "control.gain": "Gain",
+        "control.margins": "margins Margins ChannelMargins",
         "control.plan": "plan",
         "control.mpc": "mpc",
         "control.tvlqr": "tvlqr GainSchedule FilterSchedule",

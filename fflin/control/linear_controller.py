@@ -20,7 +20,14 @@ from fflin.base.validation import Array, Mask, as_double, instance, number, shap
 from fflin.base.writing import RECORDS, as_path, check_ending, reason
 from fflin.control.kalman import Compensator
 from fflin.control.policies import Feedback, Loop, OutputSensing, Sample
-from fflin.control.policy import Noise, OutputForm, Policy, Predictor, unstable_note
+from fflin.control.policy import (
+    LinearLaw,
+    Noise,
+    OutputForm,
+    Policy,
+    Predictor,
+    unstable_note,
+)
 from fflin.dynamics.integrators import held_exponential
 from fflin.dynamics.outputs import Measuring
 from fflin.dynamics.state import StateMap
@@ -199,6 +206,11 @@ class LinearController(OutputSensing, Feedback):
         """Names of the states in the measured outputs of the controller."""
         acting = self.system.B.any(axis=0) | self.system.D.any(axis=0)
         return tuple(compress(self.lin.state_names, self.lin.C[acting].any(axis=0)))
+
+    def linear_law(self) -> LinearLaw:
+        """Return the controller."""
+        A, B, C, D, dt, signals, _ = self.system
+        return LinearLaw(A, B, C, D, dt, signals)
 
     def closed_loop(self) -> tuple[Array, float] | None:
         """Return the closed-loop matrix of model and controller, and dt [s]."""

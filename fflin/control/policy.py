@@ -50,6 +50,7 @@ _FUNCTIONS = FunctionType, BuiltinFunctionType
 _DESCRIBING = (
     "form",
     "feedback_gain",
+    "linear_law",
     "closed_loop",
     "loop_around",
     "loop_notes",
@@ -91,6 +92,21 @@ class StateForm(NamedTuple):
     gains: Array
     x0: Array
     grid: Mapping[str, Array]
+
+
+class LinearLaw(NamedTuple):
+    """Law u - u0 = C z + D e about a point, where ``A z + B e`` is dz/dt, or the next z.
+
+    e contains the deviations of the measured `signals` from the point: names of states, or of
+    outputs of the robot. dt [s] is 0 in continuous time.
+    """
+
+    A: Array
+    B: Array
+    C: Array
+    D: Array
+    dt: float
+    signals: tuple[str, ...]
 
 
 class OutputForm(NamedTuple):
@@ -291,6 +307,22 @@ class Policy(ABC):
         if K is None:
             return None
         return lambda model: model.A - model.B @ K
+
+    def linear_law(self) -> LinearLaw | None:
+        """Return the law as a linear system, or None if it is not linear about a point."""
+        lin = self.model
+        K = self.feedback_gain
+        if lin is None or K is None:
+            return None
+        nu, nx = K.shape
+        return LinearLaw(
+            np.zeros((0, 0)),
+            np.zeros((0, nx)),
+            np.zeros((nu, 0)),
+            -K,
+            lin.dt,
+            lin.state_names,
+        )
 
     def poles_along(self) -> Array:
         """Return the poles [1/s] of the robot and of the loop along the followed trajectory."""

@@ -14,7 +14,7 @@ from fflin.base.errors import InputError
 from fflin.base.process import Progress, in_one_thread
 from fflin.base.tables import folded
 from fflin.base.validation import Array, Mask, shaped
-from fflin.control.gain import ACCURACY, gain_crossings, largest_gain
+from fflin.control.optimal.largest_gain import ACCURACY, gain_crossings, largest_gain
 from fflin.uncertainty.lft import LFT
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from scipy.integrate import quad_vec, solve_ivp
 from scipy.linalg import expm
 
 import fflin
-from fflin.control.gain import largest_gain
+from fflin.control.optimal.largest_gain import largest_gain
 from fflin.dynamics.integrators import held_cost
 from tests.support.messages import any_wording, says
 from tests.support.robots import BUNDLED, panels, random_point

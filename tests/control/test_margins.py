@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import minimize_scalar
 
 import fflin
-from fflin.control.gain import ACCURACY, _largest_among, largest_gain
+from fflin.control.optimal.largest_gain import ACCURACY, _largest_among, largest_gain
 from fflin.control.plots import input_loops
 from tests.support.weights import unit_weights
 

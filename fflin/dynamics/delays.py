@@ -1,0 +1,120 @@
+"""Exact sampling of linear systems whose inputs arrive late."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from fflin.base.validation import Array
+from fflin.dynamics.integrators import held_exponential
+
+# A delay that differs from a multiple of the sampling time by less than this fraction of it counts
+# as the multiple.
+_ROUNDING = 1e-9
+
+
+class Delay(NamedTuple):
+    """Delay ``(samples - 1) h + rest`` [s] with the sampling time h and ``0 < rest <= h``.
+
+    A delay of zero has no samples.
+    """
+
+    samples: int
+    rest: float
+
+
+def split(delay: float, h: float) -> Delay:
+    """Return a delay [s] in samples of length h [s] and the rest of the last of them."""
+    ratio = delay / h
+    if ratio <= _ROUNDING:
+        return Delay(0, 0.0)
+    samples = int(np.ceil(ratio - _ROUNDING))
+    rest = min(ratio - (samples - 1), 1.0)
+    return Delay(samples, rest * h)
+
+
+class HeldSystem:
+    r"""Continuous system dx/dt = A x + B u whose held inputs arrive after `delays` (nu,) [s].
+
+    With a delay of (k - 1) h + e and 0 < e <= h, the command of k samples ago acts until the time e
+    of a sample, and the command of k - 1 samples ago acts from then on:
+
+    .. math:: x(h) = \Phi(h)\,x + \Phi(h - e)\,\Gamma(e)\,u_{-k} + \Gamma(h - e)\,u_{-(k-1)},\qquad
+              \Gamma(s) = \int_0^s e^{A t}\,dt\,B
+
+    The states of the sampled system are x, and then for each input in turn its k last commands, the
+    latest first.
+
+    Parameters
+    ----------
+    A : ndarray (nx, nx)
+    B : ndarray (nx, nu)
+    h : float
+        Sampling time [s].
+    delays : ndarray (nu,)
+        Delays [s], at least 0.
+    """
+
+    def __init__(self, A: Array, B: Array, h: float, delays: Array) -> None:
+        self.A, self.B, self.h = A, B, h
+        self.delays = [split(float(delay), h) for delay in delays]
+        counts = [delay.samples for delay in self.delays]
+        ends = len(A) + np.cumsum([0, *counts])
+        self.first = ends[:-1]
+        self.size = int(ends[-1])
+
+    def after(self, s: float) -> tuple[Array, Array]:
+        """Return the maps of the states (nx, size) and of the commands (nx, nu) to x after s [s].
+
+        s is between 0 and h, and counts from a sample.
+        """
+        A, B = self.A, self.B
+        nx, nu = B.shape
+        of_states = np.zeros((nx, self.size))
+        of_commands = np.zeros((nx, nu))
+        of_states[:, :nx], held = held_exponential(A, B, s)
+        for index, (samples, rest) in enumerate(self.delays):
+            if not samples:
+                of_commands[:, index] = held[:, index]
+                continue
+            column = B[:, index : index + 1]
+            oldest = self.first[index] + samples - 1
+            _, early = held_exponential(A, column, min(rest, s))
+            left = max(s - rest, 0.0)
+            moved, late = held_exponential(A, column, left)
+            of_states[:, oldest] = (moved @ early)[:, 0]
+            if samples == 1:
+                of_commands[:, index] = late[:, 0]
+            else:
+                of_states[:, oldest - 1] = late[:, 0]
+        return of_states, of_commands
+
+    def sampled(self) -> tuple[Array, Array]:
+        """Return the matrices A (size, size) and B (size, nu) of the exact sampled system."""
+        nx, nu = self.B.shape
+        Ad = np.zeros((self.size, self.size))
+        Bd = np.zeros((self.size, nu))
+        Ad[:nx], Bd[:nx] = self.after(self.h)
+        for index, (samples, _) in enumerate(self.delays):
+            first = self.first[index]
+            for place in range(first, first + samples):
+                if place == first:
+                    Bd[place, index] = 1.0
+                else:
+                    Ad[place, place - 1] = 1.0
+        return Ad, Bd
+
+    def outputs(self, C: Array, D: Array) -> tuple[Array, Array]:
+        """Return the output matrices of the sampled system; D acts on the inputs that arrive.
+
+        At a sample, these are the commands of k samples ago.
+        """
+        nx, nu = self.B.shape
+        Cd = np.zeros((len(C), self.size))
+        Dd = np.zeros((len(C), nu))
+        Cd[:, :nx] = C
+        for index, (samples, _) in enumerate(self.delays):
+            if samples:
+                Cd[:, self.first[index] + samples - 1] = D[:, index]
+            else:
+                Dd[:, index] = D[:, index]
+        return Cd, Dd

@@ -1,0 +1,303 @@
+"""Margins of linear loops equal those of brute-force searches and of closed forms."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+import fflin
+from fflin.control.margins import _Closed, _law_of
+from fflin.control.optimal.disk import best_scaling, worst_perturbation
+from fflin.dynamics.delays import HeldSystem, split
+
+
+def satellite(inputs=None, **fields):
+    """Return a robot with a base torque, and its model."""
+    robot = fflin.load("cubesat", inputs=inputs or [fflin.BaseTorque()], **fields)
+    return robot, fflin.linearize(robot)
+
+
+def loop_of(policy, lin, **how):
+    """Return the loop whose margins are computed."""
+    how = {"delay": 0.0, "sample": None, "at": "inputs", **how}
+    return _Closed(_law_of(policy, lin, how["sample"]), lin, *how.values())
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.03, 0.1, 0.1 + 1e-12, 0.17, 0.2, 0.33])
+def test_delayed_inputs_give_the_states_of_a_fine_integration(delay):
+    rng = np.random.default_rng(1)
+    A, B = rng.normal(size=(3, 3)), rng.normal(size=(3, 2))
+    h, part, steps = 0.1, 100, 12
+    held = HeldSystem(A, B, h, np.array([delay, 0.0]))
+    Ad, Bd = held.sampled()
+    commands = rng.normal(size=(steps, 2))
+    z, x = np.zeros(len(Ad)), np.zeros(3)
+    small = h / part
+    step = expm(np.block([[A, B], [np.zeros((2, 5))]]) * small)
+    for k, u in enumerate(commands):
+        for i in range(part):
+            time = k * h + (i + 0.5) * small - delay
+            late = commands[math.floor(time / h), 0] if time > 0.0 else 0.0
+            x = step[:3, :3] @ x + step[:3, 3:] @ (late, u[1])
+            if i == 56:
+                of_states, of_commands = held.after(0.57 * h)
+                inside = of_states @ z + of_commands @ u
+                assert inside == pytest.approx(x, abs=1e-12)
+        z = Ad @ z + Bd @ u
+        assert z[:3] == pytest.approx(x, abs=1e-12)
+
+
+def test_a_delay_is_split_into_samples_and_a_rest():
+    assert split(0.0, 0.1) == (0, 0.0)
+    for delay in (0.01, 0.1, 0.25, 0.3):
+        samples, rest = split(delay, 0.1)
+        assert 0.0 < rest <= 0.1
+        assert (samples - 1) * 0.1 + rest == pytest.approx(delay)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_the_best_scaling_is_exact_for_up_to_three_channels(count):
+    rng = np.random.default_rng(count)
+    for _ in range(5):
+        M = rng.normal(size=(count, count)) + 1j * rng.normal(size=(count, count))
+        bound, d = best_scaling(M)
+        assert bound == pytest.approx(np.linalg.norm(d[:, None] * M / d, 2), rel=1e-9)
+        # The structured singular value is the largest spectral radius over the phases.
+        phases = np.linspace(0.0, 2.0 * np.pi, 91)[:-1]
+        largest = max(
+            np.abs(
+                np.linalg.eigvals(np.exp(1j * np.array([0.0, *rest]))[:, None] * M)
+            ).max()
+            for rest in itertools.product(phases, repeat=count - 1)
+        )
+        assert bound * (1.0 - 4e-3) < largest <= bound * (1.0 + 1e-9)
+        reached, change = worst_perturbation(M, d, bound)
+        assert reached == pytest.approx(bound, rel=1e-7)
+        assert abs(np.linalg.det(np.eye(count) - M @ np.diag(change))) < 1e-9
+        assert np.abs(change) == pytest.approx(1.0 / reached)
+
+
+def test_a_perturbation_of_many_channels_lies_between_its_bounds():
+    rng = np.random.default_rng(3)
+    for count in (4, 6, 9):
+        M = rng.normal(size=(count, count)) + 1j * rng.normal(size=(count, count))
+        bound, d = best_scaling(M)
+        reached, change = worst_perturbation(M, d, bound)
+        assert bound / 1.2 < reached <= bound * (1.0 + 1e-9)
+        assert abs(np.linalg.det(np.eye(count) - M @ np.diag(change))) < 1e-8
+
+
+def test_the_margins_of_a_double_integrator_are_those_of_its_closed_form():
+    _, lin = satellite()
+    gain = fflin.lqr(lin)
+    margins = fflin.margins(gain, lin)
+    # By symmetry, each axis is a double integrator q'' = s L u with L the inverse inertia.
+    for i, channel in enumerate(margins.channels):
+        names = lin.state_names
+        axis = lin.input_names[i].removeprefix("tau_b.")
+        kp = gain.K[i, names.index(f"q_b.{axis}")]
+        kd = gain.K[i, names.index(f"omega_b.{axis}")]
+        L = lin.B[names.index(f"omega_b.{axis}"), i]
+        a, b = 0.5 * kp * L, kd * L
+        # |a + b j w| = w^2
+        w = math.sqrt(0.5 * (b * b + math.sqrt(b**4 + 4.0 * a * a)))
+        phase = math.atan2(b * w, a)
+        assert channel.phase == pytest.approx(math.degrees(phase), rel=1e-9)
+        assert channel.phase_frequency == pytest.approx(w, rel=1e-9)
+        assert channel.delay == pytest.approx(phase / w, rel=1e-9)
+        assert channel.gain == (0.0, math.inf)
+    assert len(margins.channels) == 3
+
+
+@pytest.fixture(scope="module", params=[1, 2, 3])
+def joints(request):
+    """Return the model and a law of a robot whose first one to three joints are actuated."""
+    names = [f"joint_{i + 1}" for i in range(request.param)]
+    robot = fflin.load(
+        "planar_detumble",
+        inputs=[fflin.JointTorque(name) for name in names],
+        stiffness={"joint_*": 2.0},
+        damping={"joint_*": 0.2},
+    )
+    lin = fflin.linearize(robot)
+    rng = np.random.default_rng(request.param)
+    K = np.zeros(lin.B.T.shape)
+    for row, name in enumerate(names):
+        K[row, lin.state_names.index(f"q_m.{name}")] = 15.0 + 5.0 * rng.uniform()
+        K[row, lin.state_names.index(f"qdot_m.{name}")] = 6.0 + rng.uniform()
+    return lin, fflin.StateFeedback(lin, K)
+
+
+@pytest.mark.parametrize("how", [{}, {"sample": 0.02}, {"sample": 0.05, "delay": 0.03}])
+def test_disk_margins_equal_a_search_over_frequencies_and_phases(joints, how):
+    lin, policy = joints
+    margins = fflin.margins(policy, lin, **how)
+    assert margins.stable
+    loop = loop_of(policy, lin, **how)
+    plant = loop.with_delays(np.full(len(lin.input_names), loop.delay))
+    F, G, H, J = loop.closed(plant)
+    count = len(J)
+
+    def response(w):
+        point = np.exp(1j * w * loop.dt) if loop.dt else 1j * w
+        return J + H @ np.linalg.solve(point * np.eye(len(F)) - F, G)
+
+    # The largest spectral radius over phases and frequencies near the one that is reported.
+    phases = np.linspace(0.0, 2.0 * np.pi, 81)[:-1]
+    turns = np.array(
+        [(0.0, *rest) for rest in itertools.product(phases, repeat=count - 1)]
+    )
+    turns = np.exp(1j * turns)[:, :, None]
+    end = np.pi / loop.dt if loop.dt else 1e3
+
+    def largest(w, among=turns):
+        return np.abs(np.linalg.eigvals(among * response(w))).max()
+
+    for w in np.geomspace(1e-3, end, 200):
+        assert largest(w, turns[::7]) <= (1.0 + 1e-6) / margins.disk
+    assert largest(margins.frequency) >= (1.0 - 4e-3) / margins.disk
+    # The factors make the loop oscillate at that frequency: the bound is reached.
+    assert margins.disk_reached == pytest.approx(margins.disk, rel=1e-6)
+    factors = np.diag(margins.factors)
+    K = policy.K
+    kept = np.flatnonzero(K.any(axis=1))
+    assert len(kept) == count
+    A, B, C, _ = plant
+    law = loop.law.D
+    closed = A + B @ factors @ law @ C
+    poles = np.linalg.eigvals(closed.astype(complex))
+    on_boundary = np.abs(np.abs(poles) - 1.0) if loop.dt else np.abs(poles.real)
+    assert on_boundary.min() < 1e-6
+    for share, is_stable in ((0.999, True), (1.001, False)):
+        change = 2.0 * (margins.factors - 1.0) / (margins.factors + 1.0) * share
+        scaled = np.diag((1.0 + 0.5 * change) / (1.0 - 0.5 * change))
+        poles = np.linalg.eigvals((A + B @ scaled @ law @ C).astype(complex))
+        growth = np.abs(poles).max() - 1.0 if loop.dt else poles.real.max()
+        assert (growth < 0.0) == is_stable
+
+
+@pytest.mark.parametrize("how", [{"sample": 0.02}, {"sample": 0.05, "delay": 0.03}])
+@pytest.mark.parametrize("at", ["inputs", "outputs"])
+def test_delay_margins_are_the_delays_at_which_the_exact_sampled_loop_is_unstable(
+    joints, how, at
+):
+    lin, policy = joints
+    margins = fflin.margins(policy, lin, at=at, **how)
+    loop = loop_of(policy, lin, at=at, **how)
+    delays = np.full(len(lin.input_names), loop.delay)
+    for index, channel in enumerate(margins.channels):
+        if math.isinf(channel.delay):
+            continue
+
+        def radius(extra, index=index):
+            plant = loop.delayed_plant(index, extra, delays)
+            return np.abs(np.linalg.eigvals(loop.closed(plant)[0])).max()
+
+        assert (
+            radius(channel.delay * (1.0 - 1e-4))
+            < 1.0
+            < radius(channel.delay * (1.0 + 1e-4))
+        )
+        earlier = np.linspace(0.0, channel.delay, 30)[:-1]
+        assert max(map(radius, earlier)) < 1.0
+    assert any(math.isfinite(channel.delay) for channel in margins.channels)
+
+
+def test_gain_margins_are_the_factors_at_which_the_sampled_loop_is_unstable(joints):
+    lin, policy = joints
+    margins = fflin.margins(policy, lin, sample=0.05, delay=0.03)
+    loop = loop_of(policy, lin, sample=0.05, delay=0.03)
+    plant = loop.with_delays(np.full(len(lin.input_names), 0.03))
+    A, B, C, _ = plant
+    for index, channel in enumerate(margins.channels):
+
+        def growth(factor, index=index):
+            factors = np.ones(len(lin.input_names))
+            factors[index] = factor
+            closed = A + (B * factors) @ loop.law.D @ C
+            return np.abs(np.linalg.eigvals(closed)).max() - 1.0
+
+        high = channel.gain[1]
+        assert growth(high * (1.0 - 1e-6)) < 0.0 < growth(high * (1.0 + 1e-6))
+        assert channel.disk >= margins.disk * (1.0 - 1e-6)
+        least = (2.0 + channel.disk) / (2.0 - channel.disk)
+        assert high >= least * (1.0 - 1e-6)
+
+
+def test_a_continuous_loop_with_a_delay_has_the_margins_of_the_exponential(joints):
+    lin, policy = joints
+    tau = 0.04
+    margins = fflin.margins(policy, lin, delay=tau)
+    without = fflin.margins(policy, lin)
+    if len(margins.channels) > 1:
+        return
+    # With one channel, the delay adds a phase alone.
+    assert margins.channels[0].delay == pytest.approx(
+        without.channels[0].delay - tau, rel=1e-8
+    )
+    w = margins.channels[0].phase_frequency
+    lost = without.channels[0].phase - margins.channels[0].phase
+    assert lost == pytest.approx(math.degrees(w * tau), rel=1e-8)
+
+
+def test_the_bounds_of_many_channels_are_within_a_fifth():
+    robot = fflin.load("canadarm2")
+    lin = fflin.linearize(robot)
+    sampled = lin.discretize(0.2)
+    compensator = fflin.lqg(fflin.lqr(sampled), fflin.kalman(sampled, 1e-3, 1e-4))
+    policy = fflin.OutputFeedback(sampled, compensator)
+    margins = fflin.margins(policy, lin)
+    assert margins.disk <= margins.disk_reached * (1.0 + 1e-9)
+    assert margins.disk_reached <= 1.2 * margins.disk
+    factors = margins.factors
+    loop = loop_of(policy, lin)
+    A, B, C, _ = loop.with_delays(np.zeros(len(lin.input_names)))
+    law = loop.law
+    assert not law.D.any()
+    wide = np.ones(len(lin.input_names), complex)
+    wide[loop.channels] = factors
+    closed = np.block([[A, (B * wide) @ law.C], [law.B @ C, law.A]])
+    assert np.abs(np.abs(np.linalg.eigvals(closed)) - 1.0).min() < 1e-7
+    # The gain with fixed scalings by the weights is at most as good.
+    gain = fflin.lqr(sampled)
+    assert fflin.margins(gain, sampled).disk >= gain.margins.disk * (1.0 - 1e-6)
+
+
+def test_a_continuous_controller_is_sampled_for_its_margins(joints):
+    lin, policy = joints
+    # A first-order lag of the law of state feedback.
+    K = policy.K
+    count = len(K)
+    fast = 50.0 * np.eye(count)
+    system = (-fast, -fast @ K, np.eye(count), np.zeros(K.shape))
+    controller = fflin.LinearController(system, lin)
+    held = fflin.margins(controller, lin, sample=0.01)
+    explicit = fflin.margins(controller.sampled(0.01), lin)
+    assert held.disk == pytest.approx(explicit.disk, rel=1e-9)
+    assert held.dt == 0.01 and held.disk < fflin.margins(controller, lin).disk
+
+
+def test_an_unstable_loop_has_no_margins():
+    _, lin = satellite()
+    policy = fflin.StateFeedback(lin, -np.array(fflin.lqr(lin).K))
+    margins = fflin.margins(policy, lin)
+    assert not margins.stable and margins.disk == 0.0 and not margins.channels
+    assert "the loop is unstable" in str(margins)
+
+
+def test_margins_of_laws_that_do_not_fit_are_refused():
+    robot, lin = satellite()
+    gain = fflin.lqr(lin)
+    other = fflin.linearize(robot.replace(inputs=[fflin.BaseForce()]))
+    with pytest.raises(fflin.InputError, match="has other inputs, which does not fit"):
+        fflin.margins(gain, other)
+    with pytest.raises(fflin.InputError, match="expected a linear law about a point"):
+        fflin.margins(lambda t, q, v: np.zeros(3), lin)
+    with pytest.raises(fflin.InputError, match="have different sampling times"):
+        fflin.margins(gain, lin.discretize(0.1), sample=0.2)
+    with pytest.raises(fflin.InputError, match="delay is -1 s, expected at least 0"):
+        fflin.margins(gain, lin, delay=-1.0)
+    with pytest.raises(fflin.InputError, match="expected 'inputs' or 'outputs'"):
+        fflin.margins(gain, lin, at="all")
