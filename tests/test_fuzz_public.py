@@ -45,6 +45,8 @@ RESULTS = {
     "ToolGain",
     "ToolSchedule",
     "ToolTrajectory",
+    "Margins",
+    "ChannelMargins",
     *(
         "Campaign",
         "Capture",

@@ -229,15 +229,16 @@ def margins(
     True
     """
     instance("lin", lin, LinearModel, "a fflin.LinearModel")
-    if at not in ("inputs", "outputs"):
+    if not isinstance(at, str) or at not in ("inputs", "outputs"):
         raise InputError(f"at is {at!r}, expected 'inputs' or 'outputs'")
-    if number("delay", delay) < 0.0:
+    delay = number("delay", delay)
+    if delay < 0.0:
         raise InputError(f"delay is {delay:g} s, expected at least 0")
     if sample is not None:
-        positive("sample", sample, "s")
-    return _Closed(
-        _law_of(policy, lin, sample), lin, float(delay), sample, at
-    ).margins()
+        sample = positive("sample", sample, "s")
+    law = _law_of(policy, lin, sample)
+    with np.errstate(over="ignore", invalid="ignore"):
+        return _Closed(law, lin, delay, sample, at).margins()
 
 
 def _law_of(policy: Policy | Gain, lin: LinearModel, sample: float | None) -> LinearLaw:
@@ -374,6 +375,11 @@ class _Closed:
         """Return the margins of all channels."""
         delays = np.full(self.plant.B.shape[1], self.delay)
         loop = self.closed(self.with_delays(delays))
+        if not all(np.isfinite(matrix).all() for matrix in loop):
+            raise InputError(
+                "the response of the loop overflows; give smaller gains, a shorter sample time or "
+                "a shorter delay"
+            )
         if not _is_stable(loop[0], self.dt):
             count = len(self.channels)
             return Margins(

@@ -136,6 +136,13 @@ def light(folder):
         "FullState": {},
         "generalized_inertia": {"lin": lin},
         "generalized_jacobian": {"robot": robot, "q": q, "frame": "base"},
+        "margins": {
+            "policy": gain,
+            "lin": lin,
+            "delay": 0.0,
+            "sample": None,
+            "at": "inputs",
+        },
         "gramians": {"lin": filtered_model, "duration": 1.0},
         "grid": {"robot": robot, "axes": {joint: [0.0, 1.0]}, "base": None},
         "Gyroscope": {"frame": "base"},
