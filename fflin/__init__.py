@@ -75,6 +75,7 @@ _PUBLIC = {
     "Simulation": {
         "simulation.simulate": "simulate",
         "simulation.motion": "Motion",
+        "simulation.pointing": "Pointing PointingError",
         "view.visualize": "visualize",
     },
     "Campaigns": {

@@ -126,6 +126,8 @@ from fflin.export.c_code import CLaw as CLaw
 # Simulation
 from fflin.simulation.simulate import simulate as simulate
 from fflin.simulation.motion import Motion as Motion
+from fflin.simulation.pointing import Pointing as Pointing
+from fflin.simulation.pointing import PointingError as PointingError
 from fflin.view.visualize import visualize as visualize
 
 # Campaigns

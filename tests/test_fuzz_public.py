@@ -45,6 +45,8 @@ RESULTS = {
     "ToolGain",
     "ToolSchedule",
     "ToolTrajectory",
+    "Pointing",
+    "PointingError",
     "Margins",
     "ChannelMargins",
     *(

@@ -368,6 +368,21 @@ def attitude_errors(x: Array, target: Array) -> Array:
     return np.degrees(angles)
 
 
+def attitude_rotations(x: Array, target: Array) -> Array:
+    """Return the rotation vectors (N, 3) [rad] from the attitudes of targets to those of states.
+
+    The vectors are in target axes. `target` is one state (nx,), or one for each row of x (N, nx).
+    """
+    turned, scalar = _apart(x, target)
+    turned = turned * np.where(scalar < 0.0, -1.0, 1.0)
+    half = np.linalg.norm(turned, axis=1, keepdims=True)
+    angle = 2.0 * np.arctan2(half, np.abs(scalar))
+    rotations: Array = turned * np.divide(
+        angle, half, out=np.full_like(half, 2.0), where=half > 0.0
+    )
+    return rotations
+
+
 def _apart(x: Array, target: Array) -> tuple[Array, Array]:
     """Return the rotation from the target attitude to the attitude of each state in x (N, nx).
 

@@ -1,0 +1,348 @@
+"""Pointing errors of a motion, as requirements state them: absolute, mean, relative and drift."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from fflin.base.errors import InputError
+from fflin.base.tables import folded, grid
+from fflin.base.validation import (
+    Array,
+    ArrayLike,
+    Mask,
+    Result,
+    number,
+    positive,
+    vector,
+)
+from fflin.dynamics.coordinates import attitude_rotations
+from fflin.simulation.report import Firings, curves, firings
+
+if TYPE_CHECKING:
+    from fflin.simulation.motion import Motion
+
+# Share of the time in which an error is below the values of the columns "95 %" and "99.7 %".
+_LEVELS = (0.95, 0.997)
+
+# Errors are counted from this share of the run on, if neither `after` nor `accuracy` is given.
+_LATE = 0.5
+
+# At most this number of windows is evaluated; their starts are then evenly distributed.
+_WINDOWS = 2000
+
+# Seconds of arc in a degree. The report uses them if no error exceeds _SMALL [deg].
+_ARCSEC = 3600.0
+_SMALL = 0.02
+
+
+class PointingError(NamedTuple):
+    """Statistics of one pointing error over time, for each axis and for the whole angle.
+
+    Attributes
+    ----------
+    largest, rms, p95, p997 : ndarray (k,)
+        Largest magnitude, root mean square, and the magnitudes [deg] that are not exceeded in 95 %
+        and 99.7 % of the time. k is 4: rotation about x, y and z of the target, and the angle of
+        the whole rotation; or 1 for the angle of a line of sight.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> spin = fflin.velocity(robot, {"omega_b.z": 0.1})
+    >>> lin = fflin.linearize(robot)
+    >>> law = fflin.StateFeedback(lin, fflin.lqr(lin).K)
+    >>> motion = fflin.simulate(robot, law, v0=spin, duration=60.0)
+    >>> bool(motion.pointing(5.0).absolute.largest[-1] < 1.0)
+    True
+    """
+
+    largest: Array
+    rms: Array
+    p95: Array
+    p997: Array
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Pointing(Result):
+    """Pointing errors of a motion from its target, in the terms of ECSS-E-ST-60-10C.
+
+    All errors are in deg, and counted from the time `after` on.
+
+    Attributes
+    ----------
+    axes : tuple of str
+        Names of the columns of the errors: "x", "y", "z", "angle", or "line of sight".
+    absolute : PointingError
+        Absolute performance error: the error at each time.
+    mean : PointingError
+        Mean performance error: the mean of the error over each window.
+    relative : PointingError
+        Relative performance error: the error at each time minus its mean over the window. It is the
+        instability within a window.
+    drift : PointingError or None
+        Performance drift error: the difference of the means of two windows that begin `apart` one
+        after the other; None if the run is too short for it.
+    window, apart, after : float
+        Length of the windows, time between the windows of the drift, and time from which errors
+        are counted [s].
+    accuracy : float or None
+        Angle [deg] of the settling time.
+    settled : float or None
+        Time [s] after which the angle stays below `accuracy`; None if it does not, or only for less
+        than a window.
+    momentum_used, torque_used : mapping
+        For each wheel with a limit, the largest magnitude of speed or torque as a fraction of the
+        limit.
+    firings : Firings or None
+        Pulses, impulse [N s] and propellant [kg] of the thrusters.
+    robot : str
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> spin = fflin.velocity(robot, {"omega_b.z": 0.1})
+    >>> lin = fflin.linearize(robot)
+    >>> law = fflin.StateFeedback(lin, fflin.lqr(lin).K)
+    >>> motion = fflin.simulate(robot, law, v0=spin, duration=60.0)
+    >>> pointing = motion.pointing(5.0, accuracy=0.5)
+    >>> pointing.settled < 60.0, pointing.axes
+    (True, ('x', 'y', 'z', 'angle'))
+    """
+
+    axes: tuple[str, ...]
+    absolute: PointingError
+    mean: PointingError
+    relative: PointingError
+    drift: PointingError | None
+    window: float
+    apart: float
+    after: float
+    accuracy: float | None
+    settled: float | None
+    momentum_used: dict[str, float]
+    torque_used: dict[str, float]
+    firings: Firings | None
+    robot: str
+
+    def __repr__(self) -> str:
+        return str(self)
+
+    def __str__(self) -> str:
+        head = [
+            f"{self.robot}: pointing errors from {self.after:.4g} s on, windows of "
+            f"{self.window:g} s"
+        ]
+        if self.accuracy is not None:
+            when = "does not settle"
+            if self.settled is not None:
+                when = f"settles after {self.settled:.4g} s"
+            head.append(f"the angle {when} within {self.accuracy:g} deg")
+        kinds = {
+            "absolute": self.absolute,
+            "mean of a window": self.mean,
+            "relative to the mean": self.relative,
+            f"drift in {self.apart:g} s": self.drift,
+        }
+        unit, factor = "deg", 1.0
+        if self.absolute.largest.max() < _SMALL:
+            unit, factor = "arcsec", _ARCSEC
+        rows = [["error", f"about [{unit}]", "largest", "rms", "95 %", "99.7 %"]]
+        for name, error in kinds.items():
+            if error is None:
+                continue
+            for column, axis in enumerate(self.axes):
+                values = [factor * float(array[column]) for array in error]
+                cells = [f"{value:.3g}" if value else "." for value in values]
+                title = "" if column else name
+                rows.append([title, axis, *cells])
+        text = [folded(head), grid(rows, "ll")]
+        used = {
+            "wheel speed": self.momentum_used,
+            "wheel torque": self.torque_used,
+        }
+        lines = [
+            f"largest {what}: {100.0 * max(shares.values()):.3g} % of its limit "
+            f"({max(shares, key=lambda wheel: shares[wheel])})"
+            for what, shares in used.items()
+            if shares
+        ]
+        if self.firings is not None:
+            lines.append(str(self.firings))
+        if lines:
+            text.append(folded(lines))
+        return "\n\n".join(text)
+
+
+def pointing(
+    motion: Motion,
+    window: float,
+    *,
+    after: float | None = None,
+    apart: float | None = None,
+    accuracy: float | None = None,
+    line_of_sight: ArrayLike | None = None,
+) -> Pointing:
+    """Return the pointing errors of a motion, see `Motion.pointing`."""
+    window = positive("window", window, "s")
+    if not motion.target.size:
+        raise InputError(
+            "the motion has no target; simulate a policy about a point or along a trajectory"
+        )
+    errors = np.degrees(attitude_rotations(motion.x, motion.target))
+    angle = np.linalg.norm(errors, axis=1)
+    axes: tuple[str, ...] = ("x", "y", "z", "angle")
+    if line_of_sight is not None:
+        sight = vector("line_of_sight", line_of_sight, 3, "a direction")
+        if not sight.any():
+            raise InputError("line_of_sight is zero, expected a direction")
+        sight = sight / np.abs(sight).max()
+        angle = _sight_angles(errors, sight / np.linalg.norm(sight))
+        errors = angle[:, None]
+        axes = ("line of sight",)
+    settled = None
+    if accuracy is not None:
+        accuracy = positive("accuracy", accuracy, "deg")
+        settled = _settled(motion.t, angle <= accuracy, window)
+    if after is None:
+        after = settled if settled is not None else _start(motion.t)
+    after = number("after", after)
+    apart = window if apart is None else positive("apart", apart, "s")
+    counted = motion.t >= after - 1e-9 * max(1.0, abs(after))
+    left = float(motion.t[-1]) - after
+    if counted.sum() < 3 or left < window * (1.0 - 1e-9):
+        raise InputError(
+            f"window is {window:g} s, but only {max(left, 0.0):.4g} s of the motion follow "
+            f"{after:.4g} s; simulate longer, or give a shorter window or an earlier after"
+        )
+    t, errors = motion.t[counted], errors[counted]
+    whole = len(axes) > 1
+    means, starts = _means(t, errors, window)
+    later = _drifts(t, errors, window, apart)
+    speeds, torques = _wheels(motion)
+    return Pointing(
+        axes=axes,
+        absolute=_statistics(errors, whole),
+        mean=_statistics(means, whole),
+        relative=_relative(t, errors, means, starts, window, whole),
+        drift=None if later is None else _statistics(later, whole),
+        window=window,
+        apart=apart,
+        after=after,
+        accuracy=accuracy,
+        settled=settled,
+        momentum_used=speeds,
+        torque_used=torques,
+        firings=firings(motion),
+        robot=motion.robot,
+    )
+
+
+def _start(t: Array) -> float:
+    return float(t[0] + _LATE * (t[-1] - t[0]))
+
+
+def _sight_angles(errors: Array, sight: Array) -> Array:
+    """Return the angles [deg] by which rotations (N, 3) [deg] turn a direction (3,)."""
+    turns = np.radians(errors)
+    angle = np.linalg.norm(turns, axis=1, keepdims=True)
+    axis = np.divide(turns, angle, out=np.zeros_like(turns), where=angle > 0.0)
+    # A rotation by an angle a about an axis at the angle b from the direction turns it by g, with
+    # sin(g/2) = sin(a/2) sin(b).
+    across = np.linalg.norm(np.cross(axis, sight), axis=1)
+    half = np.abs(np.sin(0.5 * angle[:, 0])) * across
+    angles: Array = np.degrees(2.0 * np.arcsin(half.clip(0.0, 1.0)))
+    return angles
+
+
+def _settled(t: Array, inside: Mask, window: float) -> float | None:
+    """Return the time after which a condition holds to the end, and at least for a window."""
+    outside = np.flatnonzero(~inside)
+    first = outside[-1] + 1 if len(outside) else 0
+    if first == len(t) or t[-1] - t[first] < window * (1.0 - 1e-9):
+        return None
+    return float(t[first])
+
+
+def _integrals(t: Array, errors: Array) -> Array:
+    """Return the integral (N, k) of the errors from the first time to each time."""
+    steps = 0.5 * (errors[1:] + errors[:-1]) * np.diff(t)[:, None]
+    return np.vstack((np.zeros(errors.shape[1]), np.cumsum(steps, axis=0)))
+
+
+def _window_means(t: Array, errors: Array, starts: Array, window: float) -> Array:
+    """Return the means (m, k) over windows that begin at the times `starts` (m,)."""
+    totals = _integrals(t, errors)
+
+    def at(times: Array) -> Array:
+        # The errors are linear between rows, so their integral is quadratic.
+        k = np.clip(np.searchsorted(t, times, side="right") - 1, 0, len(t) - 2)
+        since = (times - t[k])[:, None]
+        slope = (errors[k + 1] - errors[k]) / (t[k + 1] - t[k])[:, None]
+        value: Array = totals[k] + errors[k] * since + 0.5 * slope * since**2
+        return value
+
+    means: Array = (at(starts + window) - at(starts)) / window
+    return means
+
+
+def _starts(t: Array, length: float) -> Array:
+    """Return the times at which windows of a length begin, at most _WINDOWS."""
+    last = float(t[-1]) - length
+    inside = t[t <= last + 1e-9 * max(1.0, abs(last))]
+    if len(inside) > _WINDOWS:
+        inside = inside[np.linspace(0, len(inside) - 1, _WINDOWS).astype(int)]
+    return np.minimum(inside, last)
+
+
+def _means(t: Array, errors: Array, window: float) -> tuple[Array, Array]:
+    """Return the means (m, k) over windows, and the times at which they begin."""
+    starts = _starts(t, window)
+    return _window_means(t, errors, starts, window), starts
+
+
+def _drifts(t: Array, errors: Array, window: float, apart: float) -> Array | None:
+    """Return the differences (m, k) of the means of two windows, or None in a short run."""
+    if t[-1] - t[0] < (window + apart) * (1.0 - 1e-9):
+        return None
+    starts = _starts(t, window + apart)
+    later = _window_means(t, errors, starts + apart, window)
+    return later - _window_means(t, errors, starts, window)
+
+
+def _relative(
+    t: Array, errors: Array, means: Array, starts: Array, window: float, whole: bool
+) -> PointingError:
+    """Return the statistics of the errors minus the mean of their window."""
+    ends = starts + window * (1.0 + 1e-9)
+    first = np.searchsorted(t, starts - 1e-9 * window)
+    after = np.searchsorted(t, ends, side="right")
+    parts = [errors[a:b] - mean for a, b, mean in zip(first, after, means, strict=True)]
+    return _statistics(np.vstack(parts), whole)
+
+
+def _statistics(errors: Array, whole: bool) -> PointingError:
+    """Return the statistics of errors (m, k); `whole` adds the column of the whole angle."""
+    sizes = np.abs(errors)
+    if whole:
+        sizes = np.column_stack((sizes, np.linalg.norm(errors, axis=1)))
+    levels = np.quantile(sizes, _LEVELS, axis=0)
+    rms = np.sqrt((sizes**2).mean(axis=0))
+    return PointingError(sizes.max(axis=0), rms, levels[0], levels[1])
+
+
+def _wheels(motion: Motion) -> tuple[dict[str, float], dict[str, float]]:
+    """Return the used fractions of the limits of wheel speeds and of wheel torques."""
+    speeds = dict[str, float]()
+    torques = dict[str, float]()
+    kinds = {"speed": speeds, "wheel": torques}
+    for curve in curves(motion):
+        shares = kinds.get(curve.group)
+        limit = min((abs(level) for level in curve.levels), default=math.inf)
+        if shares is None or not 0.0 < limit < math.inf:
+            continue
+        shares[curve.short] = float(np.abs(curve.values).max()) / limit
+    return speeds, torques
