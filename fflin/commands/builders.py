@@ -24,7 +24,14 @@ T = TypeVar("T")
 
 _WEIGHTS = ("weights", "q", "r", "bryson", "sample")
 _POSE = ("target_rpy", "target_position")
-_TARGETS = ("target_joint", "target_velocity", "effort", "equilibrium", "reduce")
+_TARGETS = (
+    "target_joint",
+    "target_velocity",
+    "effort",
+    "equilibrium",
+    "tilt",
+    "reduce",
+)
 
 _FILES, SHOWN = ("html", "png", "gif"), ("scene", "follow", "tool")
 
@@ -221,6 +228,8 @@ def model_about(
     --equilibrium and --relative-equilibrium compute the inputs of an equilibrium, and add the
     spring deflections to q.
     """
+    from fflin.dynamics.points import warn_beyond_limits
+
     axes = {"frame": arguments.frame, "reference": reference}
     given = once("--effort", arguments.effort)
     u = fflin.effort(robot, given) if given else None
@@ -235,9 +244,15 @@ def model_about(
             ("effort",),
             f"{option} already sets the inputs at the operating point",
         )
-        held = fflin.equilibrium(robot, q, v=v, **axes)
+        held = fflin.equilibrium(robot, q, v=v, tilt=may_tilt(arguments), **axes)
         q, u = held.q, held.u
+        warn_beyond_limits(robot, u)
     return fflin.linearize(robot, q, v, u, **axes)
+
+
+def may_tilt(arguments: Namespace) -> bool:
+    """Return whether an equilibrium under gravity may tilt the base."""
+    return arguments.tilt is not False
 
 
 def model_to_regulate(
@@ -249,11 +264,16 @@ def model_to_regulate(
 ) -> fflin.LinearModel:
     """Linearise as `model_about` does, with the inputs that hold the robot at the point.
 
-    With --reduce, the conserved momenta are removed from the model.
+    With --no-tilt, an error is raised if no inputs hold the robot at the given attitude. With
+    --reduce, the conserved momenta are removed from the model.
     """
-    from fflin.linear.holding import held_if_possible
+    from fflin.linear.holding import held, held_if_possible
 
-    lin = held_if_possible(model_about(robot, arguments, q, v, reference))
+    point = model_about(robot, arguments, q, v, reference)
+    if may_tilt(arguments):
+        lin = held_if_possible(point)
+    else:
+        lin = held(point, tilt=False)
     if arguments.reduce:
         return fflin.momentum_reduction(lin, wheel_speeds=arguments.wheel_speeds)
     return lin
@@ -273,7 +293,7 @@ def models_along(
     arguments: Namespace, robot: fflin.Robot | None = None
 ) -> fflin.LinearTrajectory:
     """Return the linear models along the trajectory of --trajectory."""
-    point = ("joint", "velocity", "effort", "equilibrium", "rpy", "position")
+    point = ("joint", "velocity", "effort", "equilibrium", "tilt", "rpy", "position")
     refuse(
         arguments,
         point,

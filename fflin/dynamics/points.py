@@ -7,17 +7,20 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.errors import FflinWarning, InputError
+from fflin.base.errors import FflinWarning, InputError, listed
 from fflin.base.names import by_name, input_keys, rates_by_name
 from fflin.base.validation import Array, ArrayLike, instance, numbers, placement
 from fflin.dynamics.state import Actuation, StateMap
-from fflin.robot.fields import travel_of
+from fflin.robot.fields import input_limits, limits_of, travel_of
 from fflin.robot.inputs import named_wheels
 from fflin.robot.joints import ROOT, Joint, by_joint
 from fflin.robot.robot import Robot
 
 # [rad/s|m/s], so that squared speeds and their sums do not overflow
 LARGEST_SPEED = 1e50
+
+# [SI]; an excess over a limit is reported only if it is larger than this
+LIMIT_SLACK = 1e-9
 
 
 def configuration(
@@ -217,6 +220,11 @@ def effort(robot: Robot, values: Mapping[str, float]) -> Array:
     InputError
         If a value is not a finite number.
 
+    Warns
+    -----
+    FflinWarning
+        If an input is beyond its limits, so that the robot cannot apply it.
+
     Examples
     --------
     >>> robot = fflin.load("planar_detumble")
@@ -226,4 +234,25 @@ def effort(robot: Robot, values: Mapping[str, float]) -> Array:
     checked = numbers("values", values, "input", "effort")
     keys = input_keys(Actuation(StateMap(robot)))
     value_at = by_name("input", checked, keys)
-    return np.array([value_at.get(index, 0.0) for index in range(len(keys))])
+    u = np.array([value_at.get(index, 0.0) for index in range(len(keys))])
+    warn_beyond_limits(robot, u)
+    return u
+
+
+def warn_beyond_limits(robot: Robot, u: Array) -> None:
+    """Warn if inputs u (nu,) at an operating point are beyond the limits of the robot."""
+    least, largest = input_limits(robot, limits_of(robot))
+    actuation = Actuation(StateMap(robot))
+    rows = zip(actuation.names, actuation.units, u, least, largest, strict=True)
+    beyond = [
+        f"{name} = {value:.3g} {unit} (limits {low:g} to {high:g} {unit})"
+        for name, unit, value, low, high in rows
+        if not low - LIMIT_SLACK <= value <= high + LIMIT_SLACK
+    ]
+    if beyond:
+        warnings.warn(
+            f"the inputs at the operating point are beyond their limits: {listed(beyond)}; the "
+            "robot cannot apply them",
+            FflinWarning,
+            stacklevel=3,
+        )
