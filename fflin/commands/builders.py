@@ -270,10 +270,10 @@ def model_to_regulate(
     from fflin.linear.holding import held, held_if_possible
 
     point = model_about(robot, arguments, q, v, reference)
-    if may_tilt(arguments):
-        lin = held_if_possible(point)
-    else:
-        lin = held(point, tilt=False)
+    hold = held_if_possible
+    if not may_tilt(arguments):
+        hold = partial(held, tilt=False)
+    lin = hold(point)
     if arguments.reduce:
         return fflin.momentum_reduction(lin, wheel_speeds=arguments.wheel_speeds)
     return lin

@@ -1,5 +1,6 @@
 """Configurations, velocities and inputs, built from values that are given by name."""
 
+import math
 import warnings
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -9,9 +10,16 @@ import pinocchio as pin
 
 from fflin.base.errors import FflinWarning, InputError, listed
 from fflin.base.names import by_name, input_keys, rates_by_name
-from fflin.base.validation import Array, ArrayLike, instance, numbers, placement
+from fflin.base.validation import (
+    Array,
+    ArrayLike,
+    instance,
+    looks_like_degrees,
+    numbers,
+    placement,
+)
 from fflin.dynamics.state import Actuation, StateMap
-from fflin.robot.fields import input_limits, limits_of, travel_of
+from fflin.robot.fields import input_limits, limits_of, travel_of, warn_of_degrees
 from fflin.robot.inputs import named_wheels
 from fflin.robot.joints import ROOT, Joint, by_joint
 from fflin.robot.robot import Robot
@@ -84,6 +92,8 @@ def _warn_beyond_travel(robot: Robot, joint: Joint, value: float) -> None:
         return
     unit = joint.unit
     text = f"joint '{joint.name}' at {value:g} {unit} is outside {low:g} to {high:g} {unit}"
+    if unit == "rad" and looks_like_degrees(value, low, high):
+        text += f"; if it is in degrees, give {math.radians(value):.3g} rad"
     warnings.warn(text, FflinWarning, stacklevel=3)
 
 
@@ -181,6 +191,12 @@ def velocity(robot: Robot, values: Mapping[str, float]) -> Array:
     InputError
         If a value is not a finite number.
 
+    Warns
+    -----
+    FflinWarning
+        If the rate of a revolute joint looks like degrees: it exceeds 2 pi rad/s and the speed limit
+        of the joint.
+
     Examples
     --------
     >>> robot = fflin.load("planar_detumble")
@@ -194,6 +210,7 @@ def velocity(robot: Robot, values: Mapping[str, float]) -> Array:
             # raises an error that explains why the wheel has no velocity
             robot.joint(name)
     rates = rates_by_name(robot.joint_names, checked)
+    warn_of_degrees(robot, rates)
     return state.spread(
         np.array([rates.get(name, 0.0) for name in state.names[6 + robot.n :]])
     )
