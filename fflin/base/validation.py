@@ -38,8 +38,8 @@ T = TypeVar("T")
 # counts as wrong input. The positions and rates of mimic joints have the same tolerance.
 NORM_TOLERANCE = 1e-5
 
-# A joint angle [rad] or rate [rad/s] of more than one rotation, or one rotation per second, may have
-# been given in degrees, see `looks_like_degrees`.
+# A joint angle [rad] or rate [rad/s] of more than one rotation, or one rotation per second, may
+# have been given in degrees, see `looks_like_degrees`.
 ONE_ROTATION = 2.0 * math.pi
 
 # Largest rounding error of the length of a normalised quaternion.

@@ -131,11 +131,11 @@ def _warn_of_degrees(
     lin: LinearModel | LinearTrajectory, sizes: Mapping[str, float]
 ) -> None:
     """Warn of largest values {name or pattern: value} of joints that look like degrees."""
-    robot: Robot | None
+    robot = None
+    if isinstance(lin, LinearModel):
+        robot = lin._robot
     if isinstance(lin, LinearTrajectory):
         robot = lin.robot
-    else:
-        robot = lin._robot
     if robot is None:
         return
     keys = (*lin.state_names, *input_keys(lin))

@@ -1,6 +1,5 @@
 """Configurations, velocities and inputs, built from values that are given by name."""
 
-import math
 import warnings
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -91,9 +90,10 @@ def _warn_beyond_travel(robot: Robot, joint: Joint, value: float) -> None:
     if low <= value <= high:
         return
     unit = joint.unit
-    text = f"joint '{joint.name}' at {value:g} {unit} is outside {low:g} to {high:g} {unit}"
+    shown = f"{value:g} {unit}"
     if unit == "rad" and looks_like_degrees(value, low, high):
-        text += f"; if it is in degrees, give {math.radians(value):.3g} rad"
+        shown = f"{value:g} (deg?)"
+    text = f"joint '{joint.name}' at {shown} is outside {low:g} to {high:g} {unit}"
     warnings.warn(text, FflinWarning, stacklevel=3)
 
 
