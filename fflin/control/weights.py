@@ -32,7 +32,6 @@ from fflin.dynamics.state import selection
 from fflin.linear.linear_trajectory import LinearTrajectory
 from fflin.linear.model import LinearModel
 from fflin.robot.fields import require_chart, warn_of_degrees
-from fflin.robot.robot import Robot
 from fflin.robot.rotors import motor_of
 
 Weight: TypeAlias = ArrayLike | Mapping[str, float]

@@ -194,8 +194,8 @@ def velocity(robot: Robot, values: Mapping[str, float]) -> Array:
     Warns
     -----
     FflinWarning
-        If the rate of a revolute joint looks like degrees: it exceeds 2 pi rad/s and the speed limit
-        of the joint.
+        If the rate of a revolute joint looks like degrees: it exceeds 2 pi rad/s and the speed
+        limit of the joint.
 
     Examples
     --------

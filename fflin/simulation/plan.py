@@ -194,10 +194,7 @@ class Plan:
         # Motion that the policy follows, or None, whatever the target.
         self.follows = follows
         # Target state (nx,), or None if there is no target.
-        name = "target"
-        if policy and options.target is None:
-            name = f"the model of the policy ({policy.kind})"
-        self.target = target_of(state, goal, name)
+        self.target = target_of(state, goal, _target_name(options.target, policy))
         # The angle of a continuous joint is unique only up to full turns. In the first row of the
         # motion, this angle is within half a turn of the joint's angle in the state `near` (nx,).
         # If `near` is None, this angle is within half a turn of 0.
@@ -271,6 +268,13 @@ def law_of(
         return None
     within = (limits.low, limits.high)
     return Law(bound(policy, plant.robot), plant.actuation.names, within, times.slow)
+
+
+def _target_name(target: object, policy: Policy | None) -> str:
+    """Return the noun for a target in messages: the given target, or the policy's model."""
+    if target is None and policy is not None:
+        return f"the model of the policy ({policy.kind})"
+    return "target"
 
 
 def target_of(

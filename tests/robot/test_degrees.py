@@ -10,6 +10,7 @@ import fflin
 from fflin.base.validation import looks_like_degrees
 from fflin.robot.fields import warn_of_degrees
 from tests.support.commands import run, warned
+from tests.support.robots import BUNDLED
 
 LOOKS = "look like degrees"
 
@@ -114,8 +115,7 @@ def test_commands_warn_once():
 
 @pytest.mark.parametrize(
     "name",
-    ["astrobee_arm", "canadarm2", "cubesat", "dual_arm", "ets_vii", "inspector"]
-    + ["planar_detumble", "servicer_7dof"],
+    BUNDLED,
 )
 def test_bundled_robots_within_their_limits_raise_no_suspicion(name):
     with warnings.catch_warnings(record=True) as caught:

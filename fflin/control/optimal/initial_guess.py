@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping
 from typing import TypeAlias
 
 import numpy as np
+import pinocchio as pin
 from scipy.interpolate import CubicSpline
 
 from fflin.base.errors import InputError, UnknownNameError

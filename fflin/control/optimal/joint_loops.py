@@ -33,8 +33,8 @@ from fflin.control.optimal.floating_base import FloatingBase
 # Step of the joint positions [rad, m] in the central differences of the curvature.
 _STEP = 1e-4
 
-# A direction counts as spanned by vectors if its singular value is above _SPANNED times the largest.
-# A largest value below _LEAST_COUPLING means that the joints do not rotate the base.
+# A direction counts as spanned by vectors if its singular value is above _SPANNED times the largest
+# one. A largest value below _LEAST_COUPLING means that the joints do not rotate the base.
 _SPANNED, _LEAST_COUPLING = 1e-9, 1e-6
 
 # The joints make up to MOST_CIRCLES circles, each of which is integrated in STEPS steps.
@@ -79,9 +79,10 @@ def curvature(base: FloatingBase, joints: Array) -> Array:
 def best_plane(F: Array, rotation: Array, scale: Array) -> tuple[Array, Array, float]:
     """Return the two directions (n,) of the joints whose loops rotate the base the most.
 
-    The rotation about the vector `rotation` (3,) is compared for loops of equal area, if each joint is measured in
-    units of `scale` (n,). The directions a and b are orthonormal in these units. The third result
-    is the angle [rad] by which a loop of unit area, oriented from a to b, rotates about it.
+    The rotation about the vector `rotation` (3,) is compared for loops of equal area, if each joint
+    is measured in units of `scale` (n,). The directions a and b are orthonormal in these units. The
+    third result is the angle [rad] by which a loop of unit area, oriented from a to b, rotates
+    about it.
     """
     about = F @ (rotation / np.linalg.norm(rotation))
     values, vectors = np.linalg.eigh(1j * scale[:, None] * about * scale)
