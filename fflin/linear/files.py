@@ -342,7 +342,7 @@ def _optimality(entry: object) -> Optimality:
     values = as_double("optimality", entry).ravel()
     checked = vector("optimality", values, len(OPTIMALITY), ", ".join(OPTIMALITY))
     *residuals, iterations = checked.tolist()
-    return Optimality(*residuals, int(iterations))
+    return Optimality(*residuals, iterations=int(iterations))
 
 
 def _columns(path: Path, known: set[str]) -> tuple[Record, bool]:
