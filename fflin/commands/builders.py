@@ -548,7 +548,6 @@ def along(robot: fflin.Robot, arguments: Namespace) -> fflin.TrajectoryFeedback:
     """Return the feedback along the trajectory of --trajectory or --schedule."""
     regulator = (
         "free",
-        "mpc",
         "gain",
         "controller",
         "relative_equilibrium",
@@ -558,6 +557,12 @@ def along(robot: fflin.Robot, arguments: Namespace) -> fflin.TrajectoryFeedback:
     why = (
         "the trajectory defines the regulator, its target, and the start, "
         "which --offset displaces"
+    )
+    refuse(
+        arguments,
+        ("mpc",),
+        "on the command line, MPC holds a fixed target; in Python, fflin.mpc(models, ...) follows "
+        "the models = fflin.linearize_trajectory(robot, motion) of a trajectory",
     )
     refuse(arguments, (*regulator, "joint", "rpy", "position", "velocity"), why)
     if arguments.schedule is None:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import fflin
 from fflin.base.errors import FflinError, FflinWarning, FileError, InputError, listed
-from fflin.base.names import runs
+from fflin.base.names import with_units
 from fflin.base.tables import counted, cut, folded, grid, matrix, signals
 from fflin.base.writing import RECORDS, check_ending, write_atomically
 from fflin.commands import DONE, FELL_SHORT
@@ -295,14 +295,10 @@ def _units(lin: fflin.LinearModel) -> list[str]:
     }
     if lin.output_names != lin.state_names:
         signals["y"] = lin.output_names, lin.output_units
-    lines = []
-    for title, (names, units) in signals.items():
-        groups = ", ".join(
-            f"{group or ' ... '.join(dict.fromkeys((names[first], names[last])))} [{unit}]"
-            for first, last, group, unit in runs(names, units)
-        )
-        lines.append(f"{title}: {groups}")
-    return lines
+    return [
+        f"{title}: {with_units(names, units)}"
+        for title, (names, units) in signals.items()
+    ]
 
 
 def _rate(unit: str) -> str:

@@ -13,7 +13,7 @@ import numpy as np
 
 from fflin.analysis.ranks import DECAY
 from fflin.base.errors import InputError, listed, require_known
-from fflin.base.names import group_of, input_keys
+from fflin.base.names import group_of, input_keys, with_units
 from fflin.base.record import Design
 from fflin.base.tables import cut, folded, grid, matrix, signals
 from fflin.base.validation import Array, Mask, Poles, Values, Vector
@@ -179,7 +179,14 @@ class Gain(ModelDesign):
             f"changes of all inputs: gain {margins.gain[0]:.3g} to {margins.gain[1]:.3g}, phase "
             f"{margins.phase:.3g} deg (disk margin {margins.disk:.3g})"
         )
-        title = folded([summary_of_poles(self), f"{head}, frame {self.frame}, {time}"])
+        title = folded(
+            [
+                summary_of_poles(self),
+                f"{head}, frame {self.frame}, {time}",
+                f"x: {with_units(self.state_names, self.state_units)}",
+                f"u: {with_units(self.input_names, self.input_units)}",
+            ]
+        )
         notes = [folded([f"{label}: {text}"]) for label, text in more.items() if text]
         return "\n\n".join(
             (

@@ -53,3 +53,10 @@ def test_poles_that_are_all_neutral_have_no_decay():
         "2 poles, 2 of them neutral (decay 0 1/s"
     )
     assert "slowest" not in summary_of_poles(design)
+
+
+def test_the_report_of_a_gain_names_its_inputs_with_units():
+    report = str(fflin.lqr(fflin.linearize(fflin.load("servicer_7dof"))))
+    assert "\nu: tau_b [N m], F_b [N], tau_m [N m]\n" in report
+    assert "\nx: q_b [1], r_b [m], q_m [rad], omega_b [rad/s], v_b [m/s], " in report
+    assert "too large to show" in report
