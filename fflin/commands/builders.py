@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from argparse import Namespace
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from functools import partial, reduce
 from pathlib import Path
@@ -126,13 +126,16 @@ def limits_of_options(
     return given or None
 
 
-def refuse(arguments: Namespace, names: Iterable[str], why: str) -> None:
+def refuse(arguments: Namespace, names: Collection[str], why: str) -> None:
     """Raise an error with the reason `why` if any option in `names` is given."""
-    if given := [
+    given = [
         f"--{name.replace('_', '-')}"
         for name in names
         if getattr(arguments, name, None)
-    ]:
+    ]
+    if "tilt" in names and getattr(arguments, "tilt", None) is False:
+        given.append("--no-tilt")
+    if given:
         raise InputError(f"{', '.join(given)}: {why}; remove {', '.join(given)}")
 
 

@@ -158,12 +158,22 @@ def point_of(
             raise InputError(
                 "x0 is given together with q0 or v0; give either x0, or q0 and v0"
             )
-        return state.to_pinocchio(x0)
+        q, v = state.to_pinocchio(x0)
+        _warn_of_angles(state, q)
+        return q, v
     if q0 is None and v0 is None:
         return default()
     q = robot.neutral() if q0 is None else robot.checked_configuration(q0).copy()
+    _warn_of_angles(state, q)
     v = np.zeros(robot.nv) if v0 is None else robot.checked_velocity(v0).copy()
     return q, v
+
+
+def _warn_of_angles(state: StateMap, q: Array) -> None:
+    """Warn of joint positions in q (nq,) that look like degrees."""
+    names = [f"q_m.{name}" for name in state.robot.joint_names]
+    positions = state.joint_positions(q).tolist()
+    warn_of_degrees(state.robot, dict(zip(names, positions, strict=True)))
 
 
 def velocity(robot: Robot, values: Mapping[str, float]) -> Array:

@@ -341,8 +341,10 @@ def _optimality(entry: object) -> Optimality:
     """Return the residuals of a plan from the entry of a file."""
     values = as_double("optimality", entry).ravel()
     checked = vector("optimality", values, len(OPTIMALITY), ", ".join(OPTIMALITY))
-    *residuals, iterations = checked.tolist()
-    return Optimality(*residuals, iterations=int(iterations))
+    effort, stationarity, feasibility, complementarity, iterations = checked.tolist()
+    return Optimality(
+        effort, stationarity, feasibility, complementarity, int(iterations)
+    )
 
 
 def _columns(path: Path, known: set[str]) -> tuple[Record, bool]:

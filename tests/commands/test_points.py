@@ -224,3 +224,12 @@ def test_all_missing_keys_of_a_thruster_are_named_at_once(tmp_path):
     err = " ".join(refused("info", path).split())
     assert "the keys position, direction are missing; add these keys" in err
     assert "position = [0, 0, 0] is the origin of the frame" in err
+
+
+def test_the_option_for_a_tilt_is_refused_where_it_has_no_effect(tmp_path):
+    path = falling_without_tilt(tmp_path)
+    gain = tmp_path / "gain.npz"
+    assert run("lqr", path, "-o", gain)[0] == 0
+    for option in ("--tilt", "--no-tilt"):
+        err = refused("simulate", path, "--gain", gain, option)
+        assert f"remove {option}" in err

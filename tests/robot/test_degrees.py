@@ -55,6 +55,13 @@ def test_wheels_sliding_joints_and_the_base_are_never_suspected():
         warn_of_degrees(robot, {"r_b.x": 300.0, "omega_b.x": 300.0})
 
 
+def displaced(arm, angle):
+    """Return the neutral configuration with joint_1 at an angle [rad]."""
+    q = arm.neutral()
+    q[arm.joint("joint_1").idx_q] = angle
+    return q
+
+
 def uses(arm):
     """Return {where joint angles are given: call with a factor on an angle of 0.5 rad}."""
     lin = fflin.linearize(arm)
@@ -76,6 +83,9 @@ def uses(arm):
         "bryson": lambda x: fflin.bryson(lin, {"q_m.joint_1": x}),
         "weights": lambda x: arm.replace(weights={"bryson": {"q_m": x}}),
         "limits": lambda x: arm.replace(limits={"q_m.joint_1": x}),
+        "q0": lambda x: fflin.simulate(
+            arm, q0=displaced(arm, x), duration=0.1, dt=0.05
+        ),
         "offset": lambda x: feedback.beside({"q_m.joint_1": x}),
         "dispersion": lambda x: fflin.monte_carlo(
             arm, law, {"q_m.joint_1": x}, runs=1, duration=0.5, dt=0.1
@@ -85,7 +95,17 @@ def uses(arm):
 
 @pytest.mark.parametrize(
     "use",
-    ["grid", "range", "rate", "bryson", "weights", "limits", "offset", "dispersion"],
+    [
+        "grid",
+        "range",
+        "rate",
+        "bryson",
+        "weights",
+        "limits",
+        "q0",
+        "offset",
+        "dispersion",
+    ],
 )
 def test_degrees_are_suspected_wherever_joint_values_are_given(arm, use):
     call = uses(arm)[use]
