@@ -39,12 +39,6 @@ _REFINEMENTS, _NEAR = 4, 0.1
 # model.
 _ALIASED = 1e-6
 
-# A pole counts as decaying only if its decay rate exceeds this, with time in the unit that
-# `split_by_poles` chooses. Rounding moves a defective pair of zero poles by the square root of the
-# rounding error, so a slower pole may belong to such a pair. For discrete-time poles z, the decay
-# per sample, 1 - abs(z), replaces the decay rate.
-_DECAY = 1e-7
-
 # If a motion decays to less than this fraction within one sample, only its rounding error remains.
 _DEAD = 1e4 * ranks.EPS
 
@@ -145,14 +139,14 @@ def _fixed_poles(
         poles = 1.0 + dt * rates / unit
         decay = 1.0 - np.abs(poles)
     least, most = int(decay.argmin()), int(decay.argmax())
-    slow = ranks.Decision(max(float(decay[least]), 0.0) / _DECAY, shapes[:, least])
+    slow = ranks.Decision(max(float(decay[least]), 0.0) / ranks.DECAY, shapes[:, least])
     if dt and abs(poles[most]) < _DEAD:
         # The motion `shapes[:, most]` decays to rounding error within one sample. The samples
         # cannot distinguish two such motions, so the rank is undecided.
         dead = ranks.Margin((ranks.Decision(1.0, shapes[:, most]),))
         margin &= dead.transformed(1.0, halved=True)
     settling = ranks.Margin((slow,)).transformed(1.0, halved=True)
-    return ranks.FixedPoles(poles, bool(decay[least] > _DECAY), margin, settling)
+    return ranks.FixedPoles(poles, bool(decay[least] > ranks.DECAY), margin, settling)
 
 
 def _left_vectors(A: Array, B: Array, tolerance: float) -> tuple[Array, ranks.Margin]:

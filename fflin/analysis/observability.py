@@ -7,6 +7,7 @@ import numpy as np
 from fflin.analysis import along_motion, mechanics, moving_points
 from fflin.analysis.hautus import split_by_poles, unobservable
 from fflin.analysis.ranks import (
+    DECAY,
     FROZEN,
     GRAMIAN,
     FixedPoles,
@@ -21,11 +22,6 @@ from fflin.base.validation import Array, FrozenArrays, Values, instance, positiv
 from fflin.dynamics.integrators import held_cost
 from fflin.linear.linear_trajectory import LinearTrajectory
 from fflin.linear.model import LinearModel
-
-# Smallest decay rate that counts as nonzero, as a fraction of the largest modulus of a pole. A
-# slower pole may be a zero pole that rounding has moved. For discrete-time poles z, this is the
-# smallest 1 - |z| that counts as nonzero.
-_DECAY = 1e-7
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -368,11 +364,11 @@ def gramians(lin: LinearModel, duration: float | None = None) -> Gramians:
         poles = np.linalg.eigvals(lin.A)
         size = float(np.abs(poles).max())
         growth = float(poles.real.max())
-        allowed = -_DECAY * size
+        allowed = -DECAY * size
         slow = f"at {growth:.3g} 1/s"
         if lin.dt:
             growth = size - 1.0
-            allowed = -_DECAY
+            allowed = -DECAY
             slow = f"of modulus {size:.6g}"
         if growth >= allowed:
             raise InputError(

@@ -12,6 +12,12 @@ from fflin.base.validation import Array, FrozenArrays, Indices, Values
 
 EPS = float(np.finfo(float).eps)
 
+# Smallest decay rate that counts as nonzero, as a fraction of the largest modulus of a pole.
+# Rounding moves a defective pair of zero poles by the square root of the rounding error, so a
+# slower pole may belong to such a pair. For discrete-time poles z, this is the smallest 1 - |z|
+# that counts as nonzero.
+DECAY = 1e-7
+
 # Values of `RankAnalysis.method` at a point that the robot leaves, and along a trajectory.
 FROZEN, GRAMIAN = "frozen", "Gramian"
 

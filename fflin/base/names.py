@@ -174,3 +174,13 @@ def joints_by_name(
 
 def _is_pattern(key: object) -> bool:
     return "*" in str(key) or "?" in str(key)
+
+
+def with_units(names: Sequence[str], units: Sequence[str]) -> str:
+    """Return the groups of signals with their units, such as "tau_b [N m], F_b [N]"."""
+    parts = []
+    for first, last, group, unit in runs(names, units):
+        ends = dict.fromkeys((names[first], names[last]))
+        label = group or " ... ".join(ends)
+        parts.append(f"{label} [{unit}]")
+    return ", ".join(parts)

@@ -38,6 +38,10 @@ T = TypeVar("T")
 # counts as wrong input. The positions and rates of mimic joints have the same tolerance.
 NORM_TOLERANCE = 1e-5
 
+# A joint angle [rad] or rate [rad/s] of more than one rotation, or one rotation per second, may
+# have been given in degrees, see `looks_like_degrees`.
+ONE_ROTATION = 2.0 * math.pi
+
 # Largest rounding error of the length of a normalised quaternion.
 ROUND_OFF = 2.0 * float(np.finfo(float).eps)
 
@@ -149,6 +153,18 @@ def function(name: str, value: Callable[..., object], arguments: str) -> None:
         raise InputError(
             f"{name} is a function of {expected}, expected a function of {arguments}"
         ) from None
+
+
+def looks_like_degrees(value: float, least: float, largest: float) -> bool:
+    """Return whether an angle [rad] or rate [rad/s] of a joint looks like degrees.
+
+    This is so if the value is finite, its magnitude exceeds `ONE_ROTATION`, and it is beyond the
+    limits `least` and `largest` of the joint. A missing limit of an angle is one rotation. A rate
+    without a limit never looks like degrees; its limits are infinite.
+    """
+    if not ONE_ROTATION < abs(value) < math.inf:
+        return False
+    return not least <= value <= largest
 
 
 def truth(name: str, value: object) -> bool:
@@ -267,6 +283,9 @@ def as_double(name: str, value: object) -> Array:
     """Return a new array of native floats; raise `InputError` if an entry is not a real number."""
     refuse_masked(name, value)
     array = _as_array(name, value)
+    if array.ndim == 0 and array.dtype.kind == "O":
+        kind = type(value).__name__
+        raise InputError(f"{name} has type {kind}, expected real numbers")
     if array.dtype.kind not in "fiu":
         raise InputError(f"{name} contains {array.dtype} values, expected real numbers")
     return array.astype(np.float64)

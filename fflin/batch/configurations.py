@@ -16,7 +16,7 @@ from fflin.base import validation
 from fflin.base.errors import InputError, located
 from fflin.base.validation import Array, ArrayLike, frozen
 from fflin.dynamics.points import configuration
-from fflin.robot.fields import travel_of
+from fflin.robot.fields import travel_of, warn_of_degrees
 from fflin.robot.joints import Joint, by_joint
 from fflin.robot.robot import Robot
 
@@ -181,6 +181,8 @@ def grid(
                 f"{label} has values that do not increase, expected increasing numbers"
             )
         checked[name] = frozen(axis)
+    largest = {f"q_m.{name}": float(max(x, key=abs)) for name, x in checked.items()}
+    warn_of_degrees(robot, largest)
     count = math.prod(map(len, checked.values()))
     if count > sys.maxsize:
         raise InputError(
@@ -242,6 +244,8 @@ def random_configurations(
         joint.name: _range(robot, joint, given.get(joint.name))
         for joint in robot.joints
     }
+    largest = {f"q_m.{name}": max(checked[name], key=abs) for name in given}
+    warn_of_degrees(robot, largest)
     return RandomConfigurations(robot, count, seed, checked, frozen(start))
 
 

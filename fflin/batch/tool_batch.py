@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
+from fflin.base.errors import InputError
 from fflin.base.record import Design
 from fflin.base.validation import Array, Indices, frozen
 from fflin.dynamics.state import StateMap
-from fflin.linear.exchange import euler_step, step_of, transformed
+from fflin.linear.exchange import ToolModel, euler_step, step_of, transformed
 from fflin.linear.tool_coordinates import Jacobians, ToolCoordinates, tool_coordinates
 from fflin.robot.robot import Robot
 
@@ -23,8 +25,9 @@ if TYPE_CHECKING:
 class ToolBatch(Design):
     r"""Linear models ``dx/dt = f0 + A (x - x0) + B (u - u0)`` in another tool's coordinates.
 
-    The models are those of a `LinearBatch`. See `ToolModel` for the state x. The outputs are not
-    converted; ``batch[i].to(tool)`` converts one model with its outputs.
+    The models are those of a `LinearBatch`. See `ToolModel` for the state x. ``tool_batch[i]`` is
+    the `ToolModel` of point i. The outputs are not converted, so it has none; for one model with
+    its outputs, convert ``batch[i].to(tool)`` of the `LinearBatch`.
 
     Attributes
     ----------
@@ -39,7 +42,7 @@ class ToolBatch(Design):
         Matrices from the deviations of a `LinearModel` to those of the tool, see `ToolModel`.
     dt : float
         Time step [s]; 0 in continuous time.
-    state_names, input_names : tuple of str
+    state_names, input_names, state_units, input_units : tuple of str
     reference : str
         "fixed" or "moving", see `ToolModel`.
 
@@ -50,7 +53,7 @@ class ToolBatch(Design):
     >>> drake = batch.to("drake")
     >>> drake.A.shape, drake.state_names[:2]
     ((5, 19, 19), ('quat.w', 'quat.x'))
-    >>> bool(abs(drake.A[2] - batch[2].to("drake").A).max() < 1e-12)
+    >>> bool(abs(drake[2].A - batch[2].to("drake").A).max() < 1e-12)
     True
     """
 
@@ -69,10 +72,42 @@ class ToolBatch(Design):
     dt: float
     state_names: tuple[str, ...]
     input_names: tuple[str, ...]
+    state_units: tuple[str, ...]
+    input_units: tuple[str, ...]
     reference: str
 
     def __len__(self) -> int:
         return len(self.A)
+
+    def __getitem__(self, index: int) -> ToolModel:
+        if not isinstance(index, int | np.integer):
+            kind = type(index).__name__
+            raise InputError(f"index has type {kind}, expected a whole number")
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"index is {index}, but the batch has {len(self)} points")
+        stacks = ("A", "B", "f0", "x0", "u0", "q", "v", "T", "T_left", "T_u")
+        fields = {name: getattr(self, name)[index] for name in stacks}
+        nx, nu = fields["B"].shape
+        return ToolModel(
+            **fields,
+            C=np.zeros((0, nx)),
+            D=np.zeros((0, nu)),
+            y0=np.zeros(0),
+            dt=self.dt,
+            tool=self.tool,
+            robot=self.robot,
+            reference=self.reference,
+            state_names=self.state_names,
+            state_units=self.state_units,
+            input_names=self.input_names,
+            input_units=self.input_units,
+            output_names=(),
+            output_units=(),
+            verified=self.verified,
+        )
+
+    def __iter__(self) -> Iterator[ToolModel]:
+        return map(self.__getitem__, range(len(self)))
 
 
 class _Change(NamedTuple):
@@ -145,6 +180,8 @@ def tool_batch(
         dt=step,
         state_names=tuple(kind.states()),
         input_names=tuple(kind.actuation.names[i] for i in kind.inputs),
+        state_units=tuple(kind.states().values()),
+        input_units=tuple(kind.actuation.units[i] for i in kind.inputs),
         reference="moving" if batch.moving else "fixed",
         verified=batch.verified,
     )

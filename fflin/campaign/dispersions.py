@@ -25,6 +25,7 @@ from fflin.kernel.forward import ActuatorFaults
 from fflin.kernel.tree import Tree, batch_tree
 from fflin.linear.model import LinearModel
 from fflin.robot.equipment.assembly import first_impossible, turned_to
+from fflin.robot.fields import warn_of_degrees
 from fflin.robot.inputs import JointTorque, ReactionWheel, Thruster
 from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.mass_properties import bodies_named, properties, varied
@@ -35,6 +36,10 @@ from fflin.simulation.run import Plant
 
 # number of runs whose values are drawn together; does not depend on the chunks
 _BLOCK = 1024
+
+# Probabilities at one standard deviation of a normal distribution.
+_ONE_SIGMA = np.array([0.15865525393145707, 0.8413447460685429])
+
 # Names of the axes, for the kinds of dispersions that have one value per axis.
 _AXES = {"com": "xyz", "inertia": "xyz", "misalignment": "12"}
 _OF_BODIES = ("mass", "com", "inertia", "density")
@@ -114,6 +119,7 @@ class Dispersions:
             self.columns.append(Column(SEED, "seed", [0], 0, SEEDS))
         for kind, spreads in by_kind.items():
             self._add(kind, spreads, " | ".join(kinds))
+        self._warn_of_degrees()
         # Names of the dispersed values.
         self.names = tuple(map(attrgetter("name"), self.columns))
         # Cached values of slow distributions: {(name, block of runs): values}.
@@ -188,6 +194,18 @@ class Dispersions:
             for axis, letter in enumerate(_AXES.get(kind, " ")):
                 name = f"{title}.{letter}".rstrip(". ")
                 self.columns.append(Column(name, kind, targets, axis, inverse))
+
+    def _warn_of_degrees(self) -> None:
+        """Warn of dispersions of joint positions and rates that look like degrees."""
+        names = self._known["state"]
+        sizes = dict[str, float]()
+        for column in self.columns:
+            # fast functions from the module `spreads`
+            if column.kind == "state" and isinstance(column.inverse, partial):
+                quantiles = column.inverse(_ONE_SIGMA)
+                size = float(np.abs(quantiles).max())
+                sizes |= {names[index]: size for index in column.at}
+        warn_of_degrees(self._plant.robot, sizes)
 
     def _by_piece(
         self, kind: str, spreads: Mapping[str, tuple[Inverse, str]]

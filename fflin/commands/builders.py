@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from argparse import Namespace
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from functools import partial, reduce
 from pathlib import Path
@@ -24,7 +24,14 @@ T = TypeVar("T")
 
 _WEIGHTS = ("weights", "q", "r", "bryson", "sample")
 _POSE = ("target_rpy", "target_position")
-_TARGETS = ("target_joint", "target_velocity", "effort", "equilibrium", "reduce")
+_TARGETS = (
+    "target_joint",
+    "target_velocity",
+    "effort",
+    "equilibrium",
+    "tilt",
+    "reduce",
+)
 
 _FILES, SHOWN = ("html", "png", "gif"), ("scene", "follow", "tool")
 
@@ -119,13 +126,16 @@ def limits_of_options(
     return given or None
 
 
-def refuse(arguments: Namespace, names: Iterable[str], why: str) -> None:
+def refuse(arguments: Namespace, names: Collection[str], why: str) -> None:
     """Raise an error with the reason `why` if any option in `names` is given."""
-    if given := [
+    given = [
         f"--{name.replace('_', '-')}"
         for name in names
         if getattr(arguments, name, None)
-    ]:
+    ]
+    if "tilt" in names and getattr(arguments, "tilt", None) is False:
+        given.append("--no-tilt")
+    if given:
         raise InputError(f"{', '.join(given)}: {why}; remove {', '.join(given)}")
 
 
@@ -221,6 +231,8 @@ def model_about(
     --equilibrium and --relative-equilibrium compute the inputs of an equilibrium, and add the
     spring deflections to q.
     """
+    from fflin.dynamics.points import warn_beyond_limits
+
     axes = {"frame": arguments.frame, "reference": reference}
     given = once("--effort", arguments.effort)
     u = fflin.effort(robot, given) if given else None
@@ -235,9 +247,15 @@ def model_about(
             ("effort",),
             f"{option} already sets the inputs at the operating point",
         )
-        held = fflin.equilibrium(robot, q, v=v, **axes)
+        held = fflin.equilibrium(robot, q, v=v, tilt=may_tilt(arguments), **axes)
         q, u = held.q, held.u
+        warn_beyond_limits(robot, u)
     return fflin.linearize(robot, q, v, u, **axes)
+
+
+def may_tilt(arguments: Namespace) -> bool:
+    """Return whether an equilibrium under gravity may tilt the base."""
+    return arguments.tilt is not False
 
 
 def model_to_regulate(
@@ -249,11 +267,16 @@ def model_to_regulate(
 ) -> fflin.LinearModel:
     """Linearise as `model_about` does, with the inputs that hold the robot at the point.
 
-    With --reduce, the conserved momenta are removed from the model.
+    With --no-tilt, an error is raised if no inputs hold the robot at the given attitude. With
+    --reduce, the conserved momenta are removed from the model.
     """
-    from fflin.linear.holding import held_if_possible
+    from fflin.linear.holding import held, held_if_possible
 
-    lin = held_if_possible(model_about(robot, arguments, q, v, reference))
+    point = model_about(robot, arguments, q, v, reference)
+    hold = held_if_possible
+    if not may_tilt(arguments):
+        hold = partial(held, tilt=False)
+    lin = hold(point)
     if arguments.reduce:
         return fflin.momentum_reduction(lin, wheel_speeds=arguments.wheel_speeds)
     return lin
@@ -273,7 +296,7 @@ def models_along(
     arguments: Namespace, robot: fflin.Robot | None = None
 ) -> fflin.LinearTrajectory:
     """Return the linear models along the trajectory of --trajectory."""
-    point = ("joint", "velocity", "effort", "equilibrium", "rpy", "position")
+    point = ("joint", "velocity", "effort", "equilibrium", "tilt", "rpy", "position")
     refuse(
         arguments,
         point,
@@ -528,7 +551,6 @@ def along(robot: fflin.Robot, arguments: Namespace) -> fflin.TrajectoryFeedback:
     """Return the feedback along the trajectory of --trajectory or --schedule."""
     regulator = (
         "free",
-        "mpc",
         "gain",
         "controller",
         "relative_equilibrium",
@@ -538,6 +560,12 @@ def along(robot: fflin.Robot, arguments: Namespace) -> fflin.TrajectoryFeedback:
     why = (
         "the trajectory defines the regulator, its target, and the start, "
         "which --offset displaces"
+    )
+    refuse(
+        arguments,
+        ("mpc",),
+        "on the command line, MPC holds a fixed target; in Python, fflin.mpc(models, ...) follows "
+        "the models = fflin.linearize_trajectory(robot, motion) of a trajectory",
     )
     refuse(arguments, (*regulator, "joint", "rpy", "position", "velocity"), why)
     if arguments.schedule is None:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import fflin
 from fflin.base.errors import FflinError, FflinWarning, FileError, InputError, listed
-from fflin.base.names import runs
+from fflin.base.names import with_units
 from fflin.base.tables import counted, cut, folded, grid, matrix, signals
 from fflin.base.writing import RECORDS, check_ending, write_atomically
 from fflin.commands import DONE, FELL_SHORT
@@ -21,6 +21,7 @@ from fflin.commands.builders import (
     Report,
     linear_model,
     load_robot,
+    may_tilt,
     models_along,
     once,
     point_of,
@@ -30,8 +31,6 @@ from fflin.commands.builders import (
 
 # Entries of f0 [SI] up to this magnitude count as zero.
 _MOVES = 1e-9
-
-_SLACK = 1e-9  # [SI]; an excess over a limit is reported only if it is larger than this
 
 
 def robots(_: Namespace) -> Report:
@@ -296,14 +295,10 @@ def _units(lin: fflin.LinearModel) -> list[str]:
     }
     if lin.output_names != lin.state_names:
         signals["y"] = lin.output_names, lin.output_units
-    lines = []
-    for title, (names, units) in signals.items():
-        groups = ", ".join(
-            f"{group or ' ... '.join(dict.fromkeys((names[first], names[last])))} [{unit}]"
-            for first, last, group, unit in runs(names, units)
-        )
-        lines.append(f"{title}: {groups}")
-    return lines
+    return [
+        f"{title}: {with_units(names, units)}"
+        for title, (names, units) in signals.items()
+    ]
 
 
 def _rate(unit: str) -> str:
@@ -385,6 +380,7 @@ def equilibrium(arguments: Namespace) -> Report:
     example: fflin equilibrium servicer_7dof --stiffness panel_left=100 --gravity 0 0 -0.01
     """
     from fflin.base.record import write_record
+    from fflin.dynamics.points import LIMIT_SLACK
     from fflin.linear.holding import wheel_notes
     from fflin.robot.fields import limits_of
 
@@ -396,7 +392,7 @@ def equilibrium(arguments: Namespace) -> Report:
     robot = load_robot(arguments)
     q, v, reference = point_of(robot, arguments)
     axes = {"frame": arguments.frame, "reference": reference}
-    held = fflin.equilibrium(robot, q, v=v, **axes)
+    held = fflin.equilibrium(robot, q, v=v, tilt=may_tilt(arguments), **axes)
     lin = fflin.linearize(robot, held.q, v, held.u, **axes)
     lin_modes = fflin.modes(lin)
     poles = lin_modes.poles
@@ -427,7 +423,7 @@ def equilibrium(arguments: Namespace) -> Report:
         for k, (low, high) in limits
         if k in value_of
     }
-    beyond = [name for name, size in excess.items() if size > _SLACK]
+    beyond = [name for name, size in excess.items() if size > LIMIT_SLACK]
     if beyond:
         lines.append(folded([f"beyond their limits: {listed(beyond)}"]))
     result = {

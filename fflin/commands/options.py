@@ -14,7 +14,7 @@ TRAJECTORY, CONTROLLER, SIMULATION = "trajectory", "controller", "simulation"
 
 _POSE = "joint rpy position velocity"
 _TARGET = "target-joint target-rpy target-position target-velocity"
-_INPUTS = "effort equilibrium relative-equilibrium"
+_INPUTS = "effort equilibrium tilt relative-equilibrium"
 _SYSTEM = "lock xacro orbit stiffness damping gravity passive inputs output"
 _TRAJECTORY = "trajectory hold strict"
 _WEIGHTS = "weights q r bryson sample reduce wheel-speeds"
@@ -128,7 +128,7 @@ COMMON = {
     "frame plot",
     "modes": "joint rpy velocity equilibrium relative-equilibrium orbit stiffness inputs output "
     "frame plot html",
-    "equilibrium": "joint rpy velocity relative-equilibrium orbit stiffness gravity passive "
+    "equilibrium": "joint rpy velocity tilt relative-equilibrium orbit stiffness gravity passive "
     "inputs frame output-file",
     "sensitivity": "joint rpy velocity equilibrium inputs frame dt top only output-file",
     "validity": "joint inputs weights q r bryson sample reduce attitude offset spread samples "
@@ -173,6 +173,9 @@ ABOUT: dict[str, str] = {
     "a steady motion) under springs and gravity. The springs of passive joints deflect until they "
     "balance the load. If no inputs can hold the robot at the operating point, the command reports "
     "an error",
+    "tilt": "whether an equilibrium under gravity may tilt the base, by less than 90 deg, if no "
+    "inputs balance all forces at the given attitude (default). With --no-tilt, the base keeps the "
+    "given attitude",
     "relative-equilibrium": "for a robot in orbit: use the N-th of the 24 attitudes without "
     "gravity-gradient torque (1 by default), and the inputs that --equilibrium computes. The state "
     "measures attitude and position from this equilibrium pose",

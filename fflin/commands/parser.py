@@ -299,7 +299,7 @@ FORMS: dict[str, Form] = {
         "metavar": "TOOL",
     },
     "real": {"choices": ("double", "float"), "default": "double"},
-    **dict.fromkeys(("wheel-speeds", "allocate", "follow"), _YES_OR_NO),
+    **dict.fromkeys(("wheel-speeds", "allocate", "follow", "tilt"), _YES_OR_NO),
     "plot": one(OutputFile((".png", ".pdf", ".svg")), "FILE"),
     **{
         ending: one(OutputFile((f".{ending}",)), "FILE")

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import math
-import textwrap
 from collections import Counter
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 
+from fflin.analysis.ranks import DECAY
 from fflin.base.errors import InputError, listed, require_known
-from fflin.base.names import group_of, input_keys
+from fflin.base.names import group_of, input_keys, with_units
 from fflin.base.record import Design
-from fflin.base.tables import cut, grid, matrix, signals, width
+from fflin.base.tables import cut, folded, grid, matrix, signals
 from fflin.base.validation import Array, Poles, Vector
 from fflin.control.optimal.largest_gain import largest_gain
 from fflin.control.optimal.riccati import Solution, rates_of
@@ -166,23 +166,27 @@ class Gain(ModelDesign):
             "weights": self.weights,
             "warning": "; ".join(cautions(self)),
         }
-        fold = partial(textwrap.fill, width=width())
         margins = self.margins
         figures = (
             f"Riccati residual {self.residual:.1e} ({self.method}); margins for simultaneous "
             f"changes of all inputs: gain {margins.gain[0]:.3g} to {margins.gain[1]:.3g}, phase "
             f"{margins.phase:.3g} deg (disk margin {margins.disk:.3g})"
         )
-        head = (
-            f"{summary_of_poles(self)}\n{fold(f'{head}, frame {self.frame}, {time}')}"
+        title = folded(
+            [
+                summary_of_poles(self),
+                f"{head}, frame {self.frame}, {time}",
+                f"x: {with_units(self.state_names, self.state_units)}",
+                f"u: {with_units(self.input_names, self.input_units)}",
+            ]
         )
-        notes = [fold(f"{label}: {text}") for label, text in more.items() if text]
+        notes = [folded([f"{label}: {text}"]) for label, text in more.items() if text]
         return "\n\n".join(
             (
-                head,
+                title,
                 f"K ({nu} x {nx}){shown}",
                 table_of_poles(self, "A - B K"),
-                fold(figures),
+                folded([figures]),
                 *notes,
             )
         )
@@ -389,15 +393,50 @@ class HasPoles(Protocol):
 
 
 def summary_of_poles(design: HasPoles) -> str:
-    """Return the number of poles, the slowest decay and the smallest damping ratio."""
+    """Return the number of poles, the slowest decay and the smallest damping ratio.
+
+    Neutral poles are counted separately.
+    """
     if not len(design.poles):
         return "no poles"
     rates = rates_of(design.poles, design.dt)
-    damping = float((-rates.real / np.abs(rates)).min())
+    moving = ~neutral_poles(rates, design.dt)
+    count = f"{len(rates)} poles"
+    neutral = rates[~moving]
+    if len(neutral):
+        decay = -neutral.real.min()
+        ratio = decay / _smallest_decay(rates, design.dt)
+        count += (
+            f", {len(neutral)} of them neutral (decay {max(decay, 0.0):.2g} 1/s, only "
+            f"{max(ratio, 0.0):.1g} times the smallest decay that exceeds rounding errors)"
+        )
+    if not moving.any():
+        return count
+    others = rates[moving]
+    damping = float((-others.real / np.abs(others)).min())
+    label = "slowest decay"
+    if len(neutral):
+        label += " of the others"
     return (
-        f"{len(design.poles)} poles, slowest decay {-rates.real.max():.3g} 1/s, "
-        f"smallest damping ratio {damping:.2g}"
+        f"{count}, {label} {-others.real.max():.3g} 1/s, smallest damping ratio "
+        f"{damping:.2g}"
     )
+
+
+def neutral_poles(rates: Values, dt: float) -> Mask:
+    """Return which poles (n,), given as rates [1/s], neither decay nor grow.
+
+    Rounding errors may cause the decay of these poles. `dt` is the sampling time [s], or 0.
+    """
+    neutral: Mask = np.abs(rates.real) <= _smallest_decay(rates, dt)
+    return neutral
+
+
+def _smallest_decay(rates: Values, dt: float) -> float:
+    """Return the smallest decay [1/s] that exceeds rounding errors, for rates [1/s]."""
+    if dt:
+        return DECAY / dt
+    return DECAY * float(np.abs(rates).max(initial=0.0))
 
 
 def table_of_poles(design: HasPoles, matrix: str) -> str:

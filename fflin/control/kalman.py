@@ -113,7 +113,7 @@ class Estimator(ModelDesign):
             f"{self.robot}: estimator of {count} states from {len(self.output_names)} outputs, "
             f"{_time(self.dt)}"
         )
-        parts = [f"{summary_of_poles(self)}\n{folded([head])}"]
+        parts = [folded([summary_of_poles(self), head])]
         parts.append(table_of_poles(self, "A - L C"))
         parts.append(f"Riccati residual {self.residual:.1e}")
         left = [
@@ -201,7 +201,8 @@ class Compensator(ModelDesign):
             f"the robot to {nu} inputs, {_time(self.dt)}"
         )
         poles = table_of_poles(self, "the closed loop")
-        return f"{summary_of_poles(self)}\n{folded([head])}\n\n{poles}"
+        title = folded([summary_of_poles(self), head])
+        return f"{title}\n\n{poles}"
 
     def to_control(self) -> ControlSystem:
         """Return a `control.StateSpace` from y - y0 to u - u0, with signal names.

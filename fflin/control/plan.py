@@ -211,6 +211,11 @@ def plan(
     raise _failure(shooting, made, asked, duration)
 
 
+# An error at the goal above this [rad or m; rad/s or m/s times at most 1 s] means that the search
+# has diverged.
+_DIVERGED = 100.0
+
+
 class _Made(NamedTuple):
     """Plan, with the final error and the limit violations of the integrated motion."""
 
@@ -355,11 +360,40 @@ def _failure(
             "nonholonomic); give a longer duration, more knots or a `guess` (--guess) in which the "
             "joints move in loops, or leave q_b free with `free` (--free-end)"
         )
-    outcome = listed(misses) if misses else "diverges"
+    if passive := _passive_joints(shooting, asked):
+        names = [f"{group}.{name}" for name in passive for group in ("q_m", "qdot_m")]
+        advice = (
+            f"{listed(passive)} have springs and no motor, so they vibrate at the end; leave them "
+            f"free with free={names} (--free-end), or lock them"
+        )
+    outcome = listed(misses)
+    if not misses or _diverged(made, duration):
+        outcome = "diverges"
     return InputError(
         f"no motion within the limits was found that ends at the goal after {duration:g} s; the "
         f"last trial {outcome}; {advice}"
     )
+
+
+def _passive_joints(shooting: Shooting, asked: Mask) -> list[str]:
+    """Return the joints with springs but without a motor whose final values are prescribed."""
+    state = shooting.state
+    robot = state.robot
+    motors = {item.joint for item in robot.inputs if isinstance(item, JointTorque)}
+    prescribed = {state.names[i] for i in np.flatnonzero(asked)}
+    return [
+        name
+        for name, stiffness in robot.stiffness.items()
+        if stiffness and name not in motors and f"q_m.{name}" in prescribed
+    ]
+
+
+def _diverged(made: _Made, duration: float) -> bool:
+    """Return whether the error at the end is too large to tell how near a motion is to the goal."""
+    half = len(made.missed) // 2
+    positions, rates = made.missed[:half], made.missed[half:]
+    largest = max(positions.max(), rates.max() * min(duration, 1.0))
+    return not largest <= _DIVERGED
 
 
 def _faults(made: _Made, note: str) -> Iterator[str]:

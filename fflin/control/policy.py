@@ -13,7 +13,17 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeAlias
 import numpy as np
 
 from fflin.base.errors import InputError
-from fflin.base.validation import Array, ArrayLike, Mask, function
+from fflin.base.validation import (
+    Array,
+    ArrayLike,
+    Mask,
+    as_double,
+    function,
+    instance,
+    number,
+    shaped,
+    vector,
+)
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
 
@@ -273,7 +283,7 @@ class Policy(ABC):
 
     def reference_inputs(self, names: tuple[str, ...]) -> tuple[str, Array] | None:
         """Return where the law has reference inputs, and these inputs (N, nu), or None."""
-        initial = self.initial_inputs_for(names)
+        initial = initial_inputs(self, names)
         if initial is None:
             return None
         return "at its target", initial[None]
@@ -428,10 +438,80 @@ class FunctionPolicy(Policy):
 
 
 def as_policy(given: object) -> Policy:
-    """Return a policy; raise `InputError` if the object is neither a policy nor a function."""
+    """Return a policy; raise `InputError` if the object is neither a policy nor a function.
+
+    The members of a policy that a user defines are checked.
+    """
     if isinstance(given, Policy):
+        _check_members(given)
         return given
     return FunctionPolicy(given)
+
+
+def defined_by_user(policy: Policy, name: str) -> bool:
+    """Return whether a class outside fflin defines a member of a policy."""
+    package = __name__.partition(".")[0]
+    return _provider(type(policy), name).__module__.partition(".")[0] != package
+
+
+def _check_members(policy: Policy) -> None:
+    """Raise `InputError` if a member that a user defines returns a wrong type or size."""
+    kind = policy.kind
+    lin = policy.model
+    if defined_by_user(policy, "model") and lin is not None:
+        instance(f"{kind}.model", lin, LinearModel, "a fflin.LinearModel or None")
+    K = policy.feedback_gain
+    if defined_by_user(policy, "feedback_gain") and K is not None:
+        label = f"{kind}.feedback_gain"
+        shape = as_double(label, K).shape
+        if lin is not None:
+            shape = lin.B.shape[::-1]
+        elif len(shape) != 2:
+            raise InputError(f"{label} has shape {shape}, expected (nu, nx)")
+        shaped(label, K, shape, " (nu, nx), the inputs and states of its model")
+    if defined_by_user(policy, "reference_motion"):
+        motion = policy.reference_motion
+        if motion is not None:
+            label = f"{kind}.reference_motion"
+            function(label, _callable(label, motion), "(t)")
+    if defined_by_user(policy, "closed_loop"):
+        _check_closed_loop(f"{kind}.closed_loop()", policy.closed_loop())
+
+
+def _callable(name: str, value: object) -> Callable[..., object]:
+    """Return a function, or raise `InputError`."""
+    if not callable(value):
+        raise InputError(
+            f"{name} has type {type(value).__name__}, expected a function of t or None"
+        )
+    return value
+
+
+def _check_closed_loop(label: str, closed: object) -> None:
+    """Raise `InputError` if a closed loop is not None or a matrix (n, n) with its dt [s]."""
+    if closed is None:
+        return
+    if not isinstance(closed, tuple) or len(closed) != 2:
+        raise InputError(
+            f"{label} returned an object of type {type(closed).__name__}, expected a matrix (n, n) "
+            "and its sampling time dt [s], or None"
+        )
+    matrix, dt = closed
+    shape = as_double(label, matrix).shape
+    if len(shape) != 2 or shape[0] != shape[1]:
+        raise InputError(f"{label} has a matrix of shape {shape}, expected (n, n)")
+    shaped(label, matrix, shape)
+    if number(f"dt of {label}", dt) < 0.0:
+        raise InputError(f"dt of {label} is {dt:g} s, expected 0 or more")
+
+
+def initial_inputs(policy: Policy, names: tuple[str, ...]) -> Array | None:
+    """Return the checked reference inputs (nu,) at the start, or None if the law has none."""
+    initial = policy.initial_inputs_for(names)
+    if initial is None:
+        return None
+    label = f"{policy.kind}.initial_inputs_for(names)"
+    return vector(label, initial, len(names), "one value for each input")
 
 
 def bound(policy: object, robot: Robot) -> Command:

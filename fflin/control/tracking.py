@@ -38,6 +38,7 @@ from fflin.dynamics.state import StateMap
 from fflin.linear.fit import require_same, require_turns, signals_of
 from fflin.linear.model import LinearModel
 from fflin.linear.trajectory import Trajectory
+from fflin.robot.fields import warn_of_degrees
 from fflin.robot.robot import Robot
 
 # A time counts as the end if it is at most this factor times the end time, because sums of time
@@ -219,6 +220,7 @@ class TrajectoryFeedback(Feedback):
         given = np.zeros(chart.nx + 3)
         given[list(values)] = list(values.values())
         e, angles = given[:-3], given[-3:]
+        warn_of_degrees(robot, dict(zip(chart.names, e.tolist(), strict=True)))
         if (e[:3].any() and angles.any()) or not np.linalg.norm(e[:3]) < 1.0:
             raise InputError(
                 f"the offset has |q_b| = {np.linalg.norm(e[:3]):.3g} and roll, pitch, yaw = "

@@ -31,7 +31,7 @@ from fflin.dynamics.integrators import held_cost
 from fflin.dynamics.state import selection
 from fflin.linear.linear_trajectory import LinearTrajectory
 from fflin.linear.model import LinearModel
-from fflin.robot.fields import require_chart
+from fflin.robot.fields import require_chart, warn_of_degrees
 from fflin.robot.rotors import motor_of
 
 Weight: TypeAlias = ArrayLike | Mapping[str, float]
@@ -119,10 +119,27 @@ def bryson(lin: LinearModel | LinearTrajectory, largest: Mapping[str, float]) ->
     for key, size in sizes.items():
         if key.startswith("q_b"):
             require_chart(f"largest value of '{key}'", size)
+    _warn_of_degrees(lin, sizes)
     values = {
         key: inverse_square(f"largest value of '{key}'", x) for key, x in sizes.items()
     }
     return _diagonal("largest", values, names, complete=of_inputs)
+
+
+def _warn_of_degrees(
+    lin: LinearModel | LinearTrajectory, sizes: Mapping[str, float]
+) -> None:
+    """Warn of largest values {name or pattern: value} of joints that look like degrees."""
+    robot = None
+    if isinstance(lin, LinearModel):
+        robot = lin._robot
+    if isinstance(lin, LinearTrajectory):
+        robot = lin.robot
+    if robot is None:
+        return
+    keys = (*lin.state_names, *input_keys(lin))
+    indices = by_name("state or input", sizes, keys)
+    warn_of_degrees(robot, {keys[i]: size for i, size in indices.items()})
 
 
 def inverse_square(what: str, size: float) -> float:
@@ -425,9 +442,10 @@ def _weights_of(
     )
     for part, kind, known in kinds:
         values = dict[str, _Given]()
-        for key, value in numbers(
-            part, given.get(part, {}), "name", f"{part} of"
-        ).items():
+        sizes = numbers(part, given.get(part, {}), "name", f"{part} of")
+        if part == "bryson" and not of_robot:
+            _warn_of_degrees(lin, sizes)
+        for key, value in sizes.items():
             if of_robot and not stands_for_any(key, known):
                 # a reduced model may lack states that the robot's weights name
                 continue

@@ -7,17 +7,27 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.errors import FflinWarning, InputError
+from fflin.base.errors import FflinWarning, InputError, listed
 from fflin.base.names import by_name, input_keys, rates_by_name
-from fflin.base.validation import Array, ArrayLike, instance, numbers, placement
+from fflin.base.validation import (
+    Array,
+    ArrayLike,
+    instance,
+    looks_like_degrees,
+    numbers,
+    placement,
+)
 from fflin.dynamics.state import Actuation, StateMap
-from fflin.robot.fields import travel_of
+from fflin.robot.fields import input_limits, limits_of, travel_of, warn_of_degrees
 from fflin.robot.inputs import named_wheels
 from fflin.robot.joints import ROOT, Joint, by_joint
 from fflin.robot.robot import Robot
 
 # [rad/s|m/s], so that squared speeds and their sums do not overflow
 LARGEST_SPEED = 1e50
+
+# [SI]; an excess over a limit is reported only if it is larger than this
+LIMIT_SLACK = 1e-9
 
 
 def configuration(
@@ -80,7 +90,10 @@ def _warn_beyond_travel(robot: Robot, joint: Joint, value: float) -> None:
     if low <= value <= high:
         return
     unit = joint.unit
-    text = f"joint '{joint.name}' at {value:g} {unit} is outside {low:g} to {high:g} {unit}"
+    shown = f"{value:g} {unit}"
+    if unit == "rad" and looks_like_degrees(value, low, high):
+        shown = f"{value:g} (deg?)"
+    text = f"joint '{joint.name}' at {shown} is outside {low:g} to {high:g} {unit}"
     warnings.warn(text, FflinWarning, stacklevel=3)
 
 
@@ -145,12 +158,22 @@ def point_of(
             raise InputError(
                 "x0 is given together with q0 or v0; give either x0, or q0 and v0"
             )
-        return state.to_pinocchio(x0)
+        q, v = state.to_pinocchio(x0)
+        _warn_of_angles(state, q)
+        return q, v
     if q0 is None and v0 is None:
         return default()
     q = robot.neutral() if q0 is None else robot.checked_configuration(q0).copy()
+    _warn_of_angles(state, q)
     v = np.zeros(robot.nv) if v0 is None else robot.checked_velocity(v0).copy()
     return q, v
+
+
+def _warn_of_angles(state: StateMap, q: Array) -> None:
+    """Warn of joint positions in q (nq,) that look like degrees."""
+    names = [f"q_m.{name}" for name in state.robot.joint_names]
+    positions = state.joint_positions(q).tolist()
+    warn_of_degrees(state.robot, dict(zip(names, positions, strict=True)))
 
 
 def velocity(robot: Robot, values: Mapping[str, float]) -> Array:
@@ -178,6 +201,12 @@ def velocity(robot: Robot, values: Mapping[str, float]) -> Array:
     InputError
         If a value is not a finite number.
 
+    Warns
+    -----
+    FflinWarning
+        If the rate of a revolute joint looks like degrees: it exceeds 2 pi rad/s and the speed
+        limit of the joint.
+
     Examples
     --------
     >>> robot = fflin.load("planar_detumble")
@@ -191,6 +220,7 @@ def velocity(robot: Robot, values: Mapping[str, float]) -> Array:
             # raises an error that explains why the wheel has no velocity
             robot.joint(name)
     rates = rates_by_name(robot.joint_names, checked)
+    warn_of_degrees(robot, rates)
     return state.spread(
         np.array([rates.get(name, 0.0) for name in state.names[6 + robot.n :]])
     )
@@ -217,6 +247,11 @@ def effort(robot: Robot, values: Mapping[str, float]) -> Array:
     InputError
         If a value is not a finite number.
 
+    Warns
+    -----
+    FflinWarning
+        If an input is beyond its limits, so that the robot cannot apply it.
+
     Examples
     --------
     >>> robot = fflin.load("planar_detumble")
@@ -226,4 +261,25 @@ def effort(robot: Robot, values: Mapping[str, float]) -> Array:
     checked = numbers("values", values, "input", "effort")
     keys = input_keys(Actuation(StateMap(robot)))
     value_at = by_name("input", checked, keys)
-    return np.array([value_at.get(index, 0.0) for index in range(len(keys))])
+    u = np.array([value_at.get(index, 0.0) for index in range(len(keys))])
+    warn_beyond_limits(robot, u)
+    return u
+
+
+def warn_beyond_limits(robot: Robot, u: Array) -> None:
+    """Warn if inputs u (nu,) at an operating point are beyond the limits of the robot."""
+    least, largest = input_limits(robot, limits_of(robot))
+    actuation = Actuation(StateMap(robot))
+    rows = zip(actuation.names, actuation.units, u, least, largest, strict=True)
+    beyond = [
+        f"{name} = {value:.3g} {unit} (limits {low:g} to {high:g} {unit})"
+        for name, unit, value, low, high in rows
+        if not low - LIMIT_SLACK <= value <= high + LIMIT_SLACK
+    ]
+    if beyond:
+        warnings.warn(
+            f"the inputs at the operating point are beyond their limits: {listed(beyond)}; the "
+            "robot cannot apply them",
+            FflinWarning,
+            stacklevel=3,
+        )

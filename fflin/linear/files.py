@@ -15,7 +15,7 @@ import csv
 import io
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, astuple, fields
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, get_args
@@ -36,6 +36,7 @@ from fflin.base.writing import (
 )
 from fflin.dynamics.coordinates import Frame, frame_of
 from fflin.dynamics.state import Actuation, StateMap
+from fflin.linear.optimality import Optimality
 
 if TYPE_CHECKING:
     from fflin.base.validation import Array
@@ -44,6 +45,9 @@ if TYPE_CHECKING:
     from fflin.robot.robot import Robot
 
 FORMATS = (*RECORDS, ".csv")
+
+# Names of the residuals of a plan, in the order in which files contain them.
+OPTIMALITY = tuple(item.name for item in fields(Optimality))
 
 _SIGNALS = ("state", "input", "output")
 # Arrays of a model in a file: {field: which names label each dimension}.
@@ -208,8 +212,12 @@ def _csv_path(path: Path, key: str) -> Path:
 def write_csv(path: Path, traj: Trajectory) -> None:
     """Write a trajectory as a csv table with named columns, for `Trajectory.load`."""
     names = [*trajectory_columns(traj), "hold", "frame"]
+    constants: list[object] = [traj.hold, traj.frame]
+    if traj.optimality is not None:
+        names += OPTIMALITY
+        constants += astuple(traj.optimality)
     rows = np.column_stack((traj.t, traj.q, traj.v, traj.u)).tolist()
-    table = [names, *([*row, traj.hold, traj.frame] for row in rows)]
+    table = [names, *([*row, *constants] for row in rows)]
     content = csv_table(table)
     if traj.verified:
         digest = record.content_digest({"table": content})
@@ -316,6 +324,8 @@ def arguments(
         u[:, columns] = u[:, columns] @ reference.rotation.T
     found_as: dict[str, object] = {"t": t, "u": u}
     found_as |= {"hold": hold, "frame": frame, "verified": verified}
+    if "optimality" in entries:
+        found_as["_optimality"] = _optimality(entries["optimality"])
     if states:
         return found_as | {name: entries[name] for name in "qv"}
     x = as_double("x", entries["x"])
@@ -325,6 +335,16 @@ def arguments(
         )
     _, q, v = state.points(x)
     return found_as | {"q": q, "v": v}
+
+
+def _optimality(entry: object) -> Optimality:
+    """Return the residuals of a plan from the entry of a file."""
+    values = as_double("optimality", entry).ravel()
+    checked = vector("optimality", values, len(OPTIMALITY), ", ".join(OPTIMALITY))
+    effort, stationarity, feasibility, complementarity, iterations = checked.tolist()
+    return Optimality(
+        effort, stationarity, feasibility, complementarity, int(iterations)
+    )
 
 
 def _columns(path: Path, known: set[str]) -> tuple[Record, bool]:
@@ -372,10 +392,15 @@ def _entries(columns: Record, robot: Robot) -> Record:
     rows["t"] = ["t"]
     known = [name for names in rows.values() for name in names]
     require_known("column", known, columns)
-    require_known("state or input", columns, (*known, *inputs, "hold", "frame"))
+    constants = ("hold", "frame", *OPTIMALITY)
+    require_known("state or input", columns, (*known, *inputs, *constants))
     entries: Record = {
         key: columns[key][0] for key in ("hold", "frame") if key in columns
     }
+    if set(OPTIMALITY) <= set(columns):
+        entries["optimality"] = [
+            float(_numbers(name, columns[name])[0]) for name in OPTIMALITY
+        ]
     acting = [name for name in inputs if name in columns]
     # If inputs are constant between knots, the last row may lack inputs, because no input acts
     # after the last knot.

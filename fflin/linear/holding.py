@@ -32,8 +32,10 @@ def is_held(lin: LinearModel) -> bool:
     return bool(np.abs(lin.rate[judged]).max(initial=0.0) <= lin.bound(TOLERANCE))
 
 
-def held(lin: LinearModel) -> LinearModel:
+def held(lin: LinearModel, *, tilt: bool = True) -> LinearModel:
     """Return a model about the same point with the inputs of `equilibrium`, which hold the robot.
+
+    Under gravity, `equilibrium` may tilt the base unless `tilt` is false.
 
     If the point needs no other inputs, return the model itself. This is also so if the inputs
     cannot be chosen: the model has a moving reference, lacks states of the robot or was read from a
@@ -55,7 +57,7 @@ def held(lin: LinearModel) -> LinearModel:
     if robot.orbit or source.x0[:6].any():
         reference = source.reference
     balanced = equilibrium(
-        robot, source.q, v=source.v, frame=frame, reference=reference
+        robot, source.q, v=source.v, frame=frame, reference=reference, tilt=tilt
     )
     model = linearize(
         robot, balanced.q, source.v, balanced.u, frame=frame, reference=reference

@@ -13,7 +13,14 @@ from fflin.base.rotation import (
     rotation_matrix,
     skew,
 )
-from fflin.base.validation import Array, ArrayLike, normalised, placement, vector
+from fflin.base.validation import (
+    Array,
+    ArrayLike,
+    instance,
+    normalised,
+    placement,
+    vector,
+)
 from fflin.dynamics.coordinates import (
     ANGULAR,
     IN_REFERENCE_AXES,
@@ -342,8 +349,9 @@ def tool_coordinates(
 
     Raise an error if the tool is unknown or cannot represent the robot.
     """
-    if not isinstance(tool, str) or tool not in TOOLS:
-        raise unknown("tool", str(tool), TOOLS)
+    instance("tool", tool, str, f"a name: {', '.join(TOOLS)}")
+    if tool not in TOOLS:
+        raise unknown("tool", tool, TOOLS)
     if tool[:5] != "euler":
         refuse_orbit(robot, f"the coordinates of {tool}")
     return ToolCoordinates(StateMap(robot), tool, moving=moving)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -125,7 +125,7 @@ class Trajectory(Design):
     frame: str = field(default="local", kw_only=True)
     # last lines of the report; not saved in files
     _note: str = field(default="", kw_only=True)
-    # not saved in files
+    # residuals of a plan, which `save` also writes
     _optimality: Optimality | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
@@ -189,7 +189,12 @@ class Trajectory(Design):
     def _report(self) -> str:
         """Return text about the trajectory: its largest residual, or why it is invalid."""
         verdict = self._fault or f"residual {self.residual.max():.1e}"
-        return folded([repr(self), verdict, *self._note.splitlines()])
+        notes = self._note.splitlines()
+        if (
+            self._optimality is not None and not notes
+        ):  # the trajectory was read from a file
+            notes = [str(self._optimality)]
+        return folded([repr(self), verdict, *notes])
 
     @cached_property
     def _aba(self) -> Aba:
@@ -199,7 +204,7 @@ class Trajectory(Design):
     def optimality(self) -> Optimality | None:
         """Effort and KKT residuals of a plan; see `plan`.
 
-        None if the trajectory is not the result of `plan`, or was read from a file.
+        None if the trajectory is not the result of `plan`. Files contain these residuals.
         """
         return self._optimality
 
@@ -351,6 +356,8 @@ class Trajectory(Design):
             write_csv(target, self)
         else:
             record = record_of(self) | {"input_names": list(self.actuation.names)}
+            if self._optimality is not None:
+                record["optimality"] = np.array(astuple(self._optimality), dtype=float)
             write_record(target, record, checksummed=self.verified)
 
     def to_pandas(self) -> DataFrame:
@@ -383,14 +390,16 @@ class Trajectory(Design):
         - t (N,);
         - q and v, or the states x (N, nx) of `StateMap`;
         - u, with one row for each knot;
-        - optionally the texts `hold` and `frame`.
+        - optionally the texts `hold` and `frame`;
+        - optionally `optimality`, the five values of `Optimality` in their order.
 
         A .csv file contains the named columns
 
         - t;
         - q[0] ... and v[0] ..., or the names of the states, such as q_b.x;
         - the names of inputs, such as tau_m.joint_1; inputs without a column are zero;
-        - optionally `hold` and `frame`, the same in every row.
+        - optionally `hold`, `frame` and the values of `Optimality`, such as `stationarity`, the
+          same in every row.
 
         Parameters
         ----------

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from fflin.base.errors import InputError, require_known
+from fflin.base.errors import FflinWarning, InputError, listed, require_known
 from fflin.base.names import (
     by_name,
     matching,
@@ -17,7 +18,14 @@ from fflin.base.names import (
     stands_for_any,
     state_keys,
 )
-from fflin.base.validation import Array, dimension, number, numbers
+from fflin.base.validation import (
+    ONE_ROTATION,
+    Array,
+    dimension,
+    looks_like_degrees,
+    number,
+    numbers,
+)
 from fflin.robot.inputs import JointTorque, ReactionWheel, Thruster, three_numbers
 from fflin.robot.joints import Joint, by_joint
 from fflin.robot.orbit import checked_orbit
@@ -79,6 +87,8 @@ def _given_limits(
     }
     limits_of_index |= by_name("input or state", of_states, (*keys, *states))
     limits_of_index |= by_name("input", of_inputs, keys)
+    sizes = {names[i]: max(map(abs, limits)) for i, limits in limits_of_index.items()}
+    warn_of_degrees(robot, sizes)
     return {
         names[i]: (max(low, floors[i]), max(up, floors[i]))
         for i, (low, up) in limits_of_index.items()
@@ -141,6 +151,39 @@ def require_chart(what: str, size: float) -> None:
             f"{what} is {size:g}, expected at most 1, because q_b is the vector part of a "
             "quaternion: a rotation by x rad has |q_b| = sin(x / 2), so 5 deg is 0.0436"
         )
+
+
+def warn_of_degrees(robot: Robot, values: Mapping[str, float]) -> None:
+    """Warn of positions and rates of revolute joints that look like degrees.
+
+    `values` is {name of a state: value}. States other than q_m and qdot_m are ignored, and so are
+    wheels, which may have any angle and a high speed. One warning names all such values; see
+    `looks_like_degrees` for the rule.
+    """
+    wheels = {names[0] for item, names in robot.named_inputs if item.GROUP == "wheel"}
+    suspicious = dict[str, float]()
+    for joint in robot.joints:
+        if joint.unit != "rad" or joint.name in {*wheels, *robot.wheel_joints}:
+            continue
+        low, high = travel_of(robot.model, joint)
+        if not math.isfinite(high - low) or low == high:
+            low, high = -ONE_ROTATION, ONE_ROTATION
+        rates = _either(float(robot.model.velocityLimit[joint.idx_v]))
+        ranges = {f"q_m.{joint.name}": (low, high), f"qdot_m.{joint.name}": rates}
+        for name, (least, largest) in ranges.items():
+            value = values.get(name, 0.0)
+            if looks_like_degrees(value, least, largest):
+                suspicious[name] = value
+    if not suspicious:
+        return
+    shown = listed([f"{name} = {value:g}" for name, value in suspicious.items()])
+    first = next(iter(suspicious.values()))
+    warnings.warn(
+        "angles look like degrees, because they exceed one rotation and the limits of the joint: "
+        f"{shown}; give radians, such as {math.radians(first):.3g} for {first:g} deg",
+        FflinWarning,
+        stacklevel=3,
+    )
 
 
 def _bound(what: str, value: object) -> float:
@@ -215,6 +258,8 @@ def _weights(value: object, robot: Robot) -> dict[str, object]:
             if part == "bryson" and (key in weights["q"] or key in weights["r"]):
                 message = f"'{key}' has both a weight and a largest value; give only one of them"
                 raise InputError(message)
+    indices = by_name("state or input", weights["bryson"], both)
+    warn_of_degrees(robot, {both[i]: size for i, size in indices.items()})
     rule = {"rule": given["rule"]} if "rule" in given else {}
     return rule | {part: entries for part, entries in weights.items() if entries}
 

@@ -16,7 +16,13 @@ from typing import TypeVar
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.errors import FflinWarning, InputError, ModelError, require_known
+from fflin.base.errors import (
+    FflinWarning,
+    InputError,
+    ModelError,
+    listed,
+    require_known,
+)
 from fflin.base.toml_file import TomlFile, flat
 from fflin.base.validation import by_name, instance, is_rotation, printable, rotated
 from fflin.base.writing import read_file, remember
@@ -552,15 +558,24 @@ def _built(
             if build is FlexibleAppendage:
                 del parameters["inertia"], parameters["rigid"]
             require_known(f"key of {key}", values, parameters)
-            for parameter_name, parameter in parameters.items():
-                if (
-                    parameter.default is parameter.empty
-                    and parameter_name not in values
-                ):
-                    raise InputError(
-                        f"the key '{parameter_name}' is missing; add this key"
-                    )
+            missing = [
+                name
+                for name, parameter in parameters.items()
+                if parameter.default is parameter.empty and name not in values
+            ]
+            if missing:
+                raise _missing_keys(missing)
             for file in {"op4", "asm"} & set(values):
                 values[file] = document.path.parent / str(values[file])
             built.append(build(**values))
     return built
+
+
+def _missing_keys(names: list[str]) -> InputError:
+    """Return the error that names the missing keys of a table."""
+    message = f"the key '{names[0]}' is missing; add this key"
+    if len(names) > 1:
+        message = f"the keys {listed(names)} are missing; add these keys"
+    if "position" in names:
+        message += "; position = [0, 0, 0] is the origin of the frame"
+    return InputError(message)

@@ -36,7 +36,13 @@ from fflin.control.channel import (
     warn_beyond,
 )
 from fflin.control.policies import Feedback
-from fflin.control.policy import Policy, bound
+from fflin.control.policy import (
+    Policy,
+    Reference,
+    bound,
+    defined_by_user,
+    initial_inputs,
+)
 from fflin.control.tracking import prepared
 from fflin.dynamics import points
 from fflin.dynamics.coordinates import ORBITAL, Frame, refuse_orbit
@@ -135,7 +141,7 @@ class Plan:
         self.plant = plant = Plant(state, options.disturbance)
         self.method = integrator(options.method)
         lin = policy.model if policy else None
-        follows = policy.reference_motion if policy else None
+        follows = _reference_of(policy, plant)
         default = (
             partial(points.start_of, robot)
             if follows is None
@@ -188,7 +194,7 @@ class Plan:
         # Motion that the policy follows, or None, whatever the target.
         self.follows = follows
         # Target state (nx,), or None if there is no target.
-        self.target = target_of(state, goal)
+        self.target = target_of(state, goal, _target_name(options.target, policy))
         # The angle of a continuous joint is unique only up to full turns. In the first row of the
         # motion, this angle is within half a turn of the joint's angle in the state `near` (nx,).
         # If `near` is None, this angle is within half a turn of 0.
@@ -264,15 +270,25 @@ def law_of(
     return Law(bound(policy, plant.robot), plant.actuation.names, within, times.slow)
 
 
-def target_of(state: StateMap, target: LinearModel | ArrayLike | None) -> Array | None:
+def _target_name(target: object, policy: Policy | None) -> str:
+    """Return the noun for a target in messages: the given target, or the policy's model."""
+    if target is None and policy is not None:
+        return f"the model of the policy ({policy.kind})"
+    return "target"
+
+
+def target_of(
+    state: StateMap, target: LinearModel | ArrayLike | None, name: str = "target"
+) -> Array | None:
     """Return the target state (nx,), or None if there is no target.
 
-    The argument `target` is the state itself, or a linear model about this state.
+    The argument `target` is the state itself, or a linear model about this state. `name` is the
+    noun for it in messages.
     """
     if target is None:
         return None
     if not isinstance(target, LinearModel):
-        goal: Array = vector("target", target, state.nx, "a state (12 + 2n)").copy()
+        goal: Array = vector(name, target, state.nx, "a state (12 + 2n)").copy()
         state.to_pinocchio(goal)  # raises an error for an invalid attitude
         return goal
     theirs = (
@@ -289,10 +305,29 @@ def target_of(state: StateMap, target: LinearModel | ArrayLike | None) -> Array 
         if state.robot.orbit:
             wanted += f" in frame {state.frame!r}"
         raise InputError(
-            f"target is a model of '{target.robot}' in frame '{target.frame}', expected {wanted}"
+            f"{name} is a model of '{target.robot}' in frame '{target.frame}', expected {wanted}"
         )
     near = selection(target.state_names, state.names).T @ target.x0
     return state.to_state(target.q, target.v, near=near)
+
+
+def _reference_of(policy: Policy | None, plant: Plant) -> Reference | None:
+    """Return the motion that a policy follows, or None; raise `InputError` if it is invalid."""
+    follows = None if policy is None else policy.reference_motion
+    if policy is None or follows is None:
+        return None
+    if defined_by_user(policy, "reference_motion"):
+        label = f"{policy.kind}.reference_motion(0)"
+        start = follows(0.0)
+        if not isinstance(start, Sequence) or len(start) != 3:
+            raise InputError(
+                f"{label} has type {type(start).__name__}, expected q (nq,), v (nv,) and u (nu,)"
+            )
+        robot = plant.robot
+        sizes = robot.nq, robot.nv, len(plant.actuation.names)
+        for name, value, size in zip("qvu", start, sizes, strict=True):
+            vector(f"{name} of {label}", value, size, f"the {name} of '{robot.name}'")
+    return follows
 
 
 def _state_of(policy: Policy | None, options: SimulationOptions) -> StateMap:
@@ -348,7 +383,7 @@ def _functions(options: SimulationOptions) -> tuple[Event, ...]:
 def _inputs_at_start(policy: Policy | None, plant: Plant) -> Array:
     """Return the reference inputs (nu,) of the policy at the start, or zeros if it has none."""
     names = plant.actuation.names
-    initial = policy.initial_inputs_for(names) if policy else None
+    initial = None if policy is None else initial_inputs(policy, names)
     if initial is None:
         return np.zeros(len(names))
     return initial

@@ -32,8 +32,9 @@ THERE, _NOTHING = 1e-9, 1e-14
 DWELL = 0.05
 
 # The end of a run decides whether an error decays. The largest error in the last _TAIL of all rows
-# is compared with the largest error in as many rows before: an error grows or decays if it changes
-# by the factor _GROWS. An error that returns below its earlier values oscillates and does not grow.
+# is compared with the largest errors in two earlier windows of as many rows: an error grows if it
+# rises through all three windows, and in the last one by the factor _GROWS. An error that remains
+# changes by less than this factor.
 # An error below _SEEN times its largest value is not judged.
 _TAIL, _GROWS, _SEEN = 0.1, 1.05, 1e-3
 
@@ -412,16 +413,22 @@ def error_sizes(motion: Motion) -> list[ErrorSize]:
 
 def _tail(size: Array) -> str:
     """Return whether an error (N,) remains or grows in the last rows of a run, or ""."""
-    # The last two windows are compared by their largest errors, so that an oscillation about a
-    # constant error counts as one that remains.
+    # The last three windows are compared by their largest errors, so that an oscillation about a
+    # constant error counts as one that remains. An error that rises only in the last window may be
+    # an overshoot.
     rows = max(int(_TAIL * len(size)), 1)
     last = size[-rows:]
-    before = size[-2 * rows : -rows].max(initial=0.0)
+    before = size[-2 * rows : -rows]
+    earlier = size[-3 * rows : -2 * rows]
+    if not len(earlier):
+        return ""
     if last.max() <= max(_SEEN * size.max(), THERE):
         return ""
-    if last.max() > _GROWS * before and last.min() >= before:
+    rises = last.min() >= before.max() and before.min() >= earlier.max()
+    if rises and last.max() > _GROWS * before.max():
         return "grows"
-    if last.max() * _GROWS > before:
+    largest = max(before.max(), earlier.max())
+    if largest <= _GROWS * last.max() and last.max() <= _GROWS * largest:
         return "remains"
     return ""
 

@@ -140,13 +140,13 @@ def _visuals(robot: Robot, notes: list[str]) -> Iterator[Shape]:
                 continue
             file = None if mesh is None else find_mesh(mesh, path, robot.package_dirs)
             if mesh is not None and file is None:
-                missing.append(shown(mesh))
+                missing.append(f"{shown(mesh)} (link {frame.name})")
                 continue
             if file is not None:
                 try:
                     load_mesh(file)
                 except ValueError:
-                    unreadable.append(file.name)
+                    unreadable.append(f"{file.name} (link {frame.name})")
                     continue
             yield Shape(
                 joint, kind, size, placement, color, finish, file, frame.name, at

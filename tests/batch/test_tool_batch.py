@@ -89,3 +89,29 @@ def test_a_batch_without_its_robot_names_the_remedy(tmp_path):
     agree(batch, "drake")
     with pytest.raises(fflin.InputError, match="no points"):
         batch[:0].to("drake")
+
+
+def test_an_index_gives_the_model_of_one_point():
+    robot = fflin.load("planar_detumble")
+    batch = fflin.sweep(robot, fflin.grid(robot, {"joint_1": [-0.5, 0.2, 0.9]}))
+    converted = batch.to("drake")
+    for i, model in enumerate(converted):
+        single = batch[i].to("drake")
+        for name in ("A", "B", "f0", "x0", "u0", "q", "v", "T", "T_left", "T_u"):
+            expected = getattr(single, name)
+            assert getattr(model, name) == pytest.approx(expected, abs=1e-12)
+        for name in ("state_names", "state_units", "input_names", "input_units"):
+            assert getattr(model, name) == getattr(single, name)
+        assert model.C.shape == (0, len(model.A)) and not model.output_names
+    assert i == 2
+    assert (converted[-1].A == converted[np.int64(2)].A).all()
+    with pytest.raises(IndexError, match="3 points"):
+        converted[3]
+    with pytest.raises(fflin.InputError, match="index has type str"):
+        converted["first"]
+
+
+def test_a_tool_is_given_by_its_name():
+    lin = fflin.linearize(fflin.load("planar_detumble"))
+    with pytest.raises(fflin.InputError, match="type list, expected a name: drake"):
+        lin.to(["drake"])

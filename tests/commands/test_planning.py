@@ -190,3 +190,15 @@ def test_the_former_names_of_the_time_steps_still_work(tmp_path, capsys):
         for name in ("--dt", "--sample")
     ]
     assert gains[0] == gains[1] and gains[0]["dt"] == 0.1
+
+
+def test_mpc_along_a_trajectory_names_the_way_in_python(tmp_path):
+    robot = fflin.load("planar_detumble")
+    rest = np.zeros((3, robot.nv))
+    q = np.tile(robot.neutral(), (3, 1))
+    motion = fflin.Trajectory(robot, [0.0, 1.0, 2.0], q, rest, np.zeros((3, 9)))
+    motion.save(tmp_path / "rest.npz")
+    path = tmp_path / "rest.npz"
+    command = ("simulate", "planar_detumble", "--trajectory", path, "--sample", 0.2)
+    err = refused(*command, "--mpc")
+    assert "fflin.mpc(models, ...)" in err and "remove --mpc" in err

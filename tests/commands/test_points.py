@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import fflin
-from tests.support.commands import refused, run
+from tests.support.commands import refused, run, warned
 
 SAT = """
 urdf = "servicer_7dof"
@@ -170,3 +170,66 @@ def test_none_removes_the_orbit_of_a_file_and_the_regulator_holds_in_it(tmp_path
     held = fflin.equilibrium(robot)
     assert design["u0"] == pytest.approx(held.u, rel=1e-9, abs=1e-15)
     assert "'no' is not a number" in refused("lqr", path, "--orbit", "no")
+
+
+def falling_without_tilt(folder):
+    """Write a robot whose centre of mass is aside, held up by a thrust and a base torque."""
+    path = folder / "hover.toml"
+    path.write_text(
+        'urdf = "planar_detumble"\ngravity = [0, 0, -1]\n'
+        '[[input]]\ntype = "base_torque"\n'
+        '[[input]]\ntype = "thruster"\nframe = "base"\nposition = [0, 0, 0]\n'
+        "direction = [0.1, 0, 1]\n"
+        '[[input]]\ntype = "joint_torque"\njoint = "*"\n'
+    )
+    return path
+
+
+@pytest.mark.parametrize("command", ["linearize", "equilibrium", "lqr", "simulate"])
+def test_an_option_keeps_the_attitude_of_an_equilibrium(tmp_path, command):
+    path = falling_without_tilt(tmp_path)
+    options = [] if command in ("equilibrium", "simulate") else ["--equilibrium"]
+    if command == "simulate":
+        options = ["--equilibrium", "--duration", 1]
+    code, _, err = run(command, path, *options)
+    assert code == 0, err
+    err = refused(command, path, *options, "--no-tilt")
+    assert "cannot balance the forces" in err and "F_b" in err
+
+
+def test_the_gain_of_lqr_keeps_the_attitude_only_if_asked(tmp_path):
+    path = falling_without_tilt(tmp_path)
+    assert run("lqr", path)[0] == 0
+    assert "F_b.x" in refused("lqr", path, "--no-tilt")
+
+
+def test_inputs_beyond_their_limits_are_named_at_the_operating_point(tmp_path):
+    weak = tmp_path / "weak.toml"
+    weak.write_text('urdf = "servicer_7dof"\ngravity = [0, 0, -1]\n[limits]\nF_b = 5\n')
+    robot = fflin.load(weak)
+    held = fflin.equilibrium(robot)
+    force = held.u[held.input_names.index("F_b.z")]
+    (message,) = warned("linearize", weak, "--equilibrium")
+    assert f"F_b.z = {force:.3g} N (limits -5 to 5 N)" in message
+    (message,) = warned("check", weak, "--effort", "F_b.x=6", "--effort", "F_b.y=5")
+    assert "F_b.x = 6 N (limits -5 to 5 N)" in message and "F_b.y" not in message
+    with pytest.warns(fflin.FflinWarning, match="beyond their limits: F_b.x = 6 N"):
+        fflin.effort(robot, {"F_b.x": 6.0})
+    assert warned("linearize", weak, "--effort", "F_b.x=4") == set()
+
+
+def test_all_missing_keys_of_a_thruster_are_named_at_once(tmp_path):
+    path = tmp_path / "thrust.toml"
+    path.write_text('urdf = "cubesat"\n[[input]]\ntype = "thruster"\nframe = "base"\n')
+    err = " ".join(refused("info", path).split())
+    assert "the keys position, direction are missing; add these keys" in err
+    assert "position = [0, 0, 0] is the origin of the frame" in err
+
+
+def test_the_option_for_a_tilt_is_refused_where_it_has_no_effect(tmp_path):
+    path = falling_without_tilt(tmp_path)
+    gain = tmp_path / "gain.npz"
+    assert run("lqr", path, "-o", gain)[0] == 0
+    for option in ("--tilt", "--no-tilt"):
+        err = refused("simulate", path, "--gain", gain, option)
+        assert f"remove {option}" in err

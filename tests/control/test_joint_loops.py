@@ -188,7 +188,7 @@ def test_many_knots_allow_no_more_circles_than_the_path_has_steps_for(monkeypatc
     robot = robot.replace(inputs=motors(robot))
     start = robot.neutral(), np.zeros(robot.nv)
     end = robot.neutral(), np.zeros(robot.nv)
-    end[0][3:7] = [0.0, 0.0, np.sin(0.1), np.cos(0.1)]
+    end[0][3:7] = [0.0, np.sin(0.1), 0.0, np.cos(0.1)]
     nx = 12 + 2 * robot.n
     for knots, most in ((20, 2), (150, MOST_CIRCLES)):
         shooting = Shooting(robot, np.linspace(0.0, 10.0, knots), held=True)

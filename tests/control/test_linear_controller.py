@@ -325,7 +325,7 @@ def test_what_is_no_controller_of_the_model_is_refused(lin, arm):
         ("'q_b_x_'", twice, 1),
         (r"'tau_b\.x'", seen, 1),
         ("parts", (A, B, C), 1),
-        ("object", gain, 1),
+        ("type Gain", gain, 1),
         ("shape", np.zeros((2, 2, 2)), 1),
         ("sign", D, 2.0),
     ):

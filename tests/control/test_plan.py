@@ -8,8 +8,10 @@ import pytest
 from scipy.optimize import minimize
 
 import fflin
+from fflin.control import plan as planning
 from fflin.control.optimal import plan_search
 from fflin.control.optimal.floating_base import FloatingBase
+from fflin.control.optimal.joint_loops import rotation_axes
 from fflin.control.optimal.shooting import Shooting
 from fflin.dynamics.impact import momentum_of
 from tests.support.marks import exhaustive
@@ -980,3 +982,93 @@ def test_a_failed_plan_of_internal_inputs_advises_to_free_the_base_velocities():
     )
     with any_wording(), pytest.raises(fflin.InputError, match="omega_b and v_b"):
         fflin.plan(robot, (goal, None), 5.0, knots=4)
+
+
+def rolled(robot, angle, axis):
+    """Return the neutral configuration with the base rotated by an angle [rad] about an axis."""
+    q = robot.neutral().copy()
+    rotation = pin.exp3(angle * np.array(axis))
+    q[3:7] = pin.Quaternion(rotation).coeffs()
+    return q
+
+
+@pytest.mark.parametrize("axis", [(1.0, 0.0, 0.0), (0.0, 0.0, 1.0)])
+def test_an_attitude_that_no_loop_of_the_joints_reaches_is_unreachable(axis):
+    robot = fflin.load("planar_detumble", inputs=[fflin.JointTorque("*")])
+    goal = (rolled(robot, 0.4, axis), None)
+    options = {"knots": 11, "free": FREE_OF_JOINTS}
+    shown = "".join(f"{x:g}, " for x in axis).rstrip(", ")
+    with pytest.raises(fflin.InputError) as told:
+        fflin.plan(robot, goal, 20.0, **options)
+    message = str(told.value)
+    assert f"rotates the base about ({shown})" in message
+    assert "only about the axis (0, 1, 0)" in message and "in loops" not in message
+
+
+@pytest.mark.parametrize(
+    ("name", "count"), [("planar_detumble", 1), ("servicer_7dof", 3)]
+)
+def test_the_axes_of_rotation_are_those_of_the_joints(name, count):
+    robot = fflin.load(name)
+    state = fflin.StateMap(robot, frame="local")
+    base = FloatingBase(state, (robot.neutral(), np.zeros(robot.nv)))
+    postures = np.random.default_rng(0).uniform(-1.0, 1.0, (20, robot.n))
+    axes = rotation_axes(base, postures)
+    assert axes @ axes.T == pytest.approx(np.eye(count), abs=1e-12)
+    if count == 1:
+        assert np.abs(axes) == pytest.approx(np.array([[0.0, 1.0, 0.0]]), abs=1e-9)
+
+
+def test_a_failed_plan_of_sprung_wings_advises_to_free_their_end(monkeypatch):
+    monkeypatch.setattr(plan_search, "_MOST", 1)
+    wings = ["panel_left", "panel_right"]
+    robot = fflin.load(
+        "servicer_7dof", passive=wings, stiffness=dict.fromkeys(wings, 40.0)
+    )
+    goal = fflin.configuration(robot, {"joint_1": 0.5})
+    with any_wording(), pytest.raises(fflin.InputError) as told:
+        fflin.plan(robot, (goal, None), 2.0, knots=5, limits={"qdot_m": 0.01})
+    message = str(told.value)
+    assert "panel_left, panel_right have springs and no motor" in message
+    assert "free=['q_m.panel_left', 'qdot_m.panel_left'" in message
+
+
+@pytest.mark.parametrize("error", [1e6, np.nan, np.inf])
+def test_a_diverged_trial_has_no_figures_in_the_message(one_joint, monkeypatch, error):
+    robot, _ = one_joint
+    state = fflin.StateMap(robot)
+    shooting = Shooting(robot, np.linspace(0.0, 5.0, 6), True, ())
+    zeros = np.zeros((6, state.nx))
+    missed = np.full(state.nx, error)
+    made = planning._Made(
+        zeros, zeros, zeros, missed, zeros[0], zeros[:, None], 0.0, None
+    )
+    message = str(planning._failure(shooting, made, np.full(state.nx, True), 5.0))
+    assert "the last trial diverges;" in message and "misses" not in message
+    near = made._replace(missed=np.full(state.nx, 0.5))
+    message = str(planning._failure(shooting, near, np.full(state.nx, True), 5.0))
+    assert "misses the attitude about x by 0.5 rad" in message
+
+
+def test_a_guess_that_names_an_unknown_joint_says_what_a_guess_may_be(loop):
+    robot, _ = loop
+    with pytest.raises(fflin.UnknownNameError, match=r"joint_9.*function of the time"):
+        fflin.plan(robot, (None, None), 5.0, knots=5, guess=lambda t: {"joint_9": 0.1})
+    with pytest.raises(fflin.InputError, match=r"a mapping, expected a function guess"):
+        fflin.plan(robot, (None, None), 5.0, knots=5, guess={"joint_1": 0.1})
+
+
+@pytest.mark.parametrize("ending", ["npz", "mat", "json", "csv"])
+def test_a_file_of_a_plan_keeps_its_residuals(tmp_path, ending):
+    robot = fflin.load("planar_detumble", lock=["joint_2", "joint_3"])
+    goal = fflin.configuration(robot, {"joint_1": 0.1})
+    motion = fflin.plan(robot, (goal, None), 20.0, knots=5, limits=None)
+    path = tmp_path / f"plan.{ending}"
+    motion.save(path)
+    back = fflin.Trajectory.load(path, robot)
+    assert back.optimality == motion.optimality and back.verified
+    assert str(motion.optimality) in " ".join(str(back).split())
+    assert back.resampled(1.0).optimality is None
+    plain = motion.resampled(1.0)
+    plain.save(path)
+    assert fflin.Trajectory.load(path, robot).optimality is None

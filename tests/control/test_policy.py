@@ -191,3 +191,73 @@ def test_an_allocation_tells_what_its_policy_does(lin, K):
     assert law.prediction(lin, fflin.StateMap(robot)) is None
     loop, dt = law.closed_loop()
     assert dt == 0.0 and loop == pytest.approx(lin.A - lin.B @ K)
+
+
+def idle(**members):
+    """Return a policy of a user whose members have the given values."""
+
+    class Idle(fflin.Policy):
+        def bind(self, robot):
+            return lambda t, q, v: np.zeros(robot.nv)
+
+    for name, value in members.items():
+        setattr(Idle, name, value)
+    return Idle()
+
+
+@pytest.mark.parametrize(
+    ("members", "message"),
+    [
+        ({"model": "planar"}, "Idle.model has type str, expected a fflin.LinearModel"),
+        ({"feedback_gain": 3.0}, r"feedback_gain has shape \(\), expected \(nu, nx\)"),
+        ({"feedback_gain": "K"}, "feedback_gain contains <U1 values"),
+        ({"feedback_gain": np.full((9, 18), np.nan)}, "every entry must be finite"),
+        ({"closed_loop": lambda self: np.eye(2)}, "type ndarray, expected a matrix"),
+        (
+            {"closed_loop": lambda self: (np.ones((2, 3)), 0.0)},
+            r"matrix of shape \(2, 3\), expected \(n, n\)",
+        ),
+        ({"closed_loop": lambda self: (np.full((2, 2), np.inf), 0.0)}, "finite"),
+        ({"closed_loop": lambda self: (np.eye(2), -1.0)}, "dt of .* is -1 s"),
+        ({"reference_motion": 5}, "reference_motion has type int, expected a function"),
+        ({"reference_motion": property(lambda self: lambda: 0)}, r"function of \(t\)"),
+        (
+            {"reference_motion": property(lambda self: lambda t: 3)},
+            r"reference_motion\(0\) has type int, expected q",
+        ),
+        (
+            {"reference_motion": property(lambda self: lambda t: ([0], [0], [0]))},
+            r"q of Idle.reference_motion\(0\) has shape \(1,\), expected \(13,\)",
+        ),
+        (
+            {"initial_inputs_for": lambda self, names: np.zeros(2)},
+            r"initial_inputs_for\(names\) has shape \(2,\), expected \(9,\)",
+        ),
+        ({"initial_inputs_for": lambda self, names: "none"}, "expected real numbers"),
+    ],
+)
+def test_members_of_a_users_policy_are_checked(members, message):
+    robot = fflin.load("planar_detumble")
+    with pytest.raises(fflin.InputError, match=message):
+        fflin.simulate(robot, idle(**members), duration=0.1, dt=0.05)
+
+
+def test_a_gain_of_a_users_policy_must_fit_its_model(lin):
+    robot = fflin.load("planar_detumble")
+    law = idle(model=lin, feedback_gain=np.ones((2, 18)))
+    with pytest.raises(fflin.InputError, match=r"shape \(2, 18\), expected \(9, 18\)"):
+        fflin.simulate(robot, law, duration=0.1, dt=0.05)
+
+
+def test_a_model_of_another_robot_is_named_as_the_model_of_the_policy(lin):
+    with pytest.raises(
+        fflin.InputError,
+        match=r"the model of the policy \(Idle\) is a model of 'planar",
+    ):
+        fflin.simulate(fflin.load("ets_vii"), idle(model=lin), duration=0.1, dt=0.05)
+
+
+def test_an_object_in_place_of_a_gain_is_named_by_its_type(lin):
+    estimator = fflin.kalman(lin, 1e-3, 1e-4)
+    with pytest.raises(fflin.InputError, match="has type Estimator, expected real"):
+        fflin.StateFeedback(lin, estimator)

@@ -44,7 +44,7 @@ def after_half_a_second(value):
     [
         (after_half_a_second(math.nan), "tau_b.x"),
         (after_half_a_second(math.inf), "tau_b.x"),
-        (lambda t, q, v: None, "object"),
+        (lambda t, q, v: None, "type NoneType"),
         (lambda t, q, v: "push", "real"),
         (lambda t, q, v: [[1.0], [1.0, 2.0]], "rows"),
         (lambda t, q, v: np.full(6, 1j), "complex128"),

@@ -215,3 +215,8 @@ def test_what_was_grasped_is_drawn_where_it_is_held():
         assert there.isApprox(held * alone.oMi[before.joint] * before.placement, 1e-9)
     body = pin.Inertia(5.0, np.zeros(3), np.eye(3))
     assert shapes(fflin.capture(robot, "tool", body).robot)[0][own].finish == "inertia"
+
+
+def test_the_links_of_missing_meshes_are_named(tmp_path):
+    (note,) = shapes(fflin.load(write(tmp_path)))[1]
+    assert "'missing.stl (link base)'" in note and "not drawn" in note

@@ -81,18 +81,18 @@ class FloatingBase:
         """
         middle = self.terms(0.5 * (joints[1:] + joints[:-1]))
         h = np.diff(t)[:, None]
-        turns = (middle.coupling @ np.diff(joints, axis=0)[..., None])[..., 0]
+        rotations = (middle.coupling @ np.diff(joints, axis=0)[..., None])[..., 0]
         rotating = bool(self.angular_momentum.any())
         R = np.empty((len(t), 3, 3))
         R[0] = self.start_rotation
-        for k, turn in enumerate(turns):
+        for k, rotation in enumerate(rotations):
             if rotating:
                 drift = h[k] * middle.inverse[k]
                 half = R[k] @ pin.exp3(
-                    0.5 * (turn + drift @ (R[k].T @ self.angular_momentum))
+                    0.5 * (rotation + drift @ (R[k].T @ self.angular_momentum))
                 )
-                turn = turn + drift @ (half.T @ self.angular_momentum)  # noqa: PLW2901
-            R[k + 1] = R[k] @ pin.exp3(turn)
+                rotation = rotation + drift @ (half.T @ self.angular_momentum)  # noqa: PLW2901
+            R[k + 1] = R[k] @ pin.exp3(rotation)
         return R
 
     def motion(self, t: Array, joints: Array, rates: Array, R: Array) -> Point:

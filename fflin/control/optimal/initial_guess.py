@@ -4,13 +4,19 @@ from collections.abc import Callable, Mapping
 from typing import TypeAlias
 
 import numpy as np
+import pinocchio as pin
 from scipy.interpolate import CubicSpline
 
-from fflin.base.errors import InputError
+from fflin.base.errors import InputError, UnknownNameError
 from fflin.base.names import input_keys
 from fflin.base.validation import Array, ArrayLike, Mask, function, numbers, vector
 from fflin.control.optimal.floating_base import FloatingBase
-from fflin.control.optimal.joint_loops import MOST_CIRCLES, STEPS, Loops
+from fflin.control.optimal.joint_loops import (
+    MOST_CIRCLES,
+    STEPS,
+    Loops,
+    rotation_axes,
+)
 from fflin.control.optimal.shooting import Point, Shooting
 from fflin.dynamics.state import Actuation
 from fflin.linear.trajectory import Trajectory, cubic
@@ -29,6 +35,12 @@ _LEAST_STEPS, _STEPS_PER_INTERVAL = 400, 4
 
 # Least number of intervals between knots for one circle of a loop.
 _INTERVALS_PER_CIRCLE = 8
+
+# Number of postures at which the axes of rotation are computed, within 1 rad or 1 m of the start.
+_POSTURES = 20
+
+# A larger angular momentum, relative to the inertia [kg m^2] of the joints, rotates the base.
+_AT_REST = 1e-9  # [rad/s]
 
 # A smaller error of the attitude [rad] at the end needs no loops of the joints.
 _REACHED = 1e-6
@@ -51,6 +63,11 @@ def initial_guess(
     if isinstance(guess, Trajectory):
         return _of_trajectory(shooting, guess, start)
     if guess is not None:
+        if isinstance(guess, Mapping):
+            raise InputError(
+                "guess is a mapping, expected a function guess(t) that returns the mapping {joint: "
+                "position} at the time t, or a fflin.Trajectory"
+            )
         if not callable(guess):
             raise InputError(
                 f"guess has type {type(guess).__name__}, expected a fflin.Trajectory, or a "
@@ -58,6 +75,7 @@ def initial_guess(
             )
         return _of_joints(shooting, guess, start, end)
     if _needs_loops(shooting, asked):
+        _require_attainable(shooting, start, end, asked)
         return _with_loops(shooting, start, end, asked, bounds, weights)
     return shooting.guess(start, end)
 
@@ -100,7 +118,13 @@ def _of_joints(
         value = guess(t)
         if isinstance(value, Mapping):
             positions = numbers(label, value, "joint", f"{label} of joint")
-            by_name = by_joint(positions, robot.joint_names, robot.joint)
+            try:
+                by_name = by_joint(positions, robot.joint_names, robot.joint)
+            except UnknownNameError as error:
+                raise UnknownNameError(
+                    f"{label}: {error}; a guess is a mapping {{joint: position}} or all "
+                    "joint positions, returned by a function of the time t"
+                ) from None
             for name, position in by_name.items():
                 row[robot.joint_names.index(name)] = position
         else:
@@ -125,6 +149,49 @@ def _needs_loops(shooting: Shooting, asked: Mask) -> bool:
         and len(state.robot.inputs) > 1
         and bool(asked[state.groups.q_b].any())
     )
+
+
+def _require_attainable(
+    shooting: Shooting, start: Point, end: Point, asked: Mask
+) -> None:
+    """Raise `InputError` if joint torques cannot rotate the base to a prescribed attitude.
+
+    If the joints rotate the base about a single axis, whatever their positions are, no loop rotates
+    it about another axis. About two or three axes, loops rotate the base to every attitude.
+    """
+    state = shooting.state
+    base = FloatingBase(state, start)
+    size = float(np.linalg.norm(base.inertia(state.joint_positions(start[0]))))
+    if np.abs(base.angular_momentum).max() > _AT_REST * size:
+        return
+    if not asked[state.groups.q_b].all():
+        return
+    joints = state.joint_positions(start[0])
+    random = np.random.default_rng(0).uniform(-1.0, 1.0, (_POSTURES, len(joints)))
+    axes = rotation_axes(base, joints + random)
+    if len(axes) > 1:
+        return
+    rotation = pin.log3(base.start_rotation.T @ state.rotation(end[0]))
+    left = rotation - axes.T @ (axes @ rotation)
+    if np.linalg.norm(left) <= _REACHED:
+        return
+    possible = "do not rotate it"
+    if len(axes):
+        possible = f"rotate it only about the axis {_shown(axes[0])}"
+    raise InputError(
+        f"the attitude of the goal is unreachable: the goal rotates the base about "
+        f"{_shown(rotation)}, in base axes, but joint torques {possible}, in any loop of the "
+        "joints; leave q_b free with `free` (--free-end), or add inputs that act on the base"
+    )
+
+
+def _shown(vector: Array) -> str:
+    """Return the direction of a vector (3,) as text, with a positive largest component."""
+    direction = vector / np.linalg.norm(vector)
+    if direction[np.abs(direction).argmax()] < 0.0:
+        direction = -direction
+    rounded = np.round(direction, 3) + 0.0
+    return f"({', '.join(f'{x:g}' for x in rounded)})"
 
 
 def _with_loops(

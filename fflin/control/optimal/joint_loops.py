@@ -33,6 +33,10 @@ from fflin.control.optimal.floating_base import FloatingBase
 # Step of the joint positions [rad, m] in the central differences of the curvature.
 _STEP = 1e-4
 
+# A direction counts as spanned by vectors if its singular value is above _SPANNED times the largest
+# one. A largest value below _LEAST_COUPLING means that the joints do not rotate the base.
+_SPANNED, _LEAST_COUPLING = 1e-9, 1e-6
+
 # The joints make up to MOST_CIRCLES circles, each of which is integrated in STEPS steps.
 MOST_CIRCLES, STEPS = 8, 48
 
@@ -65,27 +69,40 @@ def curvature(base: FloatingBase, joints: Array) -> Array:
     W = base.terms(np.vstack((joints, joints + steps, joints - steps))).coupling
     # [i, :, j]: derivative of W_j by i
     derivatives = (W[1 : n + 1] - W[n + 1 :]) / (2.0 * _STEP)
-    slope = derivatives.transpose(0, 2, 1)
+    jacobian = derivatives.transpose(0, 2, 1)
     columns = W[0].T
-    F: Array = (
-        slope - slope.transpose(1, 0, 2) + np.cross(columns[:, None], columns[None])
-    )
+    bracket = np.cross(columns[:, None], columns[None])
+    F: Array = jacobian - jacobian.transpose(1, 0, 2) + bracket
     return F
 
 
-def best_plane(F: Array, turn: Array, scale: Array) -> tuple[Array, Array, float]:
+def best_plane(F: Array, rotation: Array, scale: Array) -> tuple[Array, Array, float]:
     """Return the two directions (n,) of the joints whose loops rotate the base the most.
 
-    The rotation about `turn` (3,) is compared for loops of equal area, if each joint is measured in
-    units of `scale` (n,). The directions a and b are orthonormal in these units. The third result
-    is the angle [rad] by which a loop of unit area, oriented from a to b, rotates about `turn`.
+    The rotation about the vector `rotation` (3,) is compared for loops of equal area, if each joint
+    is measured in units of `scale` (n,). The directions a and b are orthonormal in these units. The
+    third result is the angle [rad] by which a loop of unit area, oriented from a to b, rotates
+    about it.
     """
-    about = F @ (turn / np.linalg.norm(turn))
+    about = F @ (rotation / np.linalg.norm(rotation))
     values, vectors = np.linalg.eigh(1j * scale[:, None] * about * scale)
     vector = vectors[:, -1]
     # With the largest eigenvalue s and its eigenvector x + i y: F x = s y, and F y = -s x.
     a, b = np.sqrt(2.0) * vector.imag, np.sqrt(2.0) * vector.real
     return a, b, float(values[-1])
+
+
+def rotation_axes(base: FloatingBase, postures: Array) -> Array:
+    """Return an orthonormal basis (k, 3) of the angular velocities that joint rates can produce.
+
+    The angular velocities are in base axes, and are collected over the joint positions `postures`
+    (N, n). The angular momentum is zero.
+    """
+    W = base.terms(postures).coupling
+    columns = W.transpose(0, 2, 1).reshape(-1, 3)
+    _, sizes, axes = np.linalg.svd(columns, full_matrices=False)
+    spanned: Array = axes[sizes > _SPANNED * max(float(sizes[0]), _LEAST_COUPLING)]
+    return spanned
 
 
 @dataclass(frozen=True)
@@ -181,13 +198,13 @@ class Loops:
         `postures` (P, m) are displacements from the middle of the path, in units of `scale`. The
         areas of the ellipses follow from the curvature at the postures.
         """
-        turn = self.error(self.path)
-        angle = float(np.linalg.norm(turn))
+        rotation = self.error(self.path)
+        angle = float(np.linalg.norm(rotation))
         for posture in postures:
             joints = self.middle
             joints[self.moved] += posture * self.scale
             F = curvature(self.base, joints)[np.ix_(self.moved, self.moved)]
-            a, b, most = best_plane(F, turn, self.scale)
+            a, b, most = best_plane(F, rotation, self.scale)
             radius = min(np.sqrt(angle / (np.pi * circles * max(most, 1e-12))), 1.0)
             # The path is on the ellipse. Select the point of the ellipse that is farthest away from
             # the posture, or try several points if the posture is the path itself.

@@ -1,0 +1,62 @@
+"""First line of the reports of gains and filters: how fast the poles decay."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import fflin
+from fflin.control.gain import neutral_poles, summary_of_poles
+
+
+def wheels_in_orbit(altitude):
+    """Return the gain of a robot whose wheels only the weak gravity gradient unloads."""
+    wheels = [fflin.ReactionWheel(axis, inertia=1e-5) for axis in np.eye(3)]
+    orbit = fflin.CircularOrbit(altitude=altitude)
+    robot = fflin.load("cubesat", inputs=wheels, orbit=orbit)
+    return fflin.lqr(fflin.linearize(robot))
+
+
+def test_a_marginal_pole_is_called_neutral_and_not_a_decay():
+    gain = wheels_in_orbit(36e6)
+    decays = np.sort(-gain.poles.real)
+    ratio = decays[1] / (1e-7 * np.abs(gain.poles).max())
+    assert ratio < 1.0
+    first = " ".join(str(gain).split("\n\n")[0].split())
+    assert first.startswith(
+        f"8 poles, 2 of them neutral (decay {decays[1]:.2g} 1/s, only {ratio:.1g} times the "
+        "smallest decay that exceeds rounding errors), slowest decay of the others "
+        f"{decays[2]:.3g} 1/s, smallest damping ratio 0.71"
+    )
+
+
+def test_a_slow_but_certain_decay_is_stated_as_it_is():
+    gain = wheels_in_orbit(550e3)
+    decay = -gain.poles.real.max()
+    assert str(gain).startswith(f"8 poles, slowest decay {decay:.3g} 1/s")
+
+
+@pytest.mark.parametrize("dt", [0.0, 0.1])
+def test_a_split_double_pole_at_zero_is_neutral(dt):
+    # Rounding moves a double pole at zero by the square root of the rounding error, 1.5e-8.
+    rates = np.array([-1.55e-8, 1.55e-8, -1.0 + 1.0j, -1.0 - 1.0j])
+    assert neutral_poles(rates, dt).tolist() == [True, True, False, False]
+    poles = np.exp(rates * dt) if dt else rates
+    text = summary_of_poles(SimpleNamespace(poles=poles, dt=dt))
+    assert text.startswith("4 poles, 2 of them neutral")
+    assert "slowest decay of the others 1 1/s" in text
+
+
+def test_poles_that_are_all_neutral_have_no_decay():
+    design = SimpleNamespace(poles=np.array([1j, -1j]), dt=0.0)
+    assert summary_of_poles(design).startswith(
+        "2 poles, 2 of them neutral (decay 0 1/s"
+    )
+    assert "slowest" not in summary_of_poles(design)
+
+
+def test_the_report_of_a_gain_names_its_inputs_with_units():
+    report = str(fflin.lqr(fflin.linearize(fflin.load("servicer_7dof"))))
+    assert "\nu: tau_b [N m], F_b [N], tau_m [N m]\n" in report
+    assert "\nx: q_b [1], r_b [m], q_m [rad], omega_b [rad/s], v_b [m/s], " in report
+    assert "too large to show" in report
