@@ -15,7 +15,7 @@ from fflin.base.errors import InputError, listed, require_known
 from fflin.base.names import group_of, input_keys, with_units
 from fflin.base.record import Design
 from fflin.base.tables import cut, folded, grid, matrix, signals
-from fflin.base.validation import Array, Poles, Vector
+from fflin.base.validation import Array, Mask, Poles, Values, Vector
 from fflin.control.optimal.largest_gain import largest_gain
 from fflin.control.optimal.riccati import Solution, rates_of
 from fflin.dynamics.coordinates import frame_of
