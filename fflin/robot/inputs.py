@@ -72,10 +72,7 @@ class Input:
     @property
     def frames(self) -> tuple[str, ...]:
         """Names of the model's frames on which this input is mounted."""
-        frame: str | None = getattr(self, "frame", None)
-        if frame is None:
-            return ()
-        return (frame,)
+        return ()
 
 
 class BaseTorque(Input):
@@ -211,6 +208,11 @@ class Thruster(Input):
         self._set("torque", number("thruster torque", self.torque))
 
     @property
+    def frames(self) -> tuple[str, ...]:
+        """Name of the frame on which the thruster is mounted."""
+        return (self.frame,)
+
+    @property
     def wrench(self) -> Array:
         """Force [N] and torque [N m] (6,) of a unit input, at the frame's origin in frame axes."""
         force = np.array(self.direction)
@@ -296,6 +298,13 @@ class ReactionWheel(Input):
             self._set(
                 "inertia", positive("wheel inertia", self.inertia, "kg m^2", hint)
             )
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """Name of the frame on which the wheel is mounted; () for the root frame of the base."""
+        if self.frame is None:
+            return ()
+        return (self.frame,)
 
     @property
     def wrench(self) -> Array:
