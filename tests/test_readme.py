@@ -101,6 +101,6 @@ def test_every_bundled_robot_is_named():
 
     for name in fflin.list_robots():
         if find_robot(name).origin == "fflin":
-            assert f"`{name}`" in (ROOT / "robots" / "README.md").read_text(
+            assert f"`{name}`" in (ROOT / "fflin" / "robots" / "README.md").read_text(
                 encoding="utf-8"
             )

@@ -13,7 +13,7 @@ from fflin.base.errors import FflinError
 from fflin.robot.urdf.reader import Urdf, describe
 from tests.support.reader_corpus import CASES, REFUSE
 
-ROBOTS = Path(__file__).parents[2] / "robots"
+ROBOTS = Path(__file__).parents[2] / "fflin" / "robots"
 
 TOKENS = [
     *(

@@ -16,7 +16,7 @@ from fflin.robot.urdf.reader import describe
 from tests.support.patience import finished
 from tests.support.robots import mostly
 
-BUNDLED = Path(__file__).parents[3] / "robots"
+BUNDLED = Path(__file__).parents[3] / "fflin" / "robots"
 EXAMPLES = Path(getModelPath("talos_data/robots/talos_reduced.urdf")).resolve()
 FILES = sorted(EXAMPLES.glob("**/*.urdf"))
 

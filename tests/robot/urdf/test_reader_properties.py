@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 import fflin
 
-ROBOTS = Path(__file__).parents[3] / "robots"
+ROBOTS = Path(__file__).parents[3] / "fflin" / "robots"
 
 VALUES = (
     *(
