@@ -33,7 +33,6 @@ from fflin.dynamics.state import StateMap
 from fflin.kernel.forward import ActuatorFaults, apply_faults
 from fflin.kernel.loop import StopConditions, goes_on
 from fflin.robot.joints import ROOT
-from fflin.robot.mass_properties import require_inertia
 
 if TYPE_CHECKING:
     from fflin.simulation.plan import Plan
@@ -79,7 +78,7 @@ class Plant(Aba):
         faults: ActuatorFaults | None = None,
     ) -> None:
         self.robot = robot = state.robot
-        require_inertia(robot)
+        robot.require_inertia()
         super().__init__(state)
         self.disturbance = disturbance
         # whether a warning of the order of a disturbance was given
