@@ -31,7 +31,7 @@ from fflin.robot.mass_properties import properties, varied
 from fflin.robot.robot import Robot
 from fflin.simulation.lanes import noise_generator
 from fflin.simulation.plan import Times
-from fflin.simulation.run import Plant
+from fflin.simulation.plant import Plant
 
 # number of runs whose values are drawn together; does not depend on the chunks
 _BLOCK = 1024

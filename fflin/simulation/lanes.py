@@ -34,9 +34,9 @@ from fflin.robot.fields import input_limits, limits_of
 from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.robot import Robot
 from fflin.simulation.plan import Plan, Times
+from fflin.simulation.plant import Plant
 from fflin.simulation.run import (
     STOPS,
-    Plant,
     Recording,
     ending_of,
     go,

@@ -29,7 +29,7 @@ from fflin.dynamics.integrators import CommutatorFree4, Integrator, integrated_h
 from fflin.linear.linearization import Linearizer
 from fflin.linear.model import LinearModel
 from fflin.robot.outputs import FullState
-from fflin.simulation.run import ROUNDED_DOWN, ROUNDED_UP, Plant
+from fflin.simulation.plant import ROUNDED_DOWN, ROUNDED_UP, Plant
 
 # Names in messages: the robot with constant inputs, a loop that is constant during the run, and a
 # rotation, which acts like an undamped oscillation.

@@ -46,7 +46,7 @@ from fflin.linear.model import LinearModel
 from fflin.robot.fields import chosen_limits
 from fflin.robot.robot import Robot
 from fflin.simulation.pace import Pace, Signal, limits_of_step
-from fflin.simulation.run import LARGEST_TURN, Disturbance, Plant
+from fflin.simulation.plant import LARGEST_TURN, Disturbance, Plant
 
 Event: TypeAlias = Callable[[float, Array, Array], float]
 Callback: TypeAlias = Callable[[float, Array, Array, Array], None]

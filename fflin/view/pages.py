@@ -25,9 +25,9 @@ from fflin.linear.model import LinearModel
 from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.robot import Robot
 from fflin.simulation.motion import Motion
+from fflin.simulation.plant import Plant
 from fflin.simulation.plots import JOINTS, WHEELS, charts, resting_from
 from fflin.simulation.report import STATES, Curve
-from fflin.simulation.run import Plant
 from fflin.view.page import Drawing, Page, body_poses, packed, subtitle
 from fflin.view.shapes import carriers_of
 
