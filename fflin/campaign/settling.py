@@ -19,7 +19,7 @@ from fflin.batch.run import Execution, Progress
 from fflin.campaign.runs import EDGE, CampaignJob, completed
 from fflin.control.gain import gain_matrix, regulated_states
 from fflin.control.policies import StateFeedback
-from fflin.dynamics.integrators import CommutatorFree4, held_exponential
+from fflin.dynamics.integrators import DEFAULT_INTEGRATOR, held_exponential
 from fflin.dynamics.state import StateMap, selection
 from fflin.linear.fit import require_fit
 from fflin.linear.linearization import linearize
@@ -187,7 +187,7 @@ class Loop:
             for matrix in matrices
         ]
         step = _STEP_PREDICTED if predicts else _STEP
-        dt, _ = Pace(poles, CommutatorFree4, horizon).step(step / pace)
+        dt, _ = Pace(poles, DEFAULT_INTEGRATOR, horizon).step(step / pace)
         every = 1
         if lin.dt:
             every = math.ceil(lin.dt / dt)

@@ -20,7 +20,7 @@ from fflin.base.validation import ArrayLike, as_double, frozen, instance, number
 from fflin.base.writing import as_path
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.coordinates import frame_of, refuse_orbit
-from fflin.dynamics.integrators import CommutatorFree4, integrate_rows
+from fflin.dynamics.integrators import DEFAULT_INTEGRATOR, integrate_rows
 from fflin.dynamics.points import require_slow
 from fflin.dynamics.state import Actuation, StateMap
 from fflin.linear.optimality import Optimality
@@ -494,10 +494,10 @@ class Trajectory(Design):
         return np.where(np.isfinite(errors), errors, np.inf)
 
     def end(self, k: int, steps: int, q: Array, v: Array) -> tuple[Array, Array]:
-        """Integrate by CF4 (11.1) over an interval from a state at its first knot; return q, v."""
+        """Integrate by (11.1) over an interval from a state at its first knot; return q, v."""
         start = self.t[k]
         h = self.t[k + 1] - self.t[k]
-        method = CommutatorFree4(self.robot.model, h / steps)
+        method = DEFAULT_INTEGRATOR(self.robot.model, h / steps)
 
         def rate(t: float, q: Array, v: Array) -> Array:
             u = self._in_base_axes(q, self._input(k, (t - start) / h))

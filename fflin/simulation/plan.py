@@ -41,6 +41,7 @@ from fflin.control.tracking import prepared
 from fflin.dynamics import points
 from fflin.dynamics.coordinates import ORBITAL, Frame, refuse_orbit
 from fflin.dynamics.integrators import held_exponential, integrator
+from fflin.dynamics.methods import DEFAULT_METHOD
 from fflin.dynamics.state import StateMap, selection
 from fflin.linear.model import LinearModel
 from fflin.robot.fields import chosen_limits
@@ -81,7 +82,7 @@ class SimulationOptions:
     v0: ArrayLike | None = None
     duration: float | None = None
     dt: float | None = None
-    method: str = "cf4"
+    method: str = DEFAULT_METHOD
     project: bool = True
     sample: float | None = None
     delay: float = 0.0

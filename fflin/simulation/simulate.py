@@ -20,6 +20,7 @@ from fflin.control.policy import BoundLaw, Command, Policy, Predictor
 from fflin.control.tvlqr import GainSchedule
 from fflin.dynamics.coordinates import Frame
 from fflin.dynamics.integrators import held_exponential
+from fflin.dynamics.methods import DEFAULT_METHOD
 from fflin.dynamics.state_rows import state_history
 from fflin.kernel.compiled import is_kept
 from fflin.linear.model import LinearModel
@@ -64,7 +65,7 @@ def simulate(
     v0: ArrayLike | None = None,
     duration: float | None = None,
     dt: float | None = None,
-    method: str = "cf4",
+    method: str = DEFAULT_METHOD,
     project: bool = True,
     sample: float | None = None,
     delay: float = 0.0,
