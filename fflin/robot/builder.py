@@ -22,6 +22,7 @@ from fflin.base.errors import InputError, require_known
 from fflin.base.names import stands_for_any
 from fflin.robot.equipment.appendages import Appendage, FlexibleAppendage, rigid_inertia
 from fflin.robot.equipment.assembly import (
+    Mounted,
     compare_inertia,
     mounted_modes,
     mounted_wheels,
@@ -42,7 +43,6 @@ _BY_NAME = (
     *("point", "target", "start"),
 )
 _GROUPS = ("q_m", "qdot_m", "tau_m", "wheel")
-
 
 # Fields that are tables {joint: value}. If a new table is given, the entries of modes stay.
 _TABLES_OF_JOINTS = ("stiffness", "damping")
@@ -130,62 +130,81 @@ def equipped(
     the robot keeps the old value. Each mode becomes a joint, and so does each wheel with an
     inertia. If a joint no longer exists, its entries are removed from fields such as `stiffness`.
     """
-    before = robot._bare
+    known = robot._bare.joint_names
     bare = bare or robot._bare
-    inputs = robot.inputs if inputs is None else inputs
-    checked = checked_inputs(inputs, bare, robot.passive)
-    model, joints, followers = bare.model, bare.joints, bare.followers
-    bodies = [pin.Inertia(body) for body in model.inertias.tolist()]
-    parts = mounted_wheels(model, bodies, checked)
+    checked = checked_inputs(
+        robot.inputs if inputs is None else inputs, bare, robot.passive
+    )
     items = robot.appendages if appendages is None else tuple(appendages)
-    parts += mounted_modes(model, bodies, items)
+    bodies = [pin.Inertia(body) for body in bare.model.inertias.tolist()]
+    parts = mounted_wheels(bare.model, bodies, checked)
+    parts += mounted_modes(bare.model, bodies, items)
+    model, joints, followers = bare.model, bare.joints, bare.followers
     if parts:
-        taken = {*model.names, *(frame.name for frame in model.frames.tolist())}
-        for part in parts:
-            if part.joint.name in taken:
-                raise InputError(
-                    f"'{part.joint.name}' has the name of another joint, frame, wheel or mode of "
-                    "the robot; give the wheel or the appendage another name"
-                )
-            taken.add(part.joint.name)
-        model = with_mounted(model, bodies, parts)
-        placed = [
-            joint.within(model) for joint in (*joints, *(part.joint for part in parts))
-        ]
+        _require_new_names(bare.model, parts)
+        model = with_mounted(bare.model, bodies, parts)
+        placed = [joint.within(model) for joint in joints]
+        placed += [part.joint.within(model) for part in parts]
         joints = tuple(sorted(placed, key=lambda joint: joint.idx_v))
         followers = tuple(follower.within(model) for follower in followers)
     names = [joint.name for joint in joints]
     gone = [name for name in robot.joint_names if name not in names]
-    fields = {x: _without(getattr(robot, x), gone, names) for x in _BY_NAME if gone}
-    modes = {joint.name for joint in robot.modes}
+    tables = {}
+    if gone:
+        tables = {key: _without(getattr(robot, key), gone, names) for key in _BY_NAME}
     # Reset the springs of the modes only if appendages are given. Otherwise keep them, because the
     # user may have changed them.
-    reset = () if appendages is None else ("stiffness", "damping")
-    for name in reset:
-        of_joints = fields.get(name, getattr(robot, name))
-        fields[name] = {k: x for k, x in of_joints.items() if k not in modes}
-        for item in items:
-            fields[name] |= item.springs[name]
+    if appendages is not None:
+        for key in _TABLES_OF_JOINTS:
+            springs = tables.get(key, getattr(robot, key))
+            tables[key] = _with_modes(springs, robot, items, key)
     # Remember only the names of removed wheels and modes. All other removed joints were locked.
-    removed = (
-        name for name in (*robot._removed, *gone) if name not in before.joint_names
-    )
+    removed = dict.fromkeys((*robot._removed, *gone))
     changed: dict[str, Any] = {
-        **fields,
+        **tables,
         "model": model,
         "joints": joints,
         "followers": followers,
         "inputs": checked,
+        "appendages": items,
+        "links": bare.links,
+        "urdf_sha256": bare.urdf_sha256,
     }
     return replace(
         robot,
         **changed,
-        links=bare.links,
-        urdf_sha256=bare.urdf_sha256,
-        appendages=items,
         _unequipped=bare if parts else None,
-        _removed=tuple(name for name in dict.fromkeys(removed) if name not in names),
+        _removed=tuple(x for x in removed if x not in known and x not in names),
     )
+
+
+def _require_new_names(model: pin.Model, parts: Sequence[Mounted]) -> None:
+    """Raise `InputError` if a wheel or mode has the name of something else in the model."""
+    taken = {*model.names, *(frame.name for frame in model.frames.tolist())}
+    for part in parts:
+        if part.joint.name in taken:
+            raise InputError(
+                f"'{part.joint.name}' has the name of another joint, frame, wheel or mode of "
+                "the robot; give the wheel or the appendage another name"
+            )
+        taken.add(part.joint.name)
+
+
+def _with_modes(
+    springs: Mapping[str, Any],
+    robot: RobotData,
+    appendages: Sequence[Appendage],
+    key: str,
+) -> dict[str, Any]:
+    """Return stiffness or damping {joint: value} with the modes of new appendages.
+
+    `springs` has the values of the robot, and `key` is "stiffness" or "damping".
+    """
+    modes = {joint.name for joint in robot.modes}
+    values = {name: value for name, value in springs.items() if name not in modes}
+    for item in appendages:
+        values |= item.springs[key]
+    return values
 
 
 def _without(

@@ -71,3 +71,13 @@ def test_sweeps_simulations_and_campaigns_state_the_same_reason(monkeypatch):
         fflin.monte_carlo(
             IN_ORBIT, None, {"q_b": 0.02}, runs=2, duration=1.0, **options
         )
+
+
+def test_a_campaign_states_why_its_runs_were_simulated_in_python(monkeypatch):
+    monkeypatch.setattr(limits, "numba_is_there", lambda: True)
+    runs = fflin.monte_carlo(IN_ORBIT, None, {"q_b": 0.02}, runs=2, duration=0.1)
+    (note,) = runs.notes
+    assert note.startswith("simulated in Python, because 'cubesat' is in orbit")
+    assert note in " ".join(str(runs).split())
+    options = {"runs": 2, "duration": 0.1, "engine": "python"}
+    assert fflin.monte_carlo(IN_ORBIT, None, {"q_b": 0.02}, **options).notes == ()
