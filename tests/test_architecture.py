@@ -11,10 +11,10 @@ DOCS = Path(__file__).parents[1] / "docs"
 
 
 def test_the_picture_is_made_from_the_code_and_no_import_runs_up():
-    rooms = runpy.run_path(str(DOCS / "rooms.py"))
+    rooms = runpy.run_path(str(DOCS / "scripts" / "rooms.py"))
     picture = rooms["drawing"]()
     assert (DOCS / "rooms.svg").read_text(encoding="utf-8") == picture, (
-        "run python docs/rooms.py"
+        "run python docs/scripts/rooms.py"
     )
     assert 'class="up"' not in picture
     assert len(rooms["rooms"]()) == 14
@@ -23,7 +23,7 @@ def test_the_picture_is_made_from_the_code_and_no_import_runs_up():
 def test_the_page_names_modules_and_files_that_exist():
     page = (DOCS / "architecture.md").read_text(encoding="utf-8")
     package = Path(fflin.__file__).parent
-    rooms = "|".join(runpy.run_path(str(DOCS / "rooms.py"))["rooms"]())
+    rooms = "|".join(runpy.run_path(str(DOCS / "scripts" / "rooms.py"))["rooms"]())
     modules = set(re.findall(rf"`((?:{rooms})(?:\.\w+)+)`", page))
     assert len(modules) > 80
     assert not [

@@ -25,7 +25,8 @@ from fflin.batch.linear_batch import AT_ROOT, TEXTS, LinearBatch
 from fflin.batch.run import Execution, Progress, Rows, run_chunks
 from fflin.dynamics.coordinates import SMALLEST_Q0, Chart, Standing
 from fflin.dynamics.rnea import AccelerationDerivatives
-from fflin.kernel.compiled import compiles, numba_is_there, without_numba
+from fflin.kernel.compiled import compiles
+from fflin.kernel.limits import Task, reason_against
 from fflin.kernel.tree import LANES, batch_tree
 from fflin.linear.linearization import LARGEST, Linearizer, Prepared
 from fflin.linear.state_equations import assemble, drift
@@ -183,18 +184,9 @@ def sweep(
 
 def kernel_of(prepared: Prepared, engine: str | None) -> RowAccelerations | None:
     """Return the compiled kernel for accelerations and derivatives, or None if Python is used."""
-    robot = prepared.robot
+    task = Task(robots=(prepared.robot,), outputs=prepared.sensing is not None)
     tree = batch_tree(prepared.robot)
-    reason = ""
-    if prepared.sensing is not None:
-        reason = "the outputs are not the state"
-    elif not numba_is_there():
-        reason = without_numba()
-    elif robot.orbit:
-        reason = f"'{robot.name}' is in orbit"
-    elif tree is None:
-        reason = f"a joint of '{robot.name}' has an unsupported type"
-    if not compiles(engine, lambda: reason) or tree is None:
+    if not compiles(engine, lambda: reason_against(task)) or tree is None:
         return None
     from fflin.kernel.derivatives import RowAccelerations
 

@@ -153,8 +153,8 @@ class Campaign(FrozenArrays):
     goals : tuple of str
         Conditions whose success rates appear in the printed report and in `plot_campaign`.
     notes : tuple of str
-        Remarks on the time step of the runs, see `Motion.notes`, and on runs that were read from a
-        file.
+        Remarks on the time step of the runs, see `Motion.notes`, on runs that were read from a
+        file, and why the runs were simulated in Python although no engine was given.
     wheels, modes : tuple of str
         Joints that were simulated as wheels, and modes of flexible appendages and slosh.
     x_end : tuple of float

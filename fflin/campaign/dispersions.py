@@ -28,11 +28,11 @@ from fflin.robot.equipment.assembly import first_impossible, turned_to
 from fflin.robot.fields import warn_of_degrees
 from fflin.robot.inputs import JointTorque, ReactionWheel, Thruster
 from fflin.robot.joints import ROOT, find_frame
-from fflin.robot.mass_properties import bodies_named, properties, varied
+from fflin.robot.mass_properties import properties, varied
 from fflin.robot.robot import Robot
 from fflin.simulation.lanes import noise_generator
 from fflin.simulation.plan import Times
-from fflin.simulation.run import Plant
+from fflin.simulation.plant import Plant
 
 # number of runs whose values are drawn together; does not depend on the chunks
 _BLOCK = 1024
@@ -223,7 +223,7 @@ class Dispersions:
         whole = set[int]()
         # names come last to override patterns
         for key in sorted(spreads, key=alone.__contains__):
-            for name in bodies_named(robot, f"{kind} to disperse", key):
+            for name in robot.bodies_named(f"{kind} to disperse", key):
                 if name in named:
                     raise InputError(
                         f"'{named[name]}' and '{key}' are the same link; give its {kind} only once"
@@ -304,7 +304,9 @@ class Dispersions:
                 self.starts(drawn)
                 # A drawn mass or inertia can be too small for the flexible modes of its body.
                 if self._plant.robot.appendages:
-                    refused = first_impossible(self._plant.robot, self.bodies(drawn))
+                    refused = first_impossible(
+                        self._model, self._plant.robot.appendages, self.bodies(drawn)
+                    )
                     if refused is not None:
                         problem = (
                             f"run {start + refused} draws an invalid mass or inertia"

@@ -30,9 +30,9 @@ from fflin.campaign.runs import (
 )
 from fflin.control.tracking import TrajectoryFeedback, prepared
 from fflin.control.tvlqr import GainSchedule
-from fflin.dynamics.coordinates import moved_by, moving_error
 from fflin.dynamics.points import point_of, start_of
 from fflin.dynamics.state import StateMap
+from fflin.dynamics.state_rows import moved_by, moving_error
 from fflin.linear.trajectory import Trajectory
 from fflin.robot.robot import Robot
 

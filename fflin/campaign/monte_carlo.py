@@ -25,6 +25,7 @@ from fflin.campaign.runs import KINDS, CampaignJob, chunk_size, expect
 from fflin.campaign.spreads import placed
 from fflin.kernel.tree import LANES
 from fflin.robot.robot import Robot
+from fflin.simulation.lanes import not_compilable
 from fflin.simulation.plan import SimulationOptions
 from fflin.simulation.report import pushed
 
@@ -165,7 +166,7 @@ def monte_carlo(
         such a file is not replaced, and a `FileError` is raised.
     engine : {"python", "compiled"}, optional
         Engine that simulates the runs. The default is the compiled engine if it supports these
-        runs, see `simulate`.
+        runs, see `simulate`. Otherwise, `Campaign.notes` states the reason.
     **options
         Options of `simulate`: x0, q0, v0, dt, method, project, sample, delay, limits, disturbance,
         target, frame, reference.
@@ -258,6 +259,9 @@ def monte_carlo(
             enough = partial(_is_narrow, header, until, width, confidence)
         resumed = _computed(job, store, how, header, enough)
         campaign = Campaign.of(store.complete(), header, job)
+    if engine is None and job.engine == "python":
+        note = f"simulated in Python, because {not_compilable(job.plan)}"
+        campaign = replace(campaign, notes=(*campaign.notes, note))
     if resumed:
         note = f"{resumed:,} of {runs:,} runs are from the unfinished file of an earlier call"
         campaign = replace(campaign, notes=(*campaign.notes, note))

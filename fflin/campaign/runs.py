@@ -25,13 +25,9 @@ from fflin.batch.run import Execution, Progress, Rows, run_chunks
 from fflin.campaign.dispersions import Dispersions
 from fflin.campaign.spreads import placed
 from fflin.control.channel import Saturation
-from fflin.dynamics.coordinates import (
-    attitude_errors,
-    moving_errors,
-    states_of,
-    unwound,
-)
+from fflin.dynamics.coordinates import unwound
 from fflin.dynamics.state import StateMap
+from fflin.dynamics.state_rows import attitude_errors, moving_errors, states_of
 from fflin.kernel import loop
 from fflin.kernel.compiled import kernel
 from fflin.kernel.tree import LANES, laid_out
@@ -266,10 +262,11 @@ class CampaignJob:
         """
         state, target = self.plant.state, self.target
         first = target if target.ndim == 1 else target[0]
-        x = unwound(state, states_of(state, q, state.velocities(v)), first)
+        joints = 6 + state.unbounded
+        x = unwound(states_of(state, q, state.velocities(v)), joints, first)
         if target.ndim == 1:
             return x, x - target
-        return x, unwound(state, moving_errors(state.frame, x, target[: len(x)]))
+        return x, unwound(moving_errors(state.frame, x, target[: len(x)]), joints)
 
     def outcome(self, run: Recording) -> dict[str, Array]:
         """Return a run's outcome from its recorded steps: a row of each array of `Campaign`.

@@ -17,8 +17,9 @@ from fflin.base.rotation import quaternion_product
 from fflin.base.validation import Array, Mask, as_double, instance
 from fflin.batch.run import Execution, Progress
 from fflin.campaign.runs import EDGE, CampaignJob, completed
+from fflin.control.gain import gain_matrix, regulated_states
 from fflin.control.policies import StateFeedback
-from fflin.dynamics.integrators import CommutatorFree4, held_exponential
+from fflin.dynamics.integrators import DEFAULT_INTEGRATOR, held_exponential
 from fflin.dynamics.state import StateMap, selection
 from fflin.linear.fit import require_fit
 from fflin.linear.linearization import linearize
@@ -55,8 +56,8 @@ class Loop:
 
     def __init__(self, robot: Robot, lin: LinearModel, gain: object) -> None:
         instance("robot", robot, Robot, "a fflin.Robot")
-        K = StateFeedback(lin, as_double("gain", getattr(gain, "K", gain))).K
-        kept = getattr(gain, "regulated", ())
+        K = StateFeedback(lin, as_double("gain", gain_matrix(gain))).K
+        kept = regulated_states(gain)
         part = regulated_part(lin, any(f"qdot_m.{name}" in kept for name in lin.wheels))
         # omit states that are not fed back and cannot settle
         if part.state_names == kept:
@@ -186,7 +187,7 @@ class Loop:
             for matrix in matrices
         ]
         step = _STEP_PREDICTED if predicts else _STEP
-        dt, _ = Pace(poles, CommutatorFree4, horizon).step(step / pace)
+        dt, _ = Pace(poles, DEFAULT_INTEGRATOR, horizon).step(step / pace)
         every = 1
         if lin.dt:
             every = math.ceil(lin.dt / dt)

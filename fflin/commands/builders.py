@@ -208,7 +208,7 @@ def reference_of(arguments: Namespace) -> pin.SE3 | None:
     """Return the reference of --reference; None means the base pose at the operating point."""
     import pinocchio as pin
 
-    if getattr(arguments, "reference", None) == "world":
+    if "reference" in arguments and arguments.reference == "world":
         return pin.SE3.Identity()
     return None
 

@@ -1,8 +1,11 @@
 """Options of each command: their groups and their help texts."""
 
 from fflin.base.writing import RECORDS
+from fflin.dynamics.methods import DEFAULT_METHOD, METHODS
 
 _SAVED = ", ".join(RECORDS)
+_OTHER_METHODS = [name for name in METHODS if name != DEFAULT_METHOD]
+_METHODS = " or ".join((f"{DEFAULT_METHOD} (default)", *_OTHER_METHODS))
 
 # Titles of the groups of options in the help.
 POINT, ROBOT, OUTPUT = (
@@ -259,7 +262,7 @@ ABOUT: dict[str, str] = {
     "600 s",
     "dt": "integration step [s]; chosen automatically by default",
     "step": "former name of --dt",
-    "method": "integration method: cf4 (default) or semi_implicit_euler",
+    "method": f"integration method: {_METHODS}",
     "scene": "background: sky and planet (space), or a floor with a grid (lab). The default is lab "
     "under uniform gravity, otherwise space",
     "tool": "draw the axes and the path of this frame",

@@ -18,6 +18,7 @@ from fflin.base.errors import FflinWarning, one_line
 from fflin.base.writing import RECORDS
 from fflin.commands import BAD_INPUT, NO_ORBIT
 from fflin.commands.options import ABOUT, COMMON, DESCRIPTIONS, OPTIONS, OUTPUT
+from fflin.dynamics.methods import DEFAULT_METHOD
 
 
 def number(text: str) -> float:
@@ -276,7 +277,7 @@ FORMS: dict[str, Form] = {
     "only": one(str, "NAME"),
     "until": one(str, "CONDITION"),
     "tool": one(str, "FRAME"),
-    "method": one(str, "METHOD", "cf4"),
+    "method": one(str, "METHOD", DEFAULT_METHOD),
     "name": one(str, "NAME", "controller"),
     "output-folder": one(str, "FOLDER", required=True),
     "frame": {"choices": ("hybrid", "local", "world", "lvlh", "hill")},

@@ -13,7 +13,8 @@ from fflin.base.errors import FflinWarning, InputError, listed
 from fflin.base.validation import DOUBLE, Array, as_double
 from fflin.kernel import loop as rules
 from fflin.kernel.tree import empty
-from fflin.robot.fields import Range, input_limits
+from fflin.robot.fields import input_limits
+from fflin.robot.inputs import Range
 from fflin.robot.robot import Robot
 from fflin.robot.rotors import motor_of
 

@@ -18,6 +18,7 @@ from fflin.base.tables import cut, folded, grid, matrix, signals
 from fflin.base.validation import Array, Mask, Poles, Values, Vector
 from fflin.control.optimal.largest_gain import largest_gain
 from fflin.control.optimal.riccati import Solution, rates_of
+from fflin.control.policy import Policy
 from fflin.dynamics.coordinates import frame_of
 from fflin.dynamics.state import StateMap, selection
 from fflin.linear.fit import require_same
@@ -271,6 +272,22 @@ class Gain(ModelDesign):
             most = (2.0 + disk) / (2.0 - disk)
         phase = math.degrees(2.0 * math.atan(disk / 2.0))
         return Margins(disk, ((2.0 - disk) / (2.0 + disk), most), phase)
+
+
+def gain_matrix(gain: object) -> object:
+    """Return K of a `Gain` or of a policy with a constant gain, and an array unchanged."""
+    if isinstance(gain, Gain):
+        return gain.K
+    if isinstance(gain, Policy) and gain.feedback_gain is not None:
+        return gain.feedback_gain
+    return gain
+
+
+def regulated_states(gain: object) -> tuple[str, ...]:
+    """Return the names of the states that a `Gain` regulates, or () for all states."""
+    if isinstance(gain, Gain):
+        return gain.regulated
+    return ()
 
 
 def model_of(gain: Gain, robot: Robot, made: str, reference: pin.SE3) -> LinearModel:

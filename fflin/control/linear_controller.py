@@ -394,7 +394,7 @@ def _system_of(given: Any) -> System:
         return _checked(None, None, None, as_double("system", given))
     inputs = getattr(given, "input_names", getattr(given, "input_labels", ()))
     outputs = getattr(given, "output_names", getattr(given, "output_labels", ()))
-    dt = getattr(given, "dt", None)
+    dt = given.dt if hasattr(given, "dt") else None
     # Continuous systems of SciPy have dt = None and no signal names. In systems of other tools,
     # dt = None means that the sample time is not given.
     if dt is None and not inputs:

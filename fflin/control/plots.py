@@ -468,7 +468,8 @@ def _poles_of(given: object) -> tuple[Values, float]:
     if isinstance(given, LinearModel):
         return np.linalg.eigvals(given.A), given.dt
     if hasattr(given, "poles"):
-        return np.asarray(given.poles), float(getattr(given, "dt", 0.0))
+        dt = float(given.dt) if hasattr(given, "dt") else 0.0
+        return np.asarray(given.poles), dt
     refuse_masked("poles", given)
     flat = dimension("poles", given) == 1
     poles = np.asarray(given)

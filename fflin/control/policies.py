@@ -24,9 +24,10 @@ from fflin.control.policy import (
     bound,
 )
 from fflin.dynamics.aba import Aba
-from fflin.dynamics.coordinates import Frame, readout
+from fflin.dynamics.coordinates import Frame
 from fflin.dynamics.outputs import KINDS, Measuring, state_indices
 from fflin.dynamics.state import Actuation, StateMap, selection
+from fflin.dynamics.state_rows import readout
 from fflin.kernel.allocation import nearest
 from fflin.linear.fit import about_point, require_fit, require_turns
 from fflin.linear.holding import held_if_possible, wheel_notes

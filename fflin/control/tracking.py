@@ -32,9 +32,10 @@ from fflin.control.policy import (
 )
 from fflin.control.trajectory_end import SteadyEnd, resting_end, steady_regulator
 from fflin.control.tvlqr import FilterSchedule, GainSchedule
-from fflin.dynamics.coordinates import Frame, moved_by, moving_error
+from fflin.dynamics.coordinates import Frame
 from fflin.dynamics.outputs import Measuring
 from fflin.dynamics.state import StateMap
+from fflin.dynamics.state_rows import moved_by, moving_error
 from fflin.linear.fit import require_same, require_turns, signals_of
 from fflin.linear.model import LinearModel
 from fflin.linear.trajectory import Trajectory

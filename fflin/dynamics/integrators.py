@@ -11,6 +11,7 @@ import pinocchio as pin
 
 from fflin.base.errors import unknown
 from fflin.base.validation import Array, Values
+from fflin.dynamics.methods import CF4, DEFAULT_METHOD, SEMI_IMPLICIT_EULER
 
 Acceleration: TypeAlias = Callable[[float, Array, Array], Array]
 
@@ -79,6 +80,35 @@ class Integrator(ABC):
         is exp(Re z).
         """
 
+    @classmethod
+    def held(cls, A: Array, driven: Array, h: float) -> tuple[Array, Array] | None:
+        """Return the two matrices of `held_exponential` as a step computes them.
+
+        The result is None for a method for which they are not known. The time step is then not
+        checked against the poles of sampled loops.
+        """
+        return None
+
+    @classmethod
+    def vector_step(
+        cls, rate: Callable[[float, Array], Array], h: float, z: Array
+    ) -> Array:
+        """Return z one step later for dz/dt = rate, as a step computes the velocity.
+
+        `rate(node, z)` returns the derivative of z at the time `node` after the start of the step,
+        divided by h.
+        """
+        rates = list[Array]()
+        at = z
+        for k, node in enumerate(cls.nodes):
+            rates.append(rate(node, at))
+            change = np.zeros_like(z)
+            for weight, one in zip(cls.speeds[k][1:], rates, strict=False):
+                if weight:
+                    change += weight * one
+            at = z + h * change
+        return at
+
     def step(
         self, f: Acceleration, t: float, q: Array, v: Array
     ) -> tuple[Array, Array]:
@@ -134,6 +164,17 @@ class CommutatorFree4(Integrator):
             growth: Array = np.log(np.abs(R))
         return growth
 
+    @classmethod
+    def held(cls, A: Array, driven: Array, h: float) -> tuple[Array, Array]:
+        """Return the matrices of `held_exponential` as Taylor polynomials; see `Integrator.held`.
+
+        For a linear system, CF4 is the classical Runge-Kutta method.
+        """
+        one = np.eye(len(A))
+        Z = A * h
+        mean = one + Z / 2.0 @ (one + Z / 3.0 @ (one + Z / 4.0))
+        return one + Z @ mean, h * mean @ driven
+
 
 class SemiImplicitEuler(Integrator):
     """Semi-implicit Euler method of order 1: the new velocity displaces the configuration."""
@@ -160,9 +201,10 @@ class SemiImplicitEuler(Integrator):
 
 
 INTEGRATORS: dict[str, type[Integrator]] = {
-    "cf4": CommutatorFree4,
-    "semi_implicit_euler": SemiImplicitEuler,
+    CF4: CommutatorFree4,
+    SEMI_IMPLICIT_EULER: SemiImplicitEuler,
 }
+DEFAULT_INTEGRATOR = INTEGRATORS[DEFAULT_METHOD]
 
 
 def integrator(name: str) -> type[Integrator]:
@@ -170,18 +212,6 @@ def integrator(name: str) -> type[Integrator]:
     if str(name) not in INTEGRATORS:
         raise unknown("method", str(name), INTEGRATORS)
     return INTEGRATORS[str(name)]
-
-
-def integrated_hold(A: Array, driven: Array, h: float) -> tuple[Array, Array]:
-    """Return the two matrices of `held_exponential` as a step of `CommutatorFree4` computes them.
-
-    For a linear system, CF4 is the classical Runge-Kutta method: its matrices are Taylor
-    polynomials.
-    """
-    one = np.eye(len(A))
-    Z = A * h
-    mean = one + Z / 2.0 @ (one + Z / 3.0 @ (one + Z / 4.0))
-    return one + Z @ mean, h * mean @ driven
 
 
 # Commutator-free method of order four (10.3): its two Gauss points, and the weights alpha (HEAVY)

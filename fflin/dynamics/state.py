@@ -283,7 +283,7 @@ class StateMap:
         x = self.compose(self.unchecked_chart(q), self.positions(q), q_m, nu)
         if near is None:
             return x
-        return names.unwound(self, x, near)
+        return names.unwound(x, 6 + self.unbounded, near)
 
     def compose(self, chart: Chart, r_b: Array, q_m: Array, nu: Array) -> Array:
         """Assemble the state (.., nx) from parts; velocities nu (.., 6 + n) are in base axes."""

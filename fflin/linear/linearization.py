@@ -22,7 +22,6 @@ from fflin.linear.model import LinearModel
 from fflin.linear.state_equations import assemble, drift, output_equations
 from fflin.robot.fields import magnitudes_of
 from fflin.robot.joints import ROOT
-from fflin.robot.mass_properties import require_inertia
 from fflin.robot.outputs import FullState
 from fflin.robot.robot import Robot
 
@@ -79,7 +78,7 @@ class Prepared:
             )
         # In orbit, the default reference is the orbital frame instead of the base placement.
         self.own_reference = reference is None and robot.orbit is None
-        require_inertia(robot)
+        robot.require_inertia()
         self.actuation = Actuation(state)
         self.sensing: Sensing | None = None
         if robot.outputs != (FullState(),):

@@ -9,11 +9,11 @@ import pinocchio as pin
 
 from fflin.base.rotation import rotation_matrices, rotation_matrix
 from fflin.base.validation import Array, Mask
-from fflin.dynamics import coordinates
 from fflin.dynamics.aba import Aba
-from fflin.dynamics.coordinates import LINEAR, PIN_ANGULAR, PIN_LINEAR, Chart
+from fflin.dynamics.coordinates import LINEAR, PIN_ANGULAR, PIN_LINEAR, Chart, times
 from fflin.dynamics.integrators import integrate_rows
 from fflin.dynamics.state import StateMap
+from fflin.dynamics.state_rows import moving_errors, state_history
 from fflin.linear.model import LinearModel
 from fflin.linear.scales import DIFFERENCE_TOLERANCE, EPS, ULPS
 
@@ -74,7 +74,7 @@ class Nonlinear:
         at_linear, at_angular = self._v[:, PIN_LINEAR], self._v[:, PIN_ANGULAR]
         turning = chart.q0 * (angular - at_angular)
         turning += np.cross(chart.q_b, angular + at_angular)
-        position_rate = coordinates.times(chart.R, linear) - at_linear
+        position_rate = times(chart.R, linear) - at_linear
         position_rate -= np.cross(at_angular, point[:, state.groups.r_b])
         rate = state.velocities(a)
         if state.axes[1]:
@@ -105,15 +105,11 @@ class Nonlinear:
         t = h * np.repeat((1.0, 2.0, 3.0, -1.0, -2.0, -3.0), 7)[:, None]
         speeds = np.tile(v, (6, 1))
         moved = integrate_rows(robot.model, np.tile(q, (6, 1)), t * speeds)
-        after = coordinates.state_history(
-            state, moved, speeds + t * np.tile(a, (6, 1)), x[0]
-        )
+        after = state_history(state, moved, speeds + t * np.tile(a, (6, 1)), x[0])
         # The rates of a moving reference cancel in the errors, but not their rounding errors.
         rounding = ULPS * EPS * np.abs(after).reshape(6, *x.shape).max(axis=0) / h
         if lin.moving:  # the first row is also the motion of the reference
-            after = coordinates.moving_errors(
-                "local", after, np.repeat(after[::7], 7, axis=0)
-            )
+            after = moving_errors("local", after, np.repeat(after[::7], 7, axis=0))
         ahead, behind = after.reshape(2, 3, *x.shape)
         rates = np.tensordot(_WEIGHTS, ahead - behind, axes=1) / h
         size = np.maximum(1.0 + np.abs(v).max(axis=1), np.abs(expected).max(axis=1))

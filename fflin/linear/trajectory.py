@@ -20,7 +20,7 @@ from fflin.base.validation import ArrayLike, as_double, frozen, instance, number
 from fflin.base.writing import as_path
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.coordinates import frame_of, refuse_orbit
-from fflin.dynamics.integrators import CommutatorFree4, integrate_rows
+from fflin.dynamics.integrators import DEFAULT_INTEGRATOR, integrate_rows
 from fflin.dynamics.points import require_slow
 from fflin.dynamics.state import Actuation, StateMap
 from fflin.linear.optimality import Optimality
@@ -29,7 +29,6 @@ from fflin.robot.robot import Robot
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-    from fflin import Motion
     from fflin.base.validation import Array, Indices, Vector
 
 # Largest residual at which the knots are accepted as a motion of the robot.
@@ -504,10 +503,10 @@ class Trajectory(Design):
         return np.where(np.isfinite(errors), errors, np.inf)
 
     def end(self, k: int, steps: int, q: Array, v: Array) -> tuple[Array, Array]:
-        """Integrate by CF4 (11.1) over an interval from a state at its first knot; return q, v."""
+        """Integrate by (11.1) over an interval from a state at its first knot; return q, v."""
         start = self.t[k]
         h = self.t[k + 1] - self.t[k]
-        method = CommutatorFree4(self.robot.model, h / steps)
+        method = DEFAULT_INTEGRATOR(self.robot.model, h / steps)
 
         def rate(t: float, q: Array, v: Array) -> Array:
             u = self._in_base_axes(q, self._input(k, (t - start) / h))
@@ -585,36 +584,3 @@ def cubic(first: Array, last: Array, rate: Array, end_rate: Array) -> Array:
         (first, rate, 3 * apart - 2 * rate - end_rate, rate + end_rate - 2 * apart),
         axis=1,
     )
-
-
-def along(motion: Motion, robot: Robot | None) -> Trajectory:
-    """Convert a motion to a trajectory with constant or linear inputs between the knots.
-
-    If the inputs of the motion vary, two trajectories are computed: one with constant inputs
-    between the knots, and one with linear inputs. The result is the trajectory whose largest
-    residual is smaller.
-    """
-    if motion.phases:
-        raise InputError(
-            "the motion has several phases, each with its own robot; convert each phase separately"
-        )
-    if robot is None:
-        raise InputError(
-            "the motion was read from a file, which does not contain its robot; give the robot, "
-            "motion.trajectory(robot)"
-        )
-    instance("robot", robot, Robot, "a fflin.Robot; fflin.load makes one")
-    entries = {
-        name: getattr(motion, name) for name in ("t", "q", "v", "u", "placement")
-    }
-    from fflin.linear.files import arguments
-
-    values = arguments(entries, robot, "previous", motion.frame, motion.verified)
-    held = Trajectory(robot, **values)
-    if not (motion.u - motion.u[0]).any():
-        return held
-    before = motion.t[-4:-1] - motion.t[-1]
-    u = values["u"]
-    u[-1] = np.linalg.solve(np.vander(before).T, np.eye(len(before))[-1]) @ u[-4:-1]
-    smooth = Trajectory(robot, **values | {"hold": "linear", "u": u})
-    return min(held, smooth, key=lambda trajectory: float(trajectory.residual.max()))

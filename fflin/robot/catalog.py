@@ -21,11 +21,10 @@ class RobotFile(NamedTuple):
     package_dirs: tuple[Path, ...] = ()  # folders in which meshes are searched
 
 
-@cache
 def bundled_directory() -> Path:
-    """Return the folder of the bundled URDFs, in an installed package or in a source checkout."""
+    """Return the folder of the bundled robots, in an installed package or in a source checkout."""
     package = Path(__file__).resolve().parents[1]
-    installed = package / "bundled"
+    installed = package / "robots"
     if installed.is_dir():
         return installed
     return package.parent / "robots"

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -26,23 +27,27 @@ from fflin.base.validation import (
     number,
     numbers,
 )
-from fflin.robot.inputs import JointTorque, ReactionWheel, Thruster, three_numbers
+from fflin.robot.inputs import (
+    KINDS,
+    Input,
+    JointTorque,
+    Range,
+    ReactionWheel,
+    named_inputs,
+    three_numbers,
+)
 from fflin.robot.joints import Joint, by_joint
 from fflin.robot.orbit import checked_orbit
 from fflin.robot.outputs import Output, parse_output
+from fflin.robot.robot_data import RobotData
 
 if TYPE_CHECKING:
     import pinocchio as pin
 
-    from fflin.robot.robot import Robot
-
-# Lower and upper limit; a missing limit is -inf or inf.
-Range: TypeAlias = tuple[float, float]
-
 RULES = ("urdf", "identity")
 
 
-def _input_keys(robot: Robot) -> tuple[str, ...]:
+def _input_keys(robot: RobotData) -> tuple[str, ...]:
     """Return the name GROUP.ENTRY of each input, such as "thrust.NAME"; see `names.input_keys`."""
     pairs = ((item.GROUP, name) for item, names in robot.named_inputs for name in names)
     keys = []
@@ -53,7 +58,7 @@ def _input_keys(robot: Robot) -> tuple[str, ...]:
 
 
 def _given_limits(
-    given: object, robot: Robot, wheels: Iterable[str] | None = None
+    given: object, robot: RobotData, wheels: Iterable[str] | None = None
 ) -> dict[str, Range]:
     """Return limits as {input or state: (least, largest)}.
 
@@ -95,7 +100,44 @@ def _given_limits(
     }
 
 
-def _outputs(value: object, _: Robot) -> tuple[Output, ...]:
+def checked_inputs(
+    value: object, bare: RobotData, passive: Sequence[str]
+) -> tuple[Input, ...]:
+    """Return checked inputs.
+
+    A `JointTorque` whose joint is a pattern is replaced by one torque for each matching joint that
+    is not in `passive`. `bare` is the robot without the joints of wheels and modes.
+    """
+    if isinstance(value, str) or not isinstance(value, Sequence):
+        raise InputError(f"inputs is {value!r}, expected a sequence of inputs")
+    inputs: list[Input] = []
+    for item in value:
+        if not isinstance(item, Input):
+            known = ", ".join(kind.__name__ for kind in KINDS)
+            raise InputError(f"{item!r} is not an input; expected {known}")
+        if not isinstance(item, JointTorque):
+            inputs.append(item)
+            continue
+        joints = by_joint({str(item.joint): None}, bare.joint_names, bare.joint)
+        if item.joint in joints and item.joint in passive:
+            raise InputError(
+                f"joint '{item.joint}' is passive, but a joint torque acts on it; remove the joint "
+                "from passive, or the torque from the inputs"
+            )
+        inputs += [replace(item, joint=name) for name in joints if name not in passive]
+    if not inputs:
+        raise InputError(
+            f"inputs is {value!r}, expected at least one input that is not the torque of a passive "
+            "joint"
+        )
+    names = [name for _, entries in named_inputs(inputs) for name in entries]
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"input '{name}' is given twice; remove one of them")
+    return tuple(inputs)
+
+
+def _outputs(value: object, _: RobotData) -> tuple[Output, ...]:
     """Return outputs; `value` contains `Output` objects, or text such as "pose:tool"."""
     given = [value] if isinstance(value, str) else value
     if not isinstance(given, Sequence) or not given:
@@ -116,7 +158,7 @@ def _outputs(value: object, _: Robot) -> tuple[Output, ...]:
     return tuple(outputs)
 
 
-def _of_joints(what: str, value: object, robot: Robot) -> dict[str, float]:
+def _of_joints(what: str, value: object, robot: RobotData) -> dict[str, float]:
     """Return the field `what` (stiffness, damping or rest) as {joint: value}.
 
     A single value of stiffness or damping applies to all joints except wheels and modes. Patterns
@@ -153,7 +195,7 @@ def require_chart(what: str, size: float) -> None:
         )
 
 
-def warn_of_degrees(robot: Robot, values: Mapping[str, float]) -> None:
+def warn_of_degrees(robot: RobotData, values: Mapping[str, float]) -> None:
     """Warn of positions and rates of revolute joints that look like degrees.
 
     `values` is {name of a state: value}. States other than q_m and qdot_m are ignored, and so are
@@ -214,7 +256,7 @@ def range_of(name: str, value: object) -> Range:
     return least, largest
 
 
-def _state(what: str, value: object, robot: Robot) -> dict[str, object]:
+def _state(what: str, value: object, robot: RobotData) -> dict[str, object]:
     """Return the checked `point`, `start` or `target`, with patterns replaced by joint names."""
     state = _parts(what, value, ("joints", "rpy", "position", "velocity"))
     if "joints" in state:
@@ -231,7 +273,7 @@ def _state(what: str, value: object, robot: Robot) -> dict[str, object]:
     return state
 
 
-def _weights(value: object, robot: Robot) -> dict[str, object]:
+def _weights(value: object, robot: RobotData) -> dict[str, object]:
     """Return the checked weights of `lqr`: the rule, and the mappings q, r and bryson.
 
     The keys of the mappings are names, groups or patterns of states and inputs.
@@ -264,7 +306,7 @@ def _weights(value: object, robot: Robot) -> dict[str, object]:
     return rule | {part: entries for part, entries in weights.items() if entries}
 
 
-def checked_names(what: str, value: object, bare: Robot) -> tuple[str, ...]:
+def checked_names(what: str, value: object, bare: RobotData) -> tuple[str, ...]:
     """Return the names of joints in state order from the field `what`, names or patterns."""
     keys = [value] if isinstance(value, str) else value
     if not isinstance(keys, Sequence) or not all(isinstance(key, str) for key in keys):
@@ -284,8 +326,8 @@ def _parts(what: str, value: object, known: Sequence[str]) -> dict[str, object]:
 
 # Checks of the fields, in the order in which the fields of a robot file are applied. Inputs come
 # before the fields that refer to inputs by name. The first four fields have no check here, because
-# `Robot.replace` checks them itself.
-FIELDS: dict[str, Callable[[object, Robot], Any] | None] = {
+# `robot.builder` checks them itself.
+FIELDS: dict[str, Callable[[object, RobotData], Any] | None] = {
     **dict.fromkeys(("passive", "wheel_joints", "inputs", "appendages")),
     "outputs": _outputs,
     **{name: partial(_of_joints, name) for name in ("stiffness", "damping", "rest")},
@@ -300,7 +342,7 @@ FIELDS: dict[str, Callable[[object, Robot], Any] | None] = {
 _OPEN: Range = (-math.inf, math.inf)
 
 
-def limits_of(robot: Robot) -> dict[str, Range]:
+def limits_of(robot: RobotData) -> dict[str, Range]:
     """Return {name of an input or state: (least, largest)} for all limits."""
     # Start with the limits of the URDF. Equal lower and upper limits, such as 0 and 0, count as no
     # limit, because exporters write 0 for unknown limits. Limits of the inputs replace limits of
@@ -330,7 +372,7 @@ def limits_of(robot: Robot) -> dict[str, Range]:
     return {name: limits for name, limits in limits_by_name.items() if limits != _OPEN}
 
 
-def input_limits(robot: Robot, limits: Mapping[str, Range]) -> tuple[Array, Array]:
+def input_limits(robot: RobotData, limits: Mapping[str, Range]) -> tuple[Array, Array]:
     """Return the lower and the upper limits (nu,) of the inputs; a missing limit is infinite.
 
     The lower limit of a thruster is at least 0. The upper limit of a pulsed thruster is at most its
@@ -354,17 +396,7 @@ def input_limits(robot: Robot, limits: Mapping[str, Range]) -> tuple[Array, Arra
     return low, high
 
 
-def pulsed_thrusters(robot: Robot) -> dict[int, tuple[str, Thruster]]:
-    """Return the thrusters with `on_off` or `least_impulse`, as {index in u: (name, thruster)}."""
-    inputs = ((name, item) for item, names in robot.named_inputs for name in names)
-    return {
-        index: (name, item)
-        for index, (name, item) in enumerate(inputs)
-        if isinstance(item, Thruster) and (item.on_off or item.least_impulse)
-    }
-
-
-def magnitudes_of(robot: Robot) -> dict[str, float]:
+def magnitudes_of(robot: RobotData) -> dict[str, float]:
     """Return {input or state: magnitude} for all limits whose magnitude is finite and positive.
 
     The magnitude of limits (least, largest) is
@@ -382,7 +414,7 @@ def magnitudes_of(robot: Robot) -> dict[str, float]:
 
 
 def chosen_limits(
-    robot: Robot, limits: object, wheels: Iterable[str] | None = None
+    robot: RobotData, limits: object, wheels: Iterable[str] | None = None
 ) -> dict[str, Range]:
     """Return the limits that the argument `limits` selects.
 

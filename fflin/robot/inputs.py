@@ -3,19 +3,18 @@
 import math
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, ClassVar, TypeAlias, cast
+from dataclasses import dataclass, field
+from typing import ClassVar, TypeAlias, cast
 
 import numpy as np
 
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, dimension, number, positive, truth
-from fflin.robot.joints import by_joint
-
-if TYPE_CHECKING:
-    from fflin.robot.robot import Robot
 
 Vector3: TypeAlias = Sequence[float]
+
+# Lower and upper limit; a missing limit is -inf or inf.
+Range: TypeAlias = tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -60,7 +59,7 @@ class Input:
         object.__setattr__(self, name, value)
 
     @property
-    def ranges(self) -> tuple[tuple[float, float], ...]:
+    def ranges(self) -> tuple[Range, ...]:
         """Limits (least, largest) of each entry of the input; a missing limit is infinite."""
         upper = math.inf if self.max is None else self.max
         largest = np.broadcast_to(upper, len(self.ENTRIES))
@@ -72,10 +71,7 @@ class Input:
     @property
     def frames(self) -> tuple[str, ...]:
         """Names of the model's frames on which this input is mounted."""
-        frame: str | None = getattr(self, "frame", None)
-        if frame is None:
-            return ()
-        return (frame,)
+        return ()
 
 
 class BaseTorque(Input):
@@ -211,6 +207,11 @@ class Thruster(Input):
         self._set("torque", number("thruster torque", self.torque))
 
     @property
+    def frames(self) -> tuple[str, ...]:
+        """Name of the frame on which the thruster is mounted."""
+        return (self.frame,)
+
+    @property
     def wrench(self) -> Array:
         """Force [N] and torque [N m] (6,) of a unit input, at the frame's origin in frame axes."""
         force = np.array(self.direction)
@@ -298,6 +299,13 @@ class ReactionWheel(Input):
             )
 
     @property
+    def frames(self) -> tuple[str, ...]:
+        """Name of the frame on which the wheel is mounted; () for the root frame of the base."""
+        if self.frame is None:
+            return ()
+        return (self.frame,)
+
+    @property
     def wrench(self) -> Array:
         """Force [N] and torque [N m] (6,) of a unit input, at the frame's origin in frame axes."""
         return np.concatenate((np.zeros(3), -np.array(self.axis)))
@@ -330,43 +338,6 @@ def unit_vector(what: str, value: object) -> tuple[float, float, float]:
     if length == 0.0:
         raise InputError(f"{what} is zero; give a direction")
     return x / length, y / length, z / length
-
-
-def checked_inputs(
-    value: object, bare: "Robot", passive: Sequence[str]
-) -> tuple[Input, ...]:
-    """Return checked inputs.
-
-    A `JointTorque` whose joint is a pattern is replaced by one torque for each matching joint that
-    is not in `passive`. `bare` is the robot without the joints of wheels and modes.
-    """
-    if isinstance(value, str) or not isinstance(value, Sequence):
-        raise InputError(f"inputs is {value!r}, expected a sequence of inputs")
-    inputs: list[Input] = []
-    for item in value:
-        if not isinstance(item, Input):
-            known = ", ".join(kind.__name__ for kind in KINDS)
-            raise InputError(f"{item!r} is not an input; expected {known}")
-        if not isinstance(item, JointTorque):
-            inputs.append(item)
-            continue
-        joints = by_joint({str(item.joint): None}, bare.joint_names, bare.joint)
-        if item.joint in joints and item.joint in passive:
-            raise InputError(
-                f"joint '{item.joint}' is passive, but a joint torque acts on it; remove the joint "
-                "from passive, or the torque from the inputs"
-            )
-        inputs += [replace(item, joint=name) for name in joints if name not in passive]
-    if not inputs:
-        raise InputError(
-            f"inputs is {value!r}, expected at least one input that is not the torque of a passive "
-            "joint"
-        )
-    names = [name for _, entries in named_inputs(inputs) for name in entries]
-    for name in names:
-        if names.count(name) > 1:
-            raise InputError(f"input '{name}' is given twice; remove one of them")
-    return tuple(inputs)
 
 
 def named_inputs(inputs: Sequence[Input]) -> list[tuple[Input, tuple[str, ...]]]:

@@ -31,8 +31,9 @@ from fflin.robot.equipment.appendages import Appendage, FlexibleAppendage, Slosh
 from fflin.robot.fields import FIELDS
 from fflin.robot.inputs import KINDS, Input
 from fflin.robot.joints import ROOT, Follower, joint_of, require_room
-from fflin.robot.mass_properties import LinkMass, given_body, massless_note
+from fflin.robot.mass_properties import given_body, massless_note
 from fflin.robot.robot import Robot
+from fflin.robot.robot_data import LinkMass
 from fflin.robot.urdf.description import Mimic, is_impossible
 from fflin.robot.urdf.reader import SIZE_LIMIT, describe, ignored
 from fflin.robot.welding import Lock, locked_model, requested, welded
@@ -182,7 +183,7 @@ def load(
     if loaded.idle_coordinates:
         # Add a note that M is singular. Do not warn, because every function that inverts M raises
         # an error.
-        notes.append(massless_note(loaded))
+        notes.append(massless_note(loaded, loaded.idle_coordinates))
     return replace(loaded, notes=tuple(notes))
 
 

@@ -12,14 +12,13 @@ identification, IEEE Robotics and Automation Letters 3(1), 2018).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from itertools import filterfalse
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.errors import InputError, SingularInertiaError, listed, require_known
-from fflin.base.names import by_name, matching
+from fflin.base.errors import InputError, listed, require_known
+from fflin.base.names import by_name
 from fflin.base.rotation import row_products, skew
 from fflin.base.validation import (
     Array,
@@ -31,10 +30,8 @@ from fflin.base.validation import (
     whole,
 )
 from fflin.robot.joints import ROOT, find_frame
+from fflin.robot.robot_data import RobotData
 from fflin.robot.urdf.description import TRIANGLE_SLACK, is_impossible
-
-if TYPE_CHECKING:
-    from fflin.robot.robot import Robot
 
 _KEYS = ("mass", "com", "inertia")
 _SYMMETRIC = 1e-9
@@ -192,20 +189,6 @@ def properties(P: Array) -> tuple[Array, Array, Array]:
     return mass, com, about
 
 
-class LinkMass(NamedTuple):
-    """Mass [kg] of a link, and its inertia (3, 3) [kg m^2] about the centre of mass."""
-
-    mass: float
-    inertia: Array
-    # placement of the centre of mass and the inertia's axes on the link
-    placement: pin.SE3
-
-
-def link_mass(body: pin.Inertia) -> LinkMass:
-    """Return the mass properties of a link from its inertia in the axes of the link."""
-    return LinkMass(body.mass, body.inertia, pin.SE3(np.eye(3), body.lever))
-
-
 class Piece(NamedTuple):
     """Mass properties of a link, or of a body of links that are fixed to each other."""
 
@@ -220,7 +203,7 @@ class Piece(NamedTuple):
     whole: bool = False  # whether the piece is a body of several links
 
 
-def pieces_of(robot: Robot) -> dict[str, Piece]:
+def pieces_of(robot: RobotData) -> dict[str, Piece]:
     """Return the links and bodies of a robot as {name: piece}.
 
     - Each link with mass is a piece, if the inertias of the links of its body add up to the
@@ -266,24 +249,11 @@ def pieces_of(robot: Robot) -> dict[str, Piece]:
     }
 
 
-def bodies_named(robot: Robot, kind: str, key: str) -> list[str]:
-    """Return the names of the pieces (links and bodies) that match a name or pattern."""
-    pieces, link_of = robot.pieces, robot.link_of
-    if key in pieces:
-        return [key]
-    if key in link_of:
-        return [link_of[key]]
-    names = [*filterfalse(robot._sums.__contains__, pieces), *link_of]
-    matches = [names[i] for i in matching(kind, key, names)]
-    return list(dict.fromkeys(map(link_of.get, matches, matches)))
-
-
-def sums_of(robot: Robot) -> frozenset[str]:
+def sums_of(pieces: Mapping[str, Piece]) -> frozenset[str]:
     """Return the names of the pieces that are sums of other pieces: the bodies of several links."""
-    linked = {piece.joint for piece in robot.pieces.values() if not piece.whole}
-    pieces = robot.pieces.items()
+    linked = {piece.joint for piece in pieces.values() if not piece.whole}
     return frozenset(
-        name for name, piece in pieces if piece.whole and piece.joint in linked
+        name for name, piece in pieces.items() if piece.whole and piece.joint in linked
     )
 
 
@@ -397,7 +367,7 @@ def _flexible_part(
     return _Part(body, center, modes, rows)
 
 
-def mode_carriers(robot: Robot) -> dict[int, int]:
+def mode_carriers(robot: RobotData) -> dict[int, int]:
     """Return {joint of a mode: joint of the body that carries the mode}, in ascending order."""
     carrier_of: dict[int, int] = {}
     for index in sorted(robot.model.getJointId(joint.name) for joint in robot.modes):
@@ -406,7 +376,7 @@ def mode_carriers(robot: Robot) -> dict[int, int]:
     return carrier_of
 
 
-def idle_coordinates(robot: Robot) -> tuple[str, ...]:
+def idle_coordinates(robot: RobotData) -> tuple[str, ...]:
     """Return the names of the coordinates that can move without kinetic energy; usually none."""
     # A motion has no kinetic energy if it moves no centre of mass, rotates no body about an axis
     # with inertia, and moves no joint with armature. The test uses only whether a mass or moment is
@@ -447,16 +417,15 @@ def idle_coordinates(robot: Robot) -> tuple[str, ...]:
     return tuple(dict.fromkeys(names[involved].tolist()))
 
 
-def coordinate_names(robot: Robot) -> list[str]:
+def coordinate_names(robot: RobotData) -> list[str]:
     """Return the names of the 6 + n velocity coordinates for messages, in state order."""
     return ["the base"] * 6 + [f"joint '{name}'" for name in robot.joint_names]
 
 
-def massless_note(robot: Robot) -> str:
-    """Return the message about coordinates that can move without kinetic energy."""
-    idle = listed(robot.idle_coordinates)
+def massless_note(robot: RobotData, idle: Sequence[str]) -> str:
+    """Return the message about coordinates `idle` that can move without kinetic energy."""
     advice = "give an inertia to the link of each such joint, or lock the joint"
-    if {f"joint '{joint.name}'" for joint in robot.modes} & {*robot.idle_coordinates}:
+    if {f"joint '{joint.name}'" for joint in robot.modes} & {*idle}:
         advice = (
             "the effective mass of modes is the whole mass of their link in some direction, so "
             "give the link more inertia, or the modes less participation"
@@ -468,12 +437,12 @@ def massless_note(robot: Robot) -> str:
             f"fflin adds by itself: lock them, as in lock={virtual}"
         )
     return (
-        f"the mass matrix of '{robot.name}' is singular at every configuration: {idle} can move "
-        f"without moving mass; {advice}"
+        f"the mass matrix of '{robot.name}' is singular at every configuration: {listed(idle)} can "
+        f"move without moving mass; {advice}"
     )
 
 
-def _virtual_joints(robot: Robot) -> list[str]:
+def _virtual_joints(robot: RobotData) -> list[str]:
     """Return the joints of a chain without mass from the root to the first body, if it is long.
 
     Some URDFs describe a floating base by such joints. A chain of at least three joints counts.
@@ -494,16 +463,7 @@ def _virtual_joints(robot: Robot) -> list[str]:
     return chain
 
 
-def require_inertia(robot: Robot) -> None:
-    """Raise `SingularInertiaError` if M is singular at every configuration.
-
-    Rounding errors may hide this singularity in a factorisation of M.
-    """
-    if robot.idle_coordinates:
-        raise SingularInertiaError(massless_note(robot))
-
-
-def _moved(robot: Robot, q: Array, parts: Sequence[_Part]) -> Array:
+def _moved(robot: RobotData, q: Array, parts: Sequence[_Part]) -> Array:
     """Return the matrix (k, nv) that maps v to all velocities on which the kinetic energy depends.
 
     These are the rates of joints with armature and the rows of all parts.

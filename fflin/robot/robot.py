@@ -3,55 +3,37 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from functools import cached_property
-from hashlib import sha256
-from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.errors import InputError, require_known, unknown
+from fflin.base.errors import SingularInertiaError
+from fflin.base.names import matching
 from fflin.base.validation import Array
-from fflin.robot import mass_properties
-from fflin.robot.equipment.appendages import Appendage
-from fflin.robot.equipment.assembly import equipped, stored_momentum, with_appendages
-from fflin.robot.fields import FIELDS, Range, checked_names, pulsed_thrusters
-from fflin.robot.inputs import (
-    BaseForce,
-    BaseTorque,
-    Input,
-    JointTorque,
-    named_inputs,
-    named_wheels,
+from fflin.robot import builder
+from fflin.robot.mass_properties import (
+    Piece,
+    given_bodies,
+    idle_coordinates,
+    massless_note,
+    pieces_of,
+    random_bodies,
+    sums_of,
 )
-from fflin.robot.joints import ROOT, Coordinates, Joint, find_frame
-from fflin.robot.orbit import CircularOrbit
-from fflin.robot.outputs import FullState, Output
+from fflin.robot.robot_data import RobotData
 from fflin.robot.rotors import (
+    FlownWheels,
     flown_wheels,
     free_rotor_names,
-    require_free_rotors,
     rotor_names,
     spin_inertia,
 )
 
 
-class Springs(NamedTuple):
-    """Stiffness, damping and rest positions, each (n,), of the springs and dampers of joints."""
-
-    stiffness: Array
-    damping: Array
-    rest: Array
-
-    def force(self, q_m: Array, rates: Array) -> Array:
-        """Return the forces (.., n) of springs and dampers at joint positions and rates (.., n)."""
-        return self.stiffness * (self.rest - q_m) - self.damping * rates
-
-
 @dataclass(frozen=True, eq=False, repr=False)
-class Robot(Coordinates):
+class Robot(RobotData):
     """Free-floating robot, made by `load` or `from_model`.
 
     Attributes
@@ -131,43 +113,6 @@ class Robot(Coordinates):
     >>> robot.n, stiff.stiffness["joint_1"], round(heavy.mass)
     (3, 50.0, 972)
     """
-
-    urdf: Path | None = None
-    urdf_sha256: str = ""
-    notes: tuple[str, ...] = ()
-    locked: tuple[str, ...] = ()
-    urdf_damping: Mapping[str, float] = field(default_factory=dict)
-    inputs: tuple[Input, ...] = ()
-    outputs: tuple[Output, ...] = (FullState(),)
-    stiffness: Mapping[str, float] = field(default_factory=dict)
-    damping: Mapping[str, float] = field(default_factory=dict)
-    rest: Mapping[str, float] = field(default_factory=dict)
-    gravity: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    orbit: CircularOrbit | None = None
-    package_dirs: tuple[Path, ...] = ()
-    xacro: Mapping[str, str] = field(default_factory=dict)
-    passive: tuple[str, ...] = ()
-    wheel_joints: tuple[str, ...] = ()
-    weights: Mapping[str, Any] = field(default_factory=dict)
-    point: Mapping[str, Any] = field(default_factory=dict)
-    target: Mapping[str, Any] = field(default_factory=dict)
-    start: Mapping[str, Any] = field(default_factory=dict)
-    limits: Mapping[str, Range] = field(default_factory=dict)
-    links: Mapping[str, mass_properties.LinkMass] = field(default_factory=dict)
-    file_joints: tuple[str, ...] = ()
-    attached: tuple[tuple[str, Robot], ...] = ()
-    appendages: tuple[Appendage, ...] = ()
-    # The robot without the joints of wheels and modes; None if no joint is a wheel or mode. Its
-    # fields such as `inputs` and `stiffness` may be outdated.
-    _unequipped: Robot | None = None
-
-    def __post_init__(self) -> None:
-        if self._as_made is None or self._as_made[0] is not self.model:
-            object.__setattr__(self, "_as_made", (self.model, self.model.copy()))
-        if not self.inputs:
-            # Default: one force or torque for each degree of freedom.
-            default = (BaseTorque(), BaseForce(), *map(JointTorque, self.joint_names))
-            object.__setattr__(self, "inputs", default)
 
     def replace(self, **fields: object) -> Robot:
         """Return a copy of the robot with other inputs, springs, gravity, orbit or other fields.
@@ -249,58 +194,11 @@ class Robot(Coordinates):
             If the robot's Pinocchio model (``robot.model``) was modified after the robot was
             created.
         """
-        return self._replaced(fields, merged=False)
+        return builder.replaced(self, fields)
 
     def merged(self, fields: Mapping[str, object]) -> Robot:
         """Return a copy with other fields; springs and limits that are not named are unchanged."""
-        if self.passive and isinstance(given := fields.get("passive"), list | tuple):
-            fields = {**fields, "passive": [*self.passive, *given]}
-        return self._replaced(fields, merged=True)
-
-    def _replaced(self, fields: Mapping[str, object], *, merged: bool) -> Robot:
-        self.require_unchanged()
-        require_known("field of a robot", fields, FIELDS)
-        robot = self
-        if "passive" in fields:
-            robot = replace(
-                self, passive=checked_names("passive", fields["passive"], self._bare)
-            )
-            driven = [
-                x for x in self.inputs if getattr(x, "joint", None) not in robot.passive
-            ]
-            fields = {"inputs": driven, **fields}
-        if "wheel_joints" in fields:
-            named = checked_names("wheel_joints", fields["wheel_joints"], self._bare)
-            robot = replace(robot, wheel_joints=named)
-        if "inputs" in fields:
-            robot = equipped(robot, inputs=fields["inputs"])
-        if "appendages" in fields:
-            robot = with_appendages(robot, fields["appendages"])
-        checked = {
-            k: check(x, robot) for k, x in fields.items() if (check := FIELDS[k])
-        }
-        # A given table replaces the old table. If `merged` is true, the old entries of all joints
-        # that the new table does not name stay. Otherwise, only those of modes stay.
-        modes = {joint.name for joint in robot.modes}
-        tables = ["stiffness", "damping"]
-        if merged:
-            tables += ["rest", "limits"]
-        for key in tables:
-            if key in checked:
-                kept = {
-                    k: x for k, x in getattr(robot, key).items() if merged or k in modes
-                }
-                checked[key] = kept | checked[key]
-        robot = replace(robot, **checked)
-        if robot.orbit and any(robot.gravity):
-            raise InputError(
-                f"'{self.name}' has both uniform gravity and an orbit, but an orbit already "
-                "includes the gravity of its central body; leave one of them out"
-            )
-        for name in robot.used_frames:
-            find_frame(robot.model, name)
-        require_free_rotors(robot)
-        return robot
+        return builder.merged(self, fields)
 
     def with_mass_properties(self, bodies: Mapping[str, object]) -> Robot:
         """Return a copy of the robot with other masses, centres of mass or inertias.
@@ -335,7 +233,7 @@ class Robot(Coordinates):
         UnknownNameError
             If a body or property does not exist.
         """
-        return self.with_bodies(mass_properties.given_bodies(self._bare.model, bodies))
+        return self.with_bodies(given_bodies(self._bare.model, bodies))
 
     def perturbed(
         self,
@@ -369,45 +267,21 @@ class Robot(Coordinates):
             Copy of the robot with the changed mass properties.
         """
         spreads = {"mass": mass, "com": com, "inertia": inertia}
-        return self.with_bodies(
-            mass_properties.random_bodies(self._bare.model, seed, **spreads)
-        )
+        return self.with_bodies(random_bodies(self._bare.model, seed, **spreads))
 
     def with_bodies(self, bodies: Mapping[int, pin.Inertia]) -> Robot:
         """Return a copy with other inertias {joint index: inertia}, which include the wheels."""
-        self.require_unchanged()
-        bare = self._bare
-        model = bare.model.copy()
-        for joint, body in bodies.items():
-            model.inertias[joint] = body
-        digest = self.urdf_sha256
-        masses = mass_properties.dynamic_parameters(model)
-        if masses != mass_properties.dynamic_parameters(bare.model):
-            digest = sha256(digest.encode() + masses).hexdigest()
-        other = replace(bare, model=model, urdf_sha256=digest)
-        if bare is self:
-            return other
-        changed: Robot = equipped(self, other)
-        if not self.modes:
-            return changed
-        # `changed` has new joints for the modes. Use the old joints instead, so that the modal
-        # amplitudes in q have the same meaning as before.
-        model = self.model.copy()
-        inertias = self.model.inertias
-        for joint in bodies:
-            at = ROOT
-            if joint > ROOT:
-                at = self.model.getJointId(bare.model.names[joint])
-            mounted = bare.model.inertias[joint] - inertias[at]
-            model.inertias[at] = other.model.inertias[joint] - mounted
-            if model.inertias[at].mass <= 0.0:
-                return changed
-        return replace(
-            changed, model=model, joints=self.joints, followers=self.followers
-        )
+        return builder.with_bodies(self, bodies)
 
-    pieces = cached_property(mass_properties.pieces_of)
-    _sums = cached_property(mass_properties.sums_of)
+    @cached_property
+    def pieces(self) -> dict[str, Piece]:
+        """Links and bodies {name: piece}, see `mass_properties.pieces_of`."""
+        return pieces_of(self)
+
+    @cached_property
+    def _sums(self) -> frozenset[str]:
+        """Names of the pieces that are sums of other pieces: the bodies of several links."""
+        return sums_of(self.pieces)
 
     @cached_property
     def link_of(self) -> dict[str, str]:
@@ -416,28 +290,48 @@ class Robot(Coordinates):
             x.body: name for name, x in self.pieces.items() if x.body not in self.pieces
         }
 
-    @property
-    def used_frames(self) -> tuple[str, ...]:
-        """Names of the frames at which inputs and outputs are mounted."""
-        of_inputs = [name for item in self.inputs for name in item.frames]
-        return (*of_inputs, *(name for item in self.outputs for name in item.frames))
+    def bodies_named(self, kind: str, key: str) -> list[str]:
+        """Return the names of the pieces (links and bodies) that match a name or pattern.
+
+        A body of several links is returned only if `key` is its name. `kind` is the kind of name
+        for messages.
+        """
+        if key in self.pieces:
+            return [key]
+        if key in self.link_of:
+            return [self.link_of[key]]
+        names = [name for name in self.pieces if name not in self._sums]
+        names += self.link_of
+        matches = [names[i] for i in matching(kind, key, names)]
+        return list(dict.fromkeys(self.link_of.get(name, name) for name in matches))
 
     @cached_property
-    def named_inputs(self) -> tuple[tuple[Input, tuple[str, ...]], ...]:
-        """Each input with the names of its entries in u."""
-        return tuple(named_inputs(self.inputs))
+    def idle_coordinates(self) -> tuple[str, ...]:
+        """Names of the coordinates that can move without kinetic energy; usually none."""
+        return idle_coordinates(self)
 
-    pulsed_thrusters = cached_property(pulsed_thrusters)
-    idle_coordinates = cached_property(mass_properties.idle_coordinates)
-    rotors = cached_property(rotor_names)
-    free_rotors = cached_property(free_rotor_names)
-    flown_wheels = cached_property(flown_wheels)
+    def require_inertia(self) -> None:
+        """Raise `SingularInertiaError` if M is singular at every configuration.
+
+        Rounding errors may hide this singularity in a factorisation of M.
+        """
+        if self.idle_coordinates:
+            raise SingularInertiaError(massless_note(self, self.idle_coordinates))
 
     @cached_property
-    def reaction_wheels(self) -> dict[str, float]:
-        """Inertias {name: inertia [kg m^2]} of the inputs `ReactionWheel` that are joints."""
-        wheels = named_wheels(self.inputs)
-        return {name: wheel.inertia for name, wheel in wheels if wheel.inertia}
+    def rotors(self) -> tuple[str, ...]:
+        """Names of the joints whose body is symmetric about the joint axis."""
+        return rotor_names(self)
+
+    @cached_property
+    def free_rotors(self) -> tuple[str, ...]:
+        """Names of the rotors without position limits, which may spin forever."""
+        return free_rotor_names(self, self.rotors)
+
+    @cached_property
+    def flown_wheels(self) -> FlownWheels:
+        """Joints that are flown as reaction wheels, always or if they spin."""
+        return flown_wheels(self, self.free_rotors)
 
     @cached_property
     def wheels(self) -> dict[str, float]:
@@ -457,67 +351,3 @@ class Robot(Coordinates):
         known = self.reaction_wheels
         names = self.flown_wheels.at(speeds)
         return {x: known.get(x) or spin_inertia(self, x) for x in names}
-
-    stored_momentum = cached_property(stored_momentum)
-
-    @cached_property
-    def springs(self) -> Springs:
-        """Stiffness, damping and rest positions (n,) of all joints in state order."""
-        rows = np.zeros((3, self.n))
-        for row, given in zip(
-            rows, (self.stiffness, self.damping, self.rest), strict=True
-        ):
-            row[:] = [given.get(name, 0.0) for name in self.joint_names]
-        return Springs(*rows)
-
-    @cached_property
-    def mass(self) -> float:
-        """Total mass [kg]."""
-        return float(pin.computeTotalMass(self.model))
-
-    def __repr__(self) -> str:
-        return f"Robot('{self.name}', n={self.n}, mass={self.mass:.6g} kg)"
-
-    def joint(self, name: str) -> Joint:
-        """Return the independent joint with the given name.
-
-        Raises
-        ------
-        UnknownNameError
-            If the robot has no joint with this name; the message suggests similar names.
-        InputError
-            If the name belongs to a mimic joint, a wheel without inertia or a locked joint.
-        """
-        if not isinstance(name, str):
-            raise unknown("joint", name, self.joint_names)
-        if independent := next(
-            (joint for joint in self.joints if joint.name == name), None
-        ):
-            return independent
-        leader = next(
-            (x.leader.name for x in self.followers if x.joint.name == name), ""
-        )
-        if leader:
-            raise InputError(
-                f"joint '{name}' mimics '{leader}'; give '{leader}' instead"
-            )
-        if name in (wheel for wheel, _ in named_wheels(self.inputs)):
-            raise InputError(
-                f"wheel '{name}' has no inertia, so it is not a joint and has no speed; give the "
-                "wheel an inertia, or its momentum"
-            )
-        if any(locked.rpartition("=")[0] == name for locked in self.locked):
-            raise InputError(
-                f"joint '{name}' is locked; unlock it, or leave it out here"
-            )
-        raise unknown("joint", name, self.joint_names)
-
-    @cached_property
-    def modes(self) -> tuple[Joint, ...]:
-        """Joints of the robot that represent modes of flexible appendages or slosh."""
-        return tuple(joint for joint in self.joints if joint.mode)
-
-    @property
-    def _bare(self) -> Robot:
-        """The robot without the joints of wheels and modes; `self` if it has no such joints."""
-        return self._unequipped or self

@@ -11,7 +11,7 @@ arm.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -19,9 +19,7 @@ from fflin.base.errors import InputError
 from fflin.base.rotation import skew
 from fflin.base.validation import Array
 from fflin.robot.fields import limits_of
-
-if TYPE_CHECKING:
-    from fflin.robot.robot import Robot
+from fflin.robot.robot_data import RobotData
 
 # Largest relative asymmetry of a body that counts as symmetric. Such an asymmetry results from the
 # rounding of numbers in a URDF.
@@ -72,17 +70,17 @@ class FlownWheels(NamedTuple):
         )
 
 
-def flown_wheels(robot: Robot) -> FlownWheels:
-    """Return which joints of a robot are flown as reaction wheels.
+def flown_wheels(robot: RobotData, free_rotors: tuple[str, ...]) -> FlownWheels:
+    """Return which joints of a robot are flown as reaction wheels, from its free rotors.
 
     Joints in `wheel_joints` are omitted if they are no longer rotors, for example because a changed
     inertia is not balanced.
     """
-    named = tuple(name for name in robot.wheel_joints if name in robot.free_rotors)
-    return FlownWheels((*robot.reaction_wheels, *named), robot.free_rotors)
+    named = tuple(name for name in robot.wheel_joints if name in free_rotors)
+    return FlownWheels((*robot.reaction_wheels, *named), free_rotors)
 
 
-def obstacles(robot: Robot) -> dict[str, str]:
+def obstacles(robot: RobotData) -> dict[str, str]:
     """Return {joint: reason why the joint is not a rotor} for all joints that are not rotors."""
     model = robot.model
     carriers = set(model.parents.tolist())
@@ -107,7 +105,7 @@ def obstacles(robot: Robot) -> dict[str, str]:
     return reasons
 
 
-def rotor_names(robot: Robot) -> tuple[str, ...]:
+def rotor_names(robot: RobotData) -> tuple[str, ...]:
     """Return the names of the rotors: joints whose body is symmetric about the joint axis.
 
     A rotor carries no other joint, is not the leader of a mimic joint, and has no spring. No input
@@ -117,7 +115,7 @@ def rotor_names(robot: Robot) -> tuple[str, ...]:
     return tuple(name for name in robot.joint_names if name not in excluded)
 
 
-def free_rotor_names(robot: Robot) -> tuple[str, ...]:
+def free_rotor_names(robot: RobotData, rotors: Sequence[str]) -> tuple[str, ...]:
     """Return the names of the rotors without position limits, which may spin forever."""
     limits = limits_of(robot)
 
@@ -125,14 +123,17 @@ def free_rotor_names(robot: Robot) -> tuple[str, ...]:
         least, largest = limits.get(f"q_m.{name}", (-np.inf, np.inf))
         return largest - least >= _UNREACHABLE
 
-    return tuple(name for name in robot.rotors if is_free(name))
+    return tuple(name for name in rotors if is_free(name))
 
 
-def require_free_rotors(robot: Robot) -> None:
+def require_free_rotors(robot: RobotData) -> None:
     """Raise `InputError` if a joint in the robot's field `wheel_joints` cannot spin freely."""
-    excluded = obstacles(robot) if robot.wheel_joints else {}
+    if not robot.wheel_joints:
+        return
+    excluded = obstacles(robot)
+    free = free_rotor_names(robot, rotor_names(robot))
     for name in robot.wheel_joints:
-        if name not in robot.free_rotors:
+        if name not in free:
             why = excluded.get(name, "it has position limits")
             raise InputError(
                 f"wheel_joints names joint '{name}', but {why}; name only joints that spin freely, "
@@ -140,14 +141,14 @@ def require_free_rotors(robot: Robot) -> None:
             )
 
 
-def spin_inertia(robot: Robot, name: str) -> float:
+def spin_inertia(robot: RobotData, name: str) -> float:
     """Return the inertia [kg m^2] of a rotor's body about the joint axis."""
     index = robot.model.getJointId(name)
     axis = spin_axis(robot, index)
     return float(axis @ robot.model.inertias[index].inertia @ axis)
 
 
-def spin_axis(robot: Robot, index: int) -> Array:
+def spin_axis(robot: RobotData, index: int) -> Array:
     """Return the axis (3,) of a revolute joint in the axes of its body, zeros if it translates."""
     joint = robot.model.joints[index]
     data = joint.createData()
@@ -166,7 +167,7 @@ def motor_of(inputs: Sequence[str], joint: str) -> int | None:
     return None
 
 
-def _is_symmetric(robot: Robot, index: int) -> bool:
+def _is_symmetric(robot: RobotData, index: int) -> bool:
     """Return whether the body of a joint is symmetric about the joint axis."""
     axis = spin_axis(robot, index)
     if not axis.any():  # a joint that translates

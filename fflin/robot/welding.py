@@ -10,17 +10,18 @@ import pinocchio as pin
 from fflin.base.errors import InputError, require_known
 from fflin.base.names import joints_by_name
 from fflin.base.validation import Array, number, printable
+from fflin.robot.builder import equipped
 from fflin.robot.equipment.assembly import (
     carry_over,
-    equipped,
     restore_names,
     with_marked_frames,
 )
 from fflin.robot.inputs import Input, ReactionWheel
 from fflin.robot.joints import ROOT, Follower, Joint, find_frame, frame_index, joint_of
-from fflin.robot.mass_properties import dynamic_parameters, link_mass
+from fflin.robot.mass_properties import dynamic_parameters
 from fflin.robot.outputs import JointOutput, Output
 from fflin.robot.robot import Robot
+from fflin.robot.robot_data import link_mass
 from fflin.robot.urdf.description import Mimic
 
 Lock = Mapping[str, float | None] | Iterable[str]

@@ -7,6 +7,7 @@ last run.
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import TypeAlias
 
 import numpy as np
@@ -22,21 +23,16 @@ from fflin.control.policy import Form, OutputForm, PathForm, Policy, StateForm
 from fflin.control.tracking import AT_THE_END, TrajectoryFeedback
 from fflin.dynamics.state import StateMap
 from fflin.kernel import allocation, forward, loop, policies
-from fflin.kernel.compiled import (
-    compiles,
-    is_kept,
-    kernel,
-    numba_is_there,
-    without_numba,
-)
+from fflin.kernel.compiled import compiles, is_kept, kernel
+from fflin.kernel.limits import Task, reason_against
 from fflin.kernel.tree import LANES, batch_tree, empty, laid_out, work_space
 from fflin.robot.fields import input_limits, limits_of
 from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.robot import Robot
 from fflin.simulation.plan import Plan, Times
+from fflin.simulation.plant import Plant
 from fflin.simulation.run import (
     STOPS,
-    Plant,
     Recording,
     ending_of,
     go,
@@ -97,40 +93,46 @@ def form_of(policy: Policy, robot: Robot) -> Form | None:
 
 def not_compilable(plan: Plan) -> str:
     """Return why the compiled loop cannot run a plan, or an empty text if it can."""
+    return reason_against(task_of(plan))
+
+
+def task_of(plan: Plan) -> Task:
+    """Return what a plan asks of an engine."""
     plant = plan.plant
+    task = Task(
+        robots=(plant.robot,),
+        simulated=True,
+        events=bool(plan.events),
+        callback=bool(plan.options.callback),
+        disturbance=bool(plant.disturbance),
+    )
+    if plan.policy is None:
+        return task
+    policy = plan.policy.inner
+    design = plan.policy.commanded_robot
+    form = form_of(policy, design or plant.robot)
+    if design is not None:
+        task = replace(task, robots=(plant.robot, design))
+    if form is None:
+        task = replace(task, python_policy=policy.kind)
+    if not isinstance(form, OutputForm):
+        return task
     times = plan.times
-    policy = None
-    form = None
-    robots = [plant.robot]
-    if plan.policy:
-        policy = plan.policy.inner
-        design = plan.policy.commanded_robot
-        form = form_of(policy, design or plant.robot)
-        if design:
-            robots.append(design)
-    reason = ""
-    if not numba_is_there():
-        reason = without_numba()
-    elif plan.events or plan.options.callback or plant.disturbance or plant.field:
-        reason = "events, callbacks, disturbances and the field of an orbit are computed in Python"
-    elif policy is not None and form is None:
-        reason = f"a {policy.kind} is computed in Python"
-    if reason:
-        return reason
-    for robot in robots:
-        at_home = robot.model.jointPlacements[ROOT].isIdentity(0.0)
-        if batch_tree(robot) is None or not at_home:
-            return f"a joint of '{robot.name}' does not move along a screw with a fixed axis"
-    if policy and isinstance(form, OutputForm):
-        dt = form.loop.dt
-        if dt and abs(times.sample * times.dt - dt) > 1e-6 * dt:
-            return "its sample time differs from the compensator's"
-        if policy.measurement_noise is not None and not times.sample:
-            return "noise is evaluated at every stage of every step"
-        try:
-            measured_at(plant.state)
-        except InputError as error:
-            return str(error)
+    dt = form.loop.dt
+    return replace(
+        task,
+        own_sample_time=dt > 0.0 and abs(times.sample * times.dt - dt) > 1e-6 * dt,
+        noise_at_stages=policy.measurement_noise is not None and not times.sample,
+        measurements=_measurement_error(plant.state),
+    )
+
+
+def _measurement_error(state: StateMap) -> str:
+    """Return why the outputs of a robot cannot be computed in lanes, or an empty text."""
+    try:
+        measured_at(state)
+    except InputError as error:
+        return str(error)
     return ""
 
 

@@ -17,17 +17,13 @@ from fflin.base.record import Design
 from fflin.base.tables import data_frame
 from fflin.base.validation import Array, ArrayLike, Open, Vector, instance
 from fflin.base.writing import RECORDS, as_path, check_ending
-from fflin.dynamics.coordinates import (
-    attitude_errors,
-    frame_of,
-    moving_errors,
-    state_history,
-)
+from fflin.dynamics.coordinates import frame_of
 from fflin.dynamics.impact import Impact, joint_called
 from fflin.dynamics.state import Actuation, StateMap
-from fflin.linear.files import labels, write_table
+from fflin.dynamics.state_rows import attitude_errors, moving_errors, state_history
+from fflin.linear.files import arguments, labels, write_table
 from fflin.linear.model import StatesAndInputs
-from fflin.linear.trajectory import Trajectory, along
+from fflin.linear.trajectory import Trajectory
 from fflin.robot.joints import ROOT
 from fflin.robot.orbit import CircularOrbit
 from fflin.robot.robot import Robot
@@ -421,7 +417,7 @@ class Motion(StatesAndInputs, Design):
         from a file.
         """
         robot = self._robot if robot is None else robot
-        return along(self, robot)
+        return _as_trajectory(self, robot)
 
     @property
     def passed(self) -> tuple[Passed, ...]:
@@ -478,6 +474,37 @@ class Motion(StatesAndInputs, Design):
         from fflin import plot_motion
 
         return plot_motion(self, path, show=show)
+
+
+def _as_trajectory(motion: Motion, robot: Robot | None) -> Trajectory:
+    """Convert a motion to a trajectory with constant or linear inputs between the knots.
+
+    If the inputs of the motion vary, two trajectories are computed: one with constant inputs
+    between the knots, and one with linear inputs. The result is the trajectory whose largest
+    residual is smaller.
+    """
+    if motion.phases:
+        raise InputError(
+            "the motion has several phases, each with its own robot; convert each phase separately"
+        )
+    if robot is None:
+        raise InputError(
+            "the motion was read from a file, which does not contain its robot; give the robot, "
+            "motion.trajectory(robot)"
+        )
+    instance("robot", robot, Robot, "a fflin.Robot; fflin.load makes one")
+    entries = {
+        name: getattr(motion, name) for name in ("t", "q", "v", "u", "placement")
+    }
+    values = arguments(entries, robot, "previous", motion.frame, motion.verified)
+    held = Trajectory(robot, **values)
+    if not (motion.u - motion.u[0]).any():
+        return held
+    before = motion.t[-4:-1] - motion.t[-1]
+    u = values["u"]
+    u[-1] = np.linalg.solve(np.vander(before).T, np.eye(len(before))[-1]) @ u[-4:-1]
+    smooth = Trajectory(robot, **values | {"hold": "linear", "u": u})
+    return min(held, smooth, key=lambda trajectory: float(trajectory.residual.max()))
 
 
 def require_motion(motion: object) -> Motion:

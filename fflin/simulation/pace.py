@@ -25,11 +25,11 @@ from fflin.base.names import group_of
 from fflin.base.validation import Array, Values
 from fflin.control.channel import Law
 from fflin.control.policy import BoundLaw, Command, Policy
-from fflin.dynamics.integrators import CommutatorFree4, Integrator, integrated_hold
+from fflin.dynamics.integrators import Integrator
 from fflin.linear.linearization import Linearizer
 from fflin.linear.model import LinearModel
 from fflin.robot.outputs import FullState
-from fflin.simulation.run import ROUNDED_DOWN, ROUNDED_UP, Plant
+from fflin.simulation.plant import ROUNDED_DOWN, ROUNDED_UP, Plant
 
 # Names in messages: the robot with constant inputs, a loop that is constant during the run, and a
 # rotation, which acts like an undamped oscillation.
@@ -182,18 +182,21 @@ class SampledLoop:
     def demand(self, method: type[Integrator], h: float, duration: float) -> Demand:
         """Return the largest step error; see `Limit`. The amplitudes are compared per sample.
 
-        Only steps of `CommutatorFree4` are compared. For other methods, only the poles of the robot
-        limit the step.
+        Only methods that define `Integrator.held` are compared. For other methods, only the poles
+        of the robot limit the step.
         """
         dt = self.lin.dt
-        if method is not CommutatorFree4:
-            return Demand(0.0, str)
         steps = max(1, math.ceil(dt / h - 1e-9))
+        A, B = self.generator.A, self.generator.B
+        with np.errstate(over="ignore", invalid="ignore"):
+            step = method.held(A, B, dt / steps)
+        if step is None:
+            return Demand(0.0, str)
         exact_loop = self.loop(self.lin)
         if not np.abs(exact_loop).max(initial=0.0) < _STEEPEST:  # the run stops at once
             return Demand(0.0, str)
         with np.errstate(over="ignore", invalid="ignore"):
-            integrated = self.loop(self._integrated(dt / steps, steps))
+            integrated = self.loop(self._integrated(step, steps))
         if not np.isfinite(integrated).all():
             return Demand(math.inf, lambda: "the sampled loop")
         exact, simulated = _matched(
@@ -210,13 +213,12 @@ class SampledLoop:
             float(errors[worst]), lambda: Poles("sampled loop", poles).mode(worst)
         )
 
-    def _integrated(self, h: float, steps: int) -> LinearModel:
-        """Return the sampled model of the plant as the integrator computes it."""
-        A, B = self.generator.A, self.generator.B
-        nx = len(A)
-        step = np.eye(nx + B.shape[1])
-        step[:nx] = np.hstack(integrated_hold(A, B, h))
-        sample = np.linalg.matrix_power(step, steps)[:nx]
+    def _integrated(self, step: tuple[Array, Array], steps: int) -> LinearModel:
+        """Return the sampled model of the plant from the matrices of one step."""
+        nx, nu = step[1].shape
+        extended = np.eye(nx + nu)
+        extended[:nx] = np.hstack(step)
+        sample = np.linalg.matrix_power(extended, steps)[:nx]
         return replace(self.lin, A=sample[:, :nx], B=sample[:, nx:])
 
 

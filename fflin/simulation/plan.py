@@ -47,12 +47,13 @@ from fflin.control.tracking import prepared
 from fflin.dynamics import points
 from fflin.dynamics.coordinates import ORBITAL, Frame, refuse_orbit
 from fflin.dynamics.integrators import held_exponential, integrator
+from fflin.dynamics.methods import DEFAULT_METHOD
 from fflin.dynamics.state import StateMap, selection
 from fflin.linear.model import LinearModel
 from fflin.robot.fields import chosen_limits
 from fflin.robot.robot import Robot
 from fflin.simulation.pace import Pace, Signal, limits_of_step
-from fflin.simulation.run import LARGEST_TURN, Disturbance, Plant
+from fflin.simulation.plant import LARGEST_TURN, Disturbance, Plant
 
 Event: TypeAlias = Callable[[float, Array, Array], float]
 Callback: TypeAlias = Callable[[float, Array, Array, Array], None]
@@ -87,7 +88,7 @@ class SimulationOptions:
     v0: ArrayLike | None = None
     duration: float | None = None
     dt: float | None = None
-    method: str = "cf4"
+    method: str = DEFAULT_METHOD
     project: bool = True
     sample: float | None = None
     delay: float = 0.0

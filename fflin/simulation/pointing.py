@@ -19,7 +19,7 @@ from fflin.base.validation import (
     positive,
     vector,
 )
-from fflin.dynamics.coordinates import attitude_rotations
+from fflin.dynamics.state_rows import attitude_rotations
 from fflin.simulation.report import Firings, curves, firings
 
 if TYPE_CHECKING:

@@ -18,8 +18,10 @@ from fflin.base.rotation import conjugate
 from fflin.base.validation import Array, ArrayLike, instance
 from fflin.control.policy import BoundLaw, Command, Policy, Predictor
 from fflin.control.tvlqr import GainSchedule
-from fflin.dynamics.coordinates import Frame, state_history
+from fflin.dynamics.coordinates import Frame
 from fflin.dynamics.integrators import held_exponential
+from fflin.dynamics.methods import DEFAULT_METHOD
+from fflin.dynamics.state_rows import state_history
 from fflin.kernel.compiled import is_kept
 from fflin.linear.model import LinearModel
 from fflin.robot.fields import limits_of
@@ -27,7 +29,8 @@ from fflin.robot.robot import Robot
 from fflin.simulation.lanes import engine_of, not_compilable, recorded
 from fflin.simulation.motion import Motion
 from fflin.simulation.plan import Callback, Event, Limits, Plan, SimulationOptions
-from fflin.simulation.run import Conserved, Disturbance, Recording, go
+from fflin.simulation.plant import Disturbance
+from fflin.simulation.run import Conserved, Recording, go
 
 # After a run in Python of more than LONG_RUN seconds, a message recommends the compiled loop. The
 # compiled loop takes about the fraction _FRACTION of the time in Python. It must be compiled once,
@@ -62,7 +65,7 @@ def simulate(
     v0: ArrayLike | None = None,
     duration: float | None = None,
     dt: float | None = None,
-    method: str = "cf4",
+    method: str = DEFAULT_METHOD,
     project: bool = True,
     sample: float | None = None,
     delay: float = 0.0,

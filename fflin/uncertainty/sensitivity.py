@@ -12,6 +12,7 @@ from fflin.base.record import Record, write_record
 from fflin.base.tables import folded, grid
 from fflin.base.validation import Array, FrozenArrays, instance, numbers, shaped, whole
 from fflin.base.writing import as_path
+from fflin.control.gain import gain_matrix
 from fflin.linear.files import record_of
 from fflin.linear.model import LinearModel
 from fflin.uncertainty.derivatives import ModelDerivatives
@@ -186,8 +187,9 @@ class Sensitivity:
             NaN, because such poles are not differentiable.
         """
         lin = self.lin
-        K = np.zeros(lin.B.T.shape) if gain is None else getattr(gain, "K", gain)
-        K = shaped("gain", K, lin.B.T.shape, " (nu, nx)")
+        K: Array = np.zeros(lin.B.T.shape)
+        if gain is not None:
+            K = shaped("gain", gain_matrix(gain), lin.B.T.shape, " (nu, nx)")
         from scipy.linalg import eig
 
         poles, left, right = eig(lin.A - lin.B @ K, left=True)

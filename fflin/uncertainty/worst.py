@@ -14,6 +14,7 @@ from fflin.base.errors import InputError
 from fflin.base.process import Progress, in_one_thread
 from fflin.base.tables import folded
 from fflin.base.validation import Array, Mask, shaped
+from fflin.control.gain import Gain, gain_matrix, regulated_states
 from fflin.control.optimal.largest_gain import ACCURACY, gain_crossings, largest_gain
 from fflin.uncertainty.lft import LFT
 
@@ -124,8 +125,8 @@ def searched(
     model: Uncertain, lft: LFT, gain: object, samples: int, seed: int
 ) -> Worst:
     """Search for the worst closed loops; see `Uncertain.worst`."""
-    K = shaped("gain", getattr(gain, "K", gain), lft.B2.T.shape, " (nu, nx)")
-    kept = judged_states(lft, K, getattr(gain, "regulated", ()))
+    K = shaped("gain", gain_matrix(gain), lft.B2.T.shape, " (nu, nx)")
+    kept = judged_states(lft, K, regulated_states(gain))
     lft = part_of(lft, kept)
     K = K[:, kept]
     size, loops = len(lft.repeats), Loops(lft, K)
@@ -144,9 +145,10 @@ def searched(
     tried = np.vstack((middle, corners[physical], draws))
     # The disk margin is computed from (S - T)/2, with each input scaled by sqrt(R_ii), as in
     # control.gain.
-    scale = np.sqrt(getattr(gain, "R", np.eye(len(K))).diagonal())
-    disk = Gain(-scale[:, None] * K, 0.5 * np.eye(len(K)), 1.0 / scale)
-    whole = Gain(lft.C2, np.zeros((len(lft.C2), len(K))), np.ones(len(K)))
+    R = gain.R if isinstance(gain, Gain) else np.eye(len(K))
+    scale = np.sqrt(R.diagonal())
+    disk = Channel(-scale[:, None] * K, 0.5 * np.eye(len(K)), 1.0 / scale)
+    whole = Channel(lft.C2, np.zeros((len(lft.C2), len(K))), np.ones(len(K)))
     cases = []
     bar = Progress()
     undamped = Figures(
@@ -214,7 +216,7 @@ def part_of(lft: LFT, kept: Mask) -> LFT:
     )
 
 
-class Gain(NamedTuple):
+class Channel(NamedTuple):
     """Channel from w to C x + D w, where scale * w is a disturbance at the inputs."""
 
     C: Array
@@ -239,7 +241,7 @@ class Loops:
         ratios: Array = (poles.real / np.maximum(np.abs(poles), 1e-300)).max(axis=-1)
         return ratios
 
-    def gains(self, channel: Gain, rows: Array, frequencies: Array) -> Array:
+    def gains(self, channel: Channel, rows: Array, frequencies: Array) -> Array:
         """Return the largest gain (N,) over the given frequencies; infinite for unstable loops."""
         F, B = self.matrices(rows)
         largest = np.zeros(len(F))
@@ -250,7 +252,7 @@ class Loops:
             largest = np.maximum(largest, np.linalg.eigvalsh(gram)[..., -1])
         return np.where(self.undamped(rows) >= 0.0, np.inf, np.sqrt(largest))
 
-    def figures(self, channel: Gain) -> Figures:
+    def figures(self, channel: Channel) -> Figures:
         """Return the functions for the criterion "largest gain" of a channel."""
         middle = np.zeros((1, len(self.lft.repeats)))
         sizes = np.unique(np.abs(np.linalg.eigvals(self.matrices(middle)[0])))

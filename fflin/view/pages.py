@@ -19,15 +19,15 @@ from fflin.base.tables import counted
 from fflin.base.validation import Array
 from fflin.dynamics.coordinates import Frame, frame_of
 from fflin.dynamics.impact import Capture, Impact, inertia_at
-from fflin.dynamics.integrators import CommutatorFree4
+from fflin.dynamics.integrators import DEFAULT_INTEGRATOR
 from fflin.dynamics.state import Actuation, StateMap
 from fflin.linear.model import LinearModel
 from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.robot import Robot
 from fflin.simulation.motion import Motion
+from fflin.simulation.plant import Plant
 from fflin.simulation.plots import JOINTS, WHEELS, charts, resting_from
 from fflin.simulation.report import STATES, Curve
-from fflin.simulation.run import Plant
 from fflin.view.page import Drawing, Page, body_poses, packed, subtitle
 from fflin.view.shapes import carriers_of
 
@@ -284,7 +284,7 @@ def _flight(caught: Capture, frame: Frame, t: Array) -> list[Array]:
     for time in t[::-1].tolist():
         steps = math.ceil((now - time) * max(1.0 / _STEP, rate / _SWING))
         for _ in range(steps):
-            take = CommutatorFree4(payload.model, (time - now) / steps).step
+            take = DEFAULT_INTEGRATOR(payload.model, (time - now) / steps).step
             q, v = take(lambda _, q, v: plant.stage(0.0, q, v, none)[0], 0.0, q, v)
         now = time
         poses.insert(0, body_poses(payload, q))

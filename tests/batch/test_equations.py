@@ -7,8 +7,8 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from fflin.batch import sweep
 from fflin.batch.sweep import ChunkJob
+from fflin.kernel import limits
 from fflin.kernel.compiled import kernel
 from tests.support.robots import BUNDLED, LINKS, MIMIC, random_tree
 
@@ -219,7 +219,7 @@ def test_an_engine_may_be_chosen(robots, monkeypatch):
     assert compiled.A == pytest.approx(by_python.A, rel=1e-9, abs=1e-9)
     with pytest.raises(fflin.UnknownNameError, match="'fast'"):
         fflin.sweep(robot, q, engine="fast")
-    monkeypatch.setattr(sweep, "numba_is_there", lambda: False)
+    monkeypatch.setattr(limits, "numba_is_there", lambda: False)
     assert (fflin.sweep(robot, q, v, u).A == by_python.A).all()
     with pytest.raises(fflin.InputError, match=r"'compiled'.*fflin\[fast"):
         fflin.sweep(robot, q, engine="compiled")

@@ -30,7 +30,7 @@ def same_bodies(robot, other):
     [
         ("servicer_7dof", {"link_3": 0.3, "base": -0.2}),
         ("planar_detumble", {"target": 0.1, "hand": -0.5, "link_1": 2.0}),
-        ("robots/inspector.toml", {"base": 0.2, "gripper": -0.3}),
+        ("inspector.toml", {"base": 0.2, "gripper": -0.3}),
     ],
 )
 def test_a_density_is_that_of_uncertain_robots(name, changes):
@@ -131,9 +131,7 @@ def test_a_body_of_one_link_has_the_name_of_its_joint_too():
             drawn(robot, by_link | by_joint)
 
 
-@pytest.mark.parametrize(
-    "name", ["servicer_7dof", "planar_detumble", "robots/inspector.toml"]
-)
+@pytest.mark.parametrize("name", ["servicer_7dof", "planar_detumble", "inspector.toml"])
 def test_a_mass_leaves_the_inertia_about_the_centre_as_in_uncertain_robots(name):
     robot = fflin.load(name)
     links = [name for name, piece in robot.pieces.items() if not piece.whole][:4]

@@ -7,8 +7,8 @@ from scipy.integrate import solve_ivp
 
 import fflin
 from fflin.campaign.funnel import ellipsoid_axes, runs_from
-from fflin.dynamics.coordinates import moved_by, moving_error
 from fflin.dynamics.state import StateMap
+from fflin.dynamics.state_rows import moved_by, moving_error
 from tests.support.commands import refused, run
 from tests.support.messages import says
 

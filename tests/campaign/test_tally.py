@@ -14,12 +14,8 @@ from fflin.campaign.runs import (
     RunStatistics,
     kinds_of,
 )
-from fflin.dynamics.coordinates import (
-    attitude_errors,
-    moving_errors,
-    states_of,
-    unwound,
-)
+from fflin.dynamics.coordinates import unwound
+from fflin.dynamics.state_rows import attitude_errors, moving_errors, states_of
 from fflin.kernel.loop import take
 from fflin.kernel.tree import LANES
 from fflin.simulation.report import DWELL, SETTLED, THERE
@@ -74,12 +70,12 @@ def rows_of(state, rng, inputs):
 def defined(job, target, q, nu, u, stop):
     """The outcome of a run by the definitions, from all its rows at once."""
     state, dt = job.plant.state, job.plan.times.dt
-    x = unwound(
-        state, states_of(state, q, nu), target if target.ndim == 1 else target[0]
-    )
+    joints = 6 + state.unbounded
+    first = target if target.ndim == 1 else target[0]
+    x = unwound(states_of(state, q, nu), joints, first)
     e = x - target
     if target.ndim == 2:
-        e = unwound(state, moving_errors(state.frame, x, target))
+        e = unwound(moving_errors(state.frame, x, target), joints)
     kind = kinds_of(state, state.robot.wheels)
     signed = e.copy()
     e[:, kind < 0] = 0.0

@@ -481,7 +481,7 @@ def test_it_shows_a_bar_on_a_terminal_and_ends_at_ctrl_c(jobs):
 
 @pytest.mark.exhaustive
 def test_the_table_of_frames_is_what_its_command_makes():
-    frames = runpy.run_path(str(DOCS / "frames.py"))
+    frames = runpy.run_path(str(DOCS / "scripts" / "frames.py"))
     table = (DOCS / "conventions.md").read_text(encoding="utf-8")
     design = "acceleration_lqr(lin, 1, 1, 1)"
     found = frames["settled"](fflin.load("servicer_7dof"), design, 150.0)

@@ -346,9 +346,7 @@ def test_existing_output_survives_a_failure(tmp_path):
 
 def test_robots_own_file_is_never_the_output(tmp_path):
     robot = tmp_path / "robot.json"
-    robot.write_bytes(
-        (Path(__file__).parents[2] / "robots" / "cubesat.urdf").read_bytes()
-    )
+    robot.write_bytes((bundled_directory() / "cubesat.urdf").read_bytes())
     before = robot.read_bytes()
     assert "input file" in refused("linearize", robot, "-o", robot)
     assert robot.read_bytes() == before

@@ -1,14 +1,13 @@
 """A satellite with panels, an arm, thrusters and wheels, in one URDF and one TOML, flies."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 import fflin
+from fflin.robot.catalog import bundled_directory
 from tests.support.commands import run
 
-TOML = Path(__file__).parents[2] / "robots" / "inspector.toml"
+TOML = bundled_directory() / "inspector.toml"
 TANK = """
 [[slosh]]
 name = "tank"

@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import chi2
 
 import fflin
-from fflin.dynamics.coordinates import moving_error
+from fflin.dynamics.state_rows import moving_error
 
 OUTPUTS = (
     *(fflin.BasePose(), fflin.JointPositions(), fflin.FramePose("link_3")),

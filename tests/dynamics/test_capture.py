@@ -14,7 +14,7 @@ CASES = {
     "servicer_7dof": ("tool", DEBRIS),
     "planar_detumble": ("hand", DEBRIS),
     "ets_vii": ("tool", "planar_detumble"),
-    "robots/inspector.toml": ("gripper", "ets_vii"),
+    "inspector.toml": ("gripper", "ets_vii"),
 }
 
 

@@ -10,7 +10,7 @@ from tests.support.robots import LINKS, MIMIC, random_point
 CASES = {
     "servicer_7dof": ["joint_3", "panel_left"],
     "ets_vii": "joint_2",
-    "robots/inspector.toml": "hinge_*",
+    "inspector.toml": "hinge_*",
 }
 
 

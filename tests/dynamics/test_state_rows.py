@@ -5,8 +5,9 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from fflin.dynamics.coordinates import moving_error, state_history, states_of, unwound
+from fflin.dynamics.coordinates import unwound
 from fflin.dynamics.integrators import integrator
+from fflin.dynamics.state_rows import moving_error, state_history, states_of
 from tests.support.marks import exhaustive
 from tests.support.robots import BUNDLED, FRAMES, random_pose
 from tests.support.weights import unit_weights
@@ -31,7 +32,8 @@ def test_feedback_reads_the_state_whose_angles_are_near(name, frame):
     near = 5.0 * rng.normal(size=state.nx)
     for _ in range(10):
         q, v = anywhere(robot, rng)
-        x = unwound(state, states_of(state, q, state.velocities(v)), near)
+        joints = 6 + state.unbounded
+        x = unwound(states_of(state, q, state.velocities(v)), joints, near)
         np.testing.assert_allclose(x, state.to_state(q, v, near=near), atol=1e-12)
         apart = (x - near)[6 + state.unbounded]
         assert (np.abs(apart) <= np.pi + 1e-12).all()

@@ -15,7 +15,8 @@ from fflin.kernel.forward import ActuatorFaults, kept_at
 from fflin.kernel.tree import laid_out
 from fflin.simulation.lanes import noises, packed
 from fflin.simulation.plan import Plan, SimulationOptions
-from fflin.simulation.run import STOPS, Plant, go, stop_conditions, stop_of
+from fflin.simulation.plant import Plant
+from fflin.simulation.run import STOPS, go, stop_conditions, stop_of
 from tests.support.marks import exhaustive
 from tests.support.motions import HOME, displaced
 from tests.support.motions import motion as trajectory

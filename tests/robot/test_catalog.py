@@ -3,13 +3,14 @@
 import re
 import xml.etree.ElementTree as ET
 from math import pi
-from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 import pytest
 
-ROBOTS = Path(__file__).parents[2] / "robots"
+from fflin.robot.catalog import bundled_directory
+
+ROBOTS = bundled_directory()
 
 # name: number of joints, total mass in kg, frames of tools or hands
 SUMMARY = {

@@ -8,7 +8,7 @@ import pytest
 
 import fflin
 from fflin.dynamics.state import StateMap
-from fflin.robot.equipment.assembly import _mounted_modes
+from fflin.robot.equipment.assembly import mounted_modes
 from tests.robot.test_appendages import (
     beam,
     clamped_roots,
@@ -213,7 +213,7 @@ def test_balls_of_columns_of_all_sizes_have_momentum_and_modal_mass(count):
         total = np.repeat([np.square(t).sum(), np.square(r).sum()], 3)
         allowed = 1.01e-12 * np.sqrt(np.maximum(total, 1e-6 * scales))
         for ball, column in zip(
-            _mounted_modes(link.model, bodies, [array]),
+            mounted_modes(link.model, bodies, [array]),
             np.vstack((t, r)).T,
             strict=True,
         ):

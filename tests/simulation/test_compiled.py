@@ -9,11 +9,12 @@ import pinocchio as pin
 import pytest
 
 import fflin
+from fflin.kernel import limits
 from fflin.kernel.compiled import ENGINES
 from fflin.kernel.tree import batch_tree
 from fflin.simulation import lanes, run
 from fflin.simulation.plan import Plan, SimulationOptions
-from fflin.simulation.run import Plant
+from fflin.simulation.plant import Plant
 from tests.support.measured import POSITIONS, designed
 from tests.support.motions import HOME, displaced
 from tests.support.motions import motion as trajectory
@@ -338,7 +339,7 @@ def test_what_cannot_be_compiled_says_why(robots):
         fflin.simulate(robot, duration=0.1, engine="compile")
     monkeypatched = pytest.MonkeyPatch()
     with monkeypatched.context() as patch:
-        patch.setattr(lanes, "numba_is_there", lambda: False)
+        patch.setattr(limits, "numba_is_there", lambda: False)
         with pytest.raises(fflin.InputError, match="numba"):
             fflin.simulate(robot, **options)
 

@@ -8,7 +8,6 @@ import fflin
 from fflin.dynamics.integrators import (
     CommutatorFree4,
     SemiImplicitEuler,
-    integrated_hold,
 )
 from fflin.simulation.pace import Pace, Poles, Signal, rotation, shorter, step_error
 from tests.support.robots import free_body
@@ -46,7 +45,7 @@ def test_growth_is_the_growth_of_a_step_of_the_method(pole):
     A = np.array([[0.0, 1.0], [-(abs(pole) ** 2), 2.0 * pole.real]])
     if pole.imag == 0.0:
         A = np.array([[pole.real]])
-    step, _ = integrated_hold(A, np.zeros((len(A), 0)), h)
+    step, _ = CommutatorFree4.held(A, np.zeros((len(A), 0)), h)
     exact = np.log(np.abs(np.linalg.eigvals(step)).max())
     assert CommutatorFree4.growth(np.array([pole * h]))[0] == pytest.approx(
         exact, rel=1e-9

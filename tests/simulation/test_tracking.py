@@ -7,7 +7,7 @@ import pytest
 import fflin
 from benchmarks.cases.trajectory import beside as beside_knots
 from benchmarks.cases.trajectory import flown
-from fflin.dynamics.coordinates import moved_by, moving_error, moving_errors
+from fflin.dynamics.state_rows import moved_by, moving_error, moving_errors
 from tests.support.marks import exhaustive
 from tests.support.messages import says
 from tests.support.motions import beside, swung

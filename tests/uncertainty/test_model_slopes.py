@@ -61,7 +61,7 @@ def test_centre_of_mass_and_momentum_as_by_complex_steps(name):
 
 
 @pytest.mark.parametrize("frame", ["hybrid", "local", "world"])
-@pytest.mark.parametrize("name", ["servicer_7dof", "robots/inspector.toml"])
+@pytest.mark.parametrize("name", ["servicer_7dof", "inspector.toml"])
 @pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
 def test_their_rows_of_C_as_by_differences(name, frame):
     robot = fflin.load(name)

@@ -139,7 +139,7 @@ def test_in_motion_as_by_differences(name, frame, moving):
 
 
 def test_springs_dampers_thrusters_and_wheels():
-    robot = fflin.load("robots/inspector.toml")
+    robot = fflin.load("inspector.toml")
     rng = np.random.default_rng(3)
     q, v, _ = random_point(robot, rng, degrees=40.0, speed=0.3)
     inputs = list(robot.inputs)
@@ -304,7 +304,7 @@ def test_what_is_wrong_is_one_line():
 
 @pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
 def test_its_check_takes_wheels_whose_bodies_have_no_mass():
-    robot = fflin.load("robots/inspector.toml")
+    robot = fflin.load("inspector.toml")
     found = fflin.sensitivity(fflin.linearize(robot)).check(
         ["wheel_x.inertia", "wheel_z.inertia"]
     )

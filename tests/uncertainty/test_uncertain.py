@@ -32,7 +32,7 @@ CASES = {
         "hand.mass": 0.5,
         "link_1.com.y": (-0.02, 0.01),
     },
-    "robots/inspector.toml": {
+    "inspector.toml": {
         "base.density": 0.1,
         "wheel_x.inertia": 0.2,
         "top_left_front.position.z": 0.1,

@@ -8,7 +8,7 @@ import pytest
 
 import fflin
 from fflin.uncertainty import worst
-from fflin.uncertainty.worst import Gain, Loops
+from fflin.uncertainty.worst import Channel, Loops
 
 FOUR = {
     "base.mass": 0.2,
@@ -28,12 +28,12 @@ def servicer():
 
 def disk_of(gain):
     scale = np.sqrt(gain.R.diagonal())
-    return Gain(-scale[:, None] * gain.K, 0.5 * np.eye(len(scale)), 1.0 / scale)
+    return Channel(-scale[:, None] * gain.K, 0.5 * np.eye(len(scale)), 1.0 / scale)
 
 
 def whole_of(loops):
     C = loops.lft.C2
-    return Gain(C, np.zeros((len(C), len(loops.K))), np.ones(len(loops.K)))
+    return Channel(C, np.zeros((len(C), len(loops.K))), np.ones(len(loops.K)))
 
 
 @pytest.mark.parametrize("drawn", [80, pytest.param(400, marks=pytest.mark.exhaustive)])

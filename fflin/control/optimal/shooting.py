@@ -1,6 +1,7 @@
 """Multiple shooting: initial guess, motions of the intervals, gaps between them, Jacobians."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from functools import partial
 
 import numpy as np
 import pinocchio as pin
@@ -9,7 +10,11 @@ from fflin.base.rotation import rotation_matrices
 from fflin.base.validation import Array
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.coordinates import PIN_ANGULAR, PIN_LINEAR
-from fflin.dynamics.integrators import CommutatorFree4, integrate_rows
+from fflin.dynamics.integrators import (
+    DEFAULT_INTEGRATOR,
+    CommutatorFree4,
+    integrate_rows,
+)
 from fflin.dynamics.state import StateMap
 from fflin.linear.linearization import Linearizer
 from fflin.linear.trajectory import cubic
@@ -86,7 +91,7 @@ class Shooting:
         steps = steps or max(self.steps, _STEPS)
         h = self.h[0]
         change = 0.0 * first if self.held else np.diff(u, axis=0)
-        method = CommutatorFree4(self.state.robot.model, h / steps, len(q))
+        method = DEFAULT_INTEGRATOR(self.state.robot.model, h / steps, len(q))
         points = [(q, v)]
 
         def rate(t: float, q: Array, v: Array) -> Array:
@@ -158,7 +163,9 @@ class Shooting:
         the points that divide each interval into equal parts.
         """
         # Integrate dZ/dt = A Z + `driven` along the motions by Runge-Kutta steps. Z contains the
-        # Jacobians of all intervals, and `driven` contains B for the inputs at both knots.
+        # Jacobians of all intervals, and `driven` contains B for the inputs at both knots. The
+        # stages of these steps are at the beginning, the middle and the end of the step, where the
+        # linear models are computed.
         N = len(self.h)
         nx = len(self._size)
         nu = u.shape[1]
@@ -176,23 +183,13 @@ class Shooting:
         A = self._size[:, None] * A / self._size
         driven = np.concatenate((np.zeros_like(A), (1.0 - late) * B, late * B), axis=3)
         h = self.h[0] / steps
-        Z = np.tile(np.eye(nx, nx + 2 * nu), (N, 1, 1))
+        Z: Array = np.tile(np.eye(nx, nx + 2 * nu), (N, 1, 1))
         fractions = np.arange(1, parts) / parts * steps
         inside = list[Array]()
         for step in range(steps):
             F = [(A[:, k], driven[:, k]) for k in range(2 * step, 2 * step + 3)]
-            total = np.zeros_like(Z)
-            rate = np.zeros_like(Z)
             before = Z
-            for i, fraction, weight in (
-                (0, 0.0, 1.0),
-                (1, 0.5, 2.0),
-                (1, 0.5, 2.0),
-                (2, 1.0, 1.0),
-            ):
-                rate = F[i][0] @ (Z + fraction * h * rate) + F[i][1]
-                total = total + weight * rate
-            Z = Z + h / 6.0 * total
+            Z = CommutatorFree4.vector_step(partial(_rate, F), h, Z)
             begin, end = (h * (f[0] @ z + f[1]) for f, z in ((F[0], before), (F[2], Z)))
             coefficients = cubic(before, Z, begin, end)
             within = (fractions >= step) & (fractions < step + 1)
@@ -249,3 +246,12 @@ class Shooting:
         by_u, rates = by_u[:, kept], rates[:, kept]
         inputs: Array = (np.linalg.pinv(by_u, 1e-9) @ rates)[..., 0]
         return inputs
+
+
+def _rate(F: Sequence[tuple[Array, Array]], node: float, Z: Array) -> Array:
+    """Return A Z + `driven` at the fraction `node` of a step.
+
+    F contains A and `driven` at the beginning, the middle and the end of the step.
+    """
+    A, driven = F[round(2.0 * node)]
+    return A @ Z + driven

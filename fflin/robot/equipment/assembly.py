@@ -16,14 +16,12 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import FflinWarning, InputError
-from fflin.base.names import stands_for_any
 from fflin.base.validation import Array, frozen
 from fflin.robot.equipment.appendages import (
     Appendage,
@@ -31,13 +29,9 @@ from fflin.robot.equipment.appendages import (
     Slosh,
     rigid_inertia,
 )
-from fflin.robot.inputs import Input, ReactionWheel, checked_inputs, named_wheels
+from fflin.robot.inputs import Input, ReactionWheel, named_wheels
 from fflin.robot.joints import ROOT, Joint, find_frame
-from fflin.robot.mass_properties import as_inertia, link_mass
 from fflin.robot.urdf.description import is_impossible
-
-if TYPE_CHECKING:
-    from fflin.robot.robot import Robot
 
 # For the rigid inertia M_rr (6, 6) of a body, M_rr - L L^T must be positive semidefinite. A
 # negative eigenvalue counts as a rounding error if its magnitude is at most this fraction of the
@@ -68,158 +62,6 @@ _NONE = 1e-24
 # origin of the appendage's frame. From the second bound on, the ball is where r' is parallel to t.
 _TURNS, _MOVES = 1e-8, 1e-4
 
-# Fields of a robot that have joint names as keys, possibly in nested mappings. A key may also have
-# the form GROUP.JOINT, where GROUP is one of _GROUPS.
-_BY_NAME = (
-    *("stiffness", "damping", "rest", "urdf_damping", "limits", "weights"),
-    *("point", "target", "start"),
-)
-_GROUPS = ("q_m", "qdot_m", "tau_m", "wheel")
-
-
-def equipped(
-    robot: Robot,
-    bare: Robot | None = None,
-    *,
-    inputs: object = None,
-    appendages: Sequence[Appendage] | None = None,
-) -> Robot:
-    """Return a robot with new inputs, new appendages or a new bare robot.
-
-    The bare robot is the robot without the joints of wheels and modes. If an argument is omitted,
-    the robot keeps the old value. Each mode becomes a joint, and so does each wheel with an
-    inertia. If a joint no longer exists, its entries are removed from fields such as `stiffness`.
-    """
-    before = robot._bare
-    bare = bare or robot._bare
-    inputs = robot.inputs if inputs is None else inputs
-    checked = checked_inputs(inputs, bare, robot.passive)
-    model, joints, followers = bare.model, bare.joints, bare.followers
-    bodies = [pin.Inertia(body) for body in model.inertias.tolist()]
-    parts = _mounted_wheels(model, bodies, checked)
-    items = robot.appendages if appendages is None else tuple(appendages)
-    parts += _mounted_modes(model, bodies, items)
-    if parts:
-        taken = {*model.names, *(frame.name for frame in model.frames.tolist())}
-        for part in parts:
-            if part.joint.name in taken:
-                raise InputError(
-                    f"'{part.joint.name}' has the name of another joint, frame, wheel or mode of "
-                    "the robot; give the wheel or the appendage another name"
-                )
-            taken.add(part.joint.name)
-        model = _with_mounted(model, bodies, parts)
-        placed = [
-            joint.within(model) for joint in (*joints, *(part.joint for part in parts))
-        ]
-        joints = tuple(sorted(placed, key=lambda joint: joint.idx_v))
-        followers = tuple(follower.within(model) for follower in followers)
-    names = [joint.name for joint in joints]
-    gone = [name for name in robot.joint_names if name not in names]
-    fields = {x: _without(getattr(robot, x), gone, names) for x in _BY_NAME if gone}
-    modes = {joint.name for joint in robot.modes}
-    # Reset the springs of the modes only if appendages are given. Otherwise keep them, because the
-    # user may have changed them.
-    reset = () if appendages is None else ("stiffness", "damping")
-    for name in reset:
-        of_joints = fields.get(name, getattr(robot, name))
-        fields[name] = {k: x for k, x in of_joints.items() if k not in modes}
-        for item in items:
-            fields[name] |= item.springs[name]
-    # Remember only the names of removed wheels and modes. All other removed joints were locked.
-    removed = (
-        name for name in (*robot._removed, *gone) if name not in before.joint_names
-    )
-    changed: dict[str, Any] = {
-        **fields,
-        "model": model,
-        "joints": joints,
-        "followers": followers,
-        "inputs": checked,
-    }
-    return replace(
-        robot,
-        **changed,
-        links=bare.links,
-        urdf_sha256=bare.urdf_sha256,
-        appendages=items,
-        _unequipped=bare if parts else None,
-        _removed=tuple(name for name in dict.fromkeys(removed) if name not in names),
-    )
-
-
-def _without(
-    table: Mapping[str, object], gone: list[str], left: list[str]
-) -> dict[str, object]:
-    """Return a mapping without the keys that match only removed joints.
-
-    Mappings inside this mapping are reduced in the same way.
-    """
-    removed = [f"{group}.{name}" for group in _GROUPS for name in gone]
-    others = [f"{group}.{name}" for group in _GROUPS for name in left]
-    kept: dict[str, object] = {}
-    for key, value in table.items():
-        if stands_for_any(key, removed) and not stands_for_any(key, others):
-            continue
-        if isinstance(value, Mapping):
-            kept[key] = _without(value, gone, left)
-        else:
-            kept[key] = value
-    return kept
-
-
-def with_appendages(robot: Robot, appendages: object) -> Robot:
-    """Return a robot with new appendages (flexible or slosh), whose modes become joints."""
-    given = [appendages] if isinstance(appendages, Appendage) else appendages
-    if not isinstance(given, Sequence) or not all(
-        isinstance(item, Appendage) for item in given
-    ):
-        raise InputError(
-            f"appendages is {given!r}, expected a list of FlexibleAppendage and Slosh"
-        )
-    bare = robot._bare
-    taken = set[int]()
-    for item in given:
-        if not isinstance(item, FlexibleAppendage) or item.inertia is None:
-            continue
-        # The inertia `file_inertia` is compared with `present_inertia`, or replaces it. The present
-        # inertia belongs to the link `item.frame`, or to the whole body if this frame is not a
-        # link.
-        joint, placement = find_frame(bare.model, item.frame)
-        body = bare.model.inertias[joint]
-        owner = f"the body with frame '{item.frame}'"
-        file_inertia = rigid_inertia(item.inertia)
-        present_inertia = body
-        links = bare.links
-        if item.frame in bare.pieces:
-            present_inertia = as_inertia(bare.pieces[item.frame])
-            owner = f"link '{item.frame}'"
-        if not item.rigid:
-            _compare_inertia(
-                item,
-                item.inertia,
-                present_inertia.se3Action(placement.inverse()),
-                owner,
-            )
-            continue
-        if joint in taken:
-            raise InputError(
-                f"'{item.title}' is the second appendage with rigid=True on its body; use "
-                "rigid=True for only one appendage of each body"
-            )
-        taken.add(joint)
-        if item.frame in links:
-            links = {**links, item.frame: link_mass(file_inertia)}
-        body = body - present_inertia + file_inertia.se3Action(placement)
-        bare = replace(bare.with_bodies({joint: body}), links=links)
-    items: list[Appendage] = []
-    for item in given:
-        if isinstance(item, FlexibleAppendage):
-            items.append(replace(item, rigid=False))
-        else:
-            items.append(item)
-    return equipped(robot, bare, appendages=items)
-
 
 class Mounted(NamedTuple):
     """Body that is mounted on a carrier, and the joint between body and carrier.
@@ -238,7 +80,7 @@ class Mounted(NamedTuple):
     armature: float = 0.0
 
 
-def _with_mounted(
+def with_mounted(
     model: pin.Model, bodies: list[pin.Inertia], parts: list[Mounted]
 ) -> pin.Model:
     """Return a model with new joints for `parts`; the old joints get the inertias `bodies`.
@@ -312,20 +154,22 @@ def carrier(model: pin.Model, wheel: ReactionWheel) -> tuple[int, Array]:
     return joint, placement.rotation @ np.array(wheel.axis)
 
 
-def stored_momentum(robot: Robot) -> tuple[tuple[int, Array], ...]:
+def stored_momentum(
+    model: pin.Model, inputs: Sequence[Input]
+) -> tuple[tuple[int, Array], ...]:
     """Return the constant momentum of the wheels without inertia, summed for each carrying joint.
 
     Each entry is (index of the joint, angular momentum (3,) [N m s] in the axes of the joint).
     """
     stored: dict[int, Array] = {}
-    for wheel in robot.inputs:
+    for wheel in inputs:
         if isinstance(wheel, ReactionWheel) and wheel.momentum:
-            joint, axis = carrier(robot.model, wheel)
+            joint, axis = carrier(model, wheel)
             stored[joint] = stored.get(joint, np.zeros(3)) + wheel.momentum * axis
     return tuple(zip(stored, map(frozen, stored.values()), strict=True))
 
 
-def _mounted_wheels(
+def mounted_wheels(
     model: pin.Model, bodies: list[pin.Inertia], inputs: Sequence[Input]
 ) -> list[Mounted]:
     """Return a mounted body for each wheel with inertia.
@@ -392,7 +236,7 @@ def _carried(model: pin.Model, item: Appendage) -> tuple[int, pin.SE3, Array]:
     return joint, placement, placement.toDualActionMatrix() @ item.participation
 
 
-def _mounted_modes(
+def mounted_modes(
     model: pin.Model, bodies: list[pin.Inertia], appendages: Sequence[Appendage]
 ) -> list[Mounted]:
     """Return a mounted body for each mode.
@@ -468,7 +312,7 @@ def effective_shares(
     return shares_of_mode
 
 
-def _compare_inertia(
+def compare_inertia(
     appendage: FlexibleAppendage, inertia: Array, of_urdf: pin.Inertia, what: str
 ) -> None:
     """Warn if the rigid inertia in an appendage's file differs from the inertia in the URDF."""
@@ -486,7 +330,7 @@ def _compare_inertia(
             "the moments of inertia; correct the URDF, or use the inertia of the file with "
             "rigid=True",
             FflinWarning,
-            stacklevel=5,
+            stacklevel=6,
         )
 
 
@@ -524,14 +368,17 @@ def _least_eigenvalue(mass: Array, center: Array, inertia: Array, L: Array) -> A
 
 
 def first_impossible(
-    robot: Robot, bodies: Mapping[int, tuple[Array, Array, Array]]
+    model: pin.Model,
+    appendages: Sequence[Appendage],
+    bodies: Mapping[int, tuple[Array, Array, Array]],
 ) -> int | None:
     """Return the index of the first sample in which a body has too little inertia for its modes.
 
-    `bodies` maps joint indices of the bare robot to the masses (N,), centres of mass (N, 3) and
-    inertias (N, 3, 3) of N samples. The result is None if all samples are possible.
+    `model` is the model without wheels and modes. `bodies` maps its joint indices to the masses
+    (N,), centres of mass (N, 3) and inertias (N, 3, 3) of N samples. The result is None if all
+    samples are possible.
     """
-    carried = [_carried(robot._bare.model, item) for item in robot.appendages]
+    carried = [_carried(model, item) for item in appendages]
     impossible = []
     for joint, rows in bodies.items():
         if of_body := [L for carrier, _, L in carried if carrier == joint]:

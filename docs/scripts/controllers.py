@@ -1,4 +1,4 @@
-"""Make docs/controllers.png from docs/guide/controllers.md: ``python docs/controllers.py``."""
+"""Make docs/controllers.png from a page of the guide: ``python docs/scripts/controllers.py``."""
 
 import os
 import re
@@ -7,13 +7,13 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 
-HERE = Path(__file__).resolve().parent
+DOCS = Path(__file__).resolve().parents[1]
 NAMES = ("PD with a direct term", "H-infinity, weighed as an integral")
 
 
 def main() -> None:
     """Run the code of the page and draw its last two motions."""
-    page = (HERE / "guide" / "controllers.md").read_text(encoding="utf-8")
+    page = (DOCS / "guide" / "controllers.md").read_text(encoding="utf-8")
     toml, *_ = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
     code, own = "\n".join(re.findall(r"```python\n(.*?)```", page, re.DOTALL)), {}
     with tempfile.TemporaryDirectory() as folder:
@@ -28,7 +28,7 @@ def main() -> None:
         each.set(title=title, xlabel="time [s]")
         each.grid(color="#dddddd", linewidth=0.6)
         each.legend(frameon=False)
-    figure.savefig(HERE / "controllers.png", dpi=110)
+    figure.savefig(DOCS / "controllers.png", dpi=110)
 
 
 if __name__ == "__main__":

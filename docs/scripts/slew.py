@@ -1,4 +1,4 @@
-"""Draw docs/mpc.png, a slew under a saturated LQR and under MPC: ``python docs/slew.py``.
+"""Draw docs/mpc.png, a slew under a saturated LQR and under MPC: ``python docs/scripts/slew.py``.
 
 The base returns from 90 deg with a strong torque, while the joint torques are weak.
 """
@@ -47,7 +47,7 @@ def main() -> None:
             each.set_ylim(low.min(), high.max())
     axes[1, 1].legend(loc="lower right", fontsize=8, title="dashed: joint limits of the panels")
     figure.tight_layout()
-    figure.savefig(Path(__file__).with_name("mpc.png"), dpi=110)
+    figure.savefig(Path(__file__).parents[1] / "mpc.png", dpi=110)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Redraw the pictures of pages: ``python docs/pictures.py capture uncertain_models``.
+"""Redraw the pictures of pages: ``python docs/scripts/pictures.py capture uncertain_models``.
 
 Run the Python of each page of docs/guide in a temporary folder and keep the figures that it saves.
 A page that shows NAME_scene.png also gets a strip of pictures of its `motion` under this name.
@@ -13,7 +13,7 @@ from pathlib import Path
 
 import fflin
 
-DOCS = Path(__file__).resolve().parent
+DOCS = Path(__file__).resolve().parents[1]
 
 for page in sys.argv[1:]:
     text = (DOCS / "guide" / f"{page}.md").read_text(encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Print the table of docs/conventions.md on frames: ``python docs/frames.py [ROBOT ...]``.
+"""Print the table of docs/conventions.md on frames: ``python docs/scripts/frames.py [ROBOT ...]``.
 
 The table counts the loops that settle with feedback in each frame. Each of ten random postures
 within the joint limits starts with the base rotated about a random axis and displaced by 0.5 m per

@@ -1,4 +1,4 @@
-"""Draw the rooms of the package and their imports from the code: ``python docs/rooms.py``."""
+"""Draw the rooms of the package and their imports: ``python docs/scripts/rooms.py``."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections import Counter
 from html import escape
 from pathlib import Path
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 PICTURE = ROOT / "docs" / "rooms.svg"
 
 # Dimensions of the page, in pixels.

@@ -1,0 +1,83 @@
+"""The limits of the compiled engine: each has a reason, and every function states it."""
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import fflin
+from fflin.kernel import limits
+from fflin.kernel.limits import LIMITS, Task, reason_against
+from fflin.robot.joints import ROOT
+
+CUBESAT = fflin.load("cubesat")
+IN_ORBIT = CUBESAT.replace(orbit=500e3)
+
+
+def with_displaced_root():
+    model = CUBESAT.model.copy()
+    model.jointPlacements[ROOT] = pin.SE3(np.eye(3), np.array([0.0, 0.0, 1.0]))
+    return fflin.from_model(model, name="displaced")
+
+
+def with_displaced_axis():
+    """A robot with a joint whose axis does not pass through the origin of its frame."""
+    hinge = pin.JointModelComposite(1)
+    hinge.addJoint(pin.JointModelRX(), pin.SE3(np.eye(3), np.array([0.1, 0.4, -0.3])))
+    model = CUBESAT.model.copy()
+    body = pin.Inertia(1.0, np.zeros(3), np.diag([0.3, 0.4, 0.5]))
+    joint = model.addJoint(ROOT, hinge, pin.SE3.Identity(), "hinge")
+    model.appendBodyToJoint(joint, body, pin.SE3.Identity())
+    return fflin.from_model(model, name="composite")
+
+
+TASKS = {
+    "the outputs are not the state": Task(robots=(CUBESAT,), outputs=True),
+    "events are computed in Python": Task(robots=(CUBESAT,), events=True),
+    "callbacks are called in Python": Task(robots=(CUBESAT,), callback=True),
+    "disturbances are computed in Python": Task(robots=(CUBESAT,), disturbance=True),
+    "a Mpc is computed in Python": Task(robots=(CUBESAT,), python_policy="Mpc"),
+    "'cubesat' is in orbit": Task(robots=(CUBESAT, IN_ORBIT)),
+    "a joint of 'composite' does not": Task(robots=(with_displaced_axis(),)),
+    "the root joint of 'displaced'": Task(
+        robots=(with_displaced_root(),), simulated=True
+    ),
+    "its sample time differs": Task(robots=(CUBESAT,), own_sample_time=True),
+    "noise is evaluated at every stage": Task(robots=(CUBESAT,), noise_at_stages=True),
+    "no frame": Task(robots=(CUBESAT,), measurements="no frame"),
+}
+
+
+def test_each_limit_has_a_task_whose_reason_it_is(monkeypatch):
+    monkeypatch.setattr(limits, "numba_is_there", lambda: True)
+    met = []
+    for reason, task in TASKS.items():
+        assert reason_against(task).startswith(reason)
+        met.append(next(i for i, limit in enumerate(LIMITS) if limit.subject(task)))
+    assert reason_against(Task(robots=(CUBESAT,), simulated=True)) == ""
+    assert reason_against(Task(robots=(with_displaced_root(),))) == ""
+    monkeypatch.setattr(limits, "numba_is_there", lambda: False)
+    assert "numba" in reason_against(Task(robots=(CUBESAT,)))
+    assert sorted([0, *met]) == list(range(len(LIMITS)))
+
+
+def test_sweeps_simulations_and_campaigns_state_the_same_reason(monkeypatch):
+    monkeypatch.setattr(limits, "numba_is_there", lambda: True)
+    options = {"engine": "compiled"}
+    with pytest.raises(fflin.InputError, match="'cubesat' is in orbit"):
+        fflin.sweep(IN_ORBIT, IN_ORBIT.neutral()[None], **options)
+    with pytest.raises(fflin.InputError, match="'cubesat' is in orbit"):
+        fflin.simulate(IN_ORBIT, duration=1.0, **options)
+    with pytest.raises(fflin.InputError, match="'cubesat' is in orbit"):
+        fflin.monte_carlo(
+            IN_ORBIT, None, {"q_b": 0.02}, runs=2, duration=1.0, **options
+        )
+
+
+def test_a_campaign_states_why_its_runs_were_simulated_in_python(monkeypatch):
+    monkeypatch.setattr(limits, "numba_is_there", lambda: True)
+    runs = fflin.monte_carlo(IN_ORBIT, None, {"q_b": 0.02}, runs=2, duration=0.1)
+    (note,) = runs.notes
+    assert note.startswith("simulated in Python, because 'cubesat' is in orbit")
+    assert note in " ".join(str(runs).split())
+    options = {"runs": 2, "duration": 0.1, "engine": "python"}
+    assert fflin.monte_carlo(IN_ORBIT, None, {"q_b": 0.02}, **options).notes == ()
