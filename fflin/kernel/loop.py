@@ -302,7 +302,7 @@ def advance(words, clock, last, every, rows, work):
 
     If `every` is not 0, the function writes a row into `rows` at every step that is a multiple of
     `every`. A row consists of q, nu, u, the reference momentum (6,) and the reference centre of
-    mass (3,). `work` has `Tree.size` entries.
+    mass (3,). `work` has `WorkOffsets.size` entries.
     """
     arguments = ARGUMENTS(words)
     robot, method, law, channel, kept = (

@@ -76,7 +76,9 @@ def advanced(plan, about=None, every=1, cuts=()):
     clock, pieces = np.zeros(1, dtype=int), []
     for last in (*cuts, times.steps):
         rows, first = np.zeros((times.steps, width)), clock[0]
-        loop.advance(parts, clock, last, every, rows.ravel(), np.zeros(robot.tree.size))
+        loop.advance(
+            parts, clock, last, every, rows.ravel(), np.zeros(robot.tree.offsets.size)
+        )
         count = -(-clock[0] // every) - -(-first // every) if every else 0
         assert not rows[count:].any()
         pieces.append(rows[:count])
