@@ -317,10 +317,8 @@ def sweep(arguments: Namespace) -> Report:
     path = arguments.output_file
     robot = load_robot(arguments)
     settings = {"frame": arguments.frame, "reference": reference_of(arguments)}
-    linearizer, (q, v, u) = (
-        fflin.Linearizer(robot, **settings),
-        _points(robot, arguments),
-    )
+    linearizer = fflin.Linearizer(robot, **settings)
+    q, v, u = _points(robot, arguments)
     size = len(q) * ChunkJob(linearizer, at_rest=v is None and u is None).row_bytes
     part = part_of(path)
     needs = f"{size / 1e9:,.1f} GB" if size >= 1e9 else f"{size / 1e3:,.1f} kB"

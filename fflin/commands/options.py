@@ -5,11 +5,9 @@ from fflin.base.writing import RECORDS
 _SAVED = ", ".join(RECORDS)
 
 # Titles of the groups of options in the help.
-POINT, ROBOT, OUTPUT = (
-    "operating point",
-    "robot (these options override robot.toml)",
-    "output",
-)
+POINT = "operating point"
+ROBOT = "robot (these options override robot.toml)"
+OUTPUT = "output"
 TRAJECTORY, CONTROLLER, SIMULATION = "trajectory", "controller", "simulation"
 
 _POSE = "joint rpy position velocity"

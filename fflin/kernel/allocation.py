@@ -229,13 +229,11 @@ def _write_force(work, robot, point, columns, at):
 @called
 def solve(problem, size, lane):
     """Write the solution x for one lane to `problem.x`; x is NaN if the given force is NaN."""
-    x, A, low, high, wanted = (
-        problem.x,
-        problem.A,
-        problem.low,
-        problem.high,
-        problem.wanted,
-    )
+    x = problem.x
+    A = problem.A
+    low = problem.low
+    high = problem.high
+    wanted = problem.wanted
     least = problem.least
     most = problem.most
     count = len(problem.least)

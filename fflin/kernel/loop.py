@@ -305,13 +305,11 @@ def advance(words, clock, last, every, rows, work):
     mass (3,). `work` has `WorkOffsets.size` entries.
     """
     arguments = ARGUMENTS(words)
-    robot, method, law, channel, kept = (
-        arguments.robot,
-        arguments.method,
-        arguments.law,
-        arguments.channel,
-        arguments.reference,
-    )
+    robot = arguments.robot
+    method = arguments.method
+    law = arguments.law
+    channel = arguments.channel
+    kept = arguments.reference
     # `at` is the index of the next entry in `rows`
     point = arguments.point
     h = method.h

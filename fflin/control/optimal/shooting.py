@@ -223,10 +223,8 @@ class Shooting:
         rates[1, PIN_ANGULAR] = np.linalg.lstsq(
             jacobian, rates[1, PIN_ANGULAR], rcond=1e-6
         )[0]
-        late, bend = (
-            3 * difference - 2 * rates[0] - rates[1],
-            rates.sum(axis=0) - 2 * difference,
-        )
+        late = 3 * difference - 2 * rates[0] - rates[1]
+        bend = rates.sum(axis=0) - 2 * difference
         displacements = s * (rates[0] + s * (late + s * bend))
         v = (rates[0] + s * (2 * late + 3 * s * bend)) / T
         q = np.array([pin.integrate(model, start[0], step) for step in displacements])

@@ -71,8 +71,15 @@ _TURNS, _MOVES = 1e-8, 1e-4
 # Fields of a robot that have joint names as keys, possibly in nested mappings. A key may also have
 # the form GROUP.JOINT, where GROUP is one of _GROUPS.
 _BY_NAME = (
-    *("stiffness", "damping", "rest", "urdf_damping", "limits", "weights"),
-    *("point", "target", "start"),
+    "stiffness",
+    "damping",
+    "rest",
+    "urdf_damping",
+    "limits",
+    "weights",
+    "point",
+    "target",
+    "start",
 )
 _GROUPS = ("q_m", "qdot_m", "tau_m", "wheel")
 
@@ -109,9 +116,8 @@ def equipped(
                 )
             taken.add(part.joint.name)
         model = _with_mounted(model, bodies, parts)
-        placed = [
-            joint.within(model) for joint in (*joints, *(part.joint for part in parts))
-        ]
+        mounted = [part.joint for part in parts]
+        placed = [joint.within(model) for joint in (*joints, *mounted)]
         joints = tuple(sorted(placed, key=lambda joint: joint.idx_v))
         followers = tuple(follower.within(model) for follower in followers)
     names = [joint.name for joint in joints]
