@@ -139,6 +139,28 @@ def test_far_joints_are_confirmed_as_far_as_m_is():
     assert fflin.check(robot, fflin.linearize(robot)).ok
 
 
+@pytest.mark.parametrize(("fraction", "ok"), [(0.7, True), (1.4, False)])
+def test_the_error_allowed_in_m_inverse_is_100_rounding_errors_times_the_condition(
+    fraction, ok
+):
+    """An inverse with the relative error e has the residual M M^-1 - I = e I.
+
+    The error of the inverse before is below 2 % of the allowed one.
+    """
+    model = fflin.load("dual_arm").model.copy()
+    model.jointPlacements[4] = pin.SE3(np.eye(3), np.array([3e3, 0.0, 0.0]))
+    robot = fflin.from_model(model)
+    lin = fflin.linearize(robot)
+    allowed = 100.0 * np.finfo(float).eps * lin.certificate.condition
+    assert 1e-9 < allowed < 1e-2
+    assert lin.certificate.inertia_residual < 0.02 * allowed
+    B = lin.B * (1.0 + fraction * allowed)
+    rows = fflin.check(robot, replace(lin, B=B)).rows
+    (row,) = [row for row in rows if row.block == "M M^-1 = I"]
+    assert row.error == pytest.approx(fraction * allowed, rel=0.05)
+    assert row.ok is ok
+
+
 def test_not_a_number_is_not_ok():
     robot = fflin.load("cubesat")
     lin = fflin.linearize(robot)
