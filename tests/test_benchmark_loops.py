@@ -80,7 +80,7 @@ def test_wheels_are_counted_in_the_body():
     assert welded(loop).mass == plain.mass
 
 
-def test_another_inertia_is_found_out():
+def test_a_different_inertia_is_detected():
     loop = made("ets_vii")
     M = fflin.linearize(loop.robot, loop.point.q).M.copy()
     loop.require_same_inertia("peer", M)

@@ -303,7 +303,7 @@ def test_odd_options_end_in_one_line(
         (["--attitude", "1e300"], "175 deg"),
     ],
 )
-def test_validity_refuses_what_would_never_end(options, said, capsys):
+def test_validity_refuses_loops_that_never_settle(options, said, capsys):
     import re
 
     assert main(["validity", "planar_detumble", *options]) == 2

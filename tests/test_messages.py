@@ -86,7 +86,7 @@ def test_a_row_of_the_page_takes_the_new_sentence(tmp_path, monkeypatch):
 
 
 @pytest.mark.process
-def test_a_command_writes_what_the_tests_hear_on_all_workers(tmp_path):
+def test_a_command_writes_the_messages_of_all_workers(tmp_path):
     def run(*options):
         root = Path(__file__).parents[1]
         command = [sys.executable, "-m", "pytest", "-q", "-p", "tests.support.messages"]

@@ -379,7 +379,7 @@ def test_a_file_gives_the_same_answer(robots, tmp_path):
     ).all() and found.uncontrollable == again.uncontrollable
 
 
-def test_what_is_no_model_is_refused():
+def test_an_invalid_model_is_refused():
     with pytest.raises(fflin.InputError, match="LinearModel"):
         fflin.controllability(np.eye(3))
 

@@ -32,7 +32,7 @@ CORES = ("", "Haswell", "Nehalem", "Prescott", "Sandybridge")
     ],
     ids=["picked", "many"],
 )
-def test_random_decisions_are_those_of_exact_arithmetic(robots, seeds):
+def test_random_decisions_match_exact_arithmetic(robots, seeds):
     wrong, doubts, count = {}, 0, 0
     for seed in seeds:
         lin, K, D = decisions.case(seed, robots)
@@ -112,7 +112,7 @@ def test_a_decision_within_rounding_names_the_state_and_both_answers(
     assert seen == {22, 24}
 
 
-def test_doubt_is_told_by_the_errors_and_by_what_succeeds(robots):
+def test_uncertain_decisions_are_reported_with_their_errors(robots):
     lin = weakly_driven(robots, 10.0**-11.25)
     assert fflin.controllability(lin).dimension == 22
     with pytest.raises(fflin.StabilizabilityError, match=r"joint_5.*22.*24") as error:
@@ -138,7 +138,7 @@ def test_doubt_is_told_by_the_errors_and_by_what_succeeds(robots):
     assert 0.01 < error.value.margin.dropped < 1.0
 
 
-def test_a_decay_within_rounding_is_told(robots):
+def test_a_decay_within_rounding_is_reported(robots):
     """Twins in one damping: their difference is not driven, and hardly decays."""
     like = fflin.linearize(robots["ets_vii"])
     K = np.diag([0.0] * 10 + [4.0, 4.0])
@@ -158,7 +158,7 @@ def test_a_decay_within_rounding_is_told(robots):
     assert says(note, "by itself") and says(note, "may not be stabilizable")
 
 
-def test_what_died_out_between_samples_is_told(robots):
+def test_modes_that_decay_between_samples_are_reported(robots):
     """Of a file, which holds the samples alone, two fast motions look like one."""
     lin, K, D = decisions.case(164, robots)
     sampled = lin.discretize(0.1)

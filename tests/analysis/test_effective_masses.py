@@ -75,7 +75,7 @@ def test_of_a_symmetric_pair_one_mode_alone_has_mass(shift):
 
 
 @pytest.mark.parametrize("name", ["servicer_7dof", "dual_arm", "talos"])
-def test_all_modes_and_what_is_left_are_the_mass_and_inertia(name):
+def test_effective_masses_and_the_residual_sum_to_the_mass_and_inertia(name):
     rng = np.random.default_rng(2)
     robot = fflin.load(name)
     q, _, _ = random_point(robot, rng)
@@ -109,7 +109,7 @@ def test_all_modes_and_what_is_left_are_the_mass_and_inertia(name):
     assert not sprung.free.any()
 
 
-def test_frequencies_are_those_of_a_robot_on_a_base_that_hardly_moves():
+def test_frequencies_match_a_robot_on_a_base_that_hardly_moves():
     light = fflin.load("servicer_7dof", stiffness=20.0)
     model = light.model.copy()
     model.inertias[1] = pin.Inertia(1e9, np.zeros(3), 1e9 * np.eye(3))
@@ -142,7 +142,7 @@ def test_masses_turn_with_the_base_frame_and_do_not_change_with_its_origin():
     np.testing.assert_allclose(found.residual, X @ expected.residual @ X.T, atol=1e-8)
 
 
-def test_soft_modes_beside_stiff_ones_keep_their_digits():
+def test_soft_modes_next_to_stiff_ones_keep_their_accuracy():
     soft, stiff = 1e-4, 1e8
     robot = fflin.load(
         "servicer_7dof", stiffness={"panel_left": soft, "joint_7": stiff}

@@ -237,7 +237,7 @@ def test_a_spinning_wheel_nutates():
 @pytest.mark.parametrize(
     "name, rotor", [("canadarm2", "joint_7"), ("ets_vii", "joint_6")]
 )
-def test_what_loses_no_energy_neither_decays_nor_grows(name, rotor):
+def test_a_conservative_system_neither_decays_nor_grows(name, rotor):
     """Springs and a spinning rotor: gyroscopic, so that every pole is imaginary; exactly so."""
     rng = np.random.default_rng(5)
     bare = fflin.load(name)
@@ -433,7 +433,7 @@ def test_a_weak_asymmetry_is_not_taken_for_a_spring(thrust):
 @pytest.mark.parametrize(
     ("growth", "doubtful"), [(1e-9, False), (1.0, True), (1e3, False)]
 )
-def test_growth_within_rounding_is_told(robots, growth, doubtful):
+def test_growth_within_rounding_is_reported(robots, growth, doubtful):
     """A pole that turns and grows by so many times its rounding, beside a damper."""
     lin = fflin.linearize(robots["planar_detumble"].replace(stiffness=9.0, damping=0.1))
     (first, *_) = (mode for mode in fflin.modes(lin).modes if mode.oscillates)
@@ -458,7 +458,7 @@ def spun(robot, frame="hybrid", moving=False):
 
 @pytest.mark.parametrize("frame", FRAMES)
 @pytest.mark.parametrize("name", ["servicer_7dof", "dual_arm", "canadarm2"])
-def test_energies_of_bodies_are_those_of_the_velocities(name, frame):
+def test_energies_of_bodies_match_the_velocities(name, frame):
     """The fractions are not negative, sum to 1, and the base has what its velocities say."""
     robot = fflin.load(name, stiffness=20.0)
     lin = spun(robot.replace(damping={robot.joint_names[1]: 30.0}), frame)

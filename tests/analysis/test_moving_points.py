@@ -99,7 +99,7 @@ def random_moving(rng, name, robots):
 
 
 @pytest.mark.parametrize("name", [*ARMS, ""])
-def test_no_more_than_what_the_momenta_leave_is_controllable(robots, name):
+def test_controllability_excludes_the_conserved_momenta(robots, name):
     rng = np.random.default_rng(len(name))
     robot, q, v = random_moving(rng, name, robots)
     nx = 12 + 2 * robot.n
@@ -242,7 +242,7 @@ def test_a_trajectory_at_rest_gives_the_closed_form(robots, knots):
         assert seen.dimension == len(lin.A) and seen.detectable is True
 
 
-def test_what_no_output_depends_on_stays_unobservable_in_motion(robots):
+def test_states_without_effect_on_outputs_are_unobservable_in_motion(robots):
     robot = robots["ets_vii"]
     v = fflin.velocity(robot, {"joint_2": 0.4, "omega_b.x": 0.2, "v_b.y": 0.1})
     sensors = {
@@ -276,7 +276,7 @@ def test_what_no_output_depends_on_stays_unobservable_in_motion(robots):
     assert fflin.observability(whole).detectable is True
 
 
-def test_a_trajectory_decides_what_one_point_cannot(robots):
+def test_a_trajectory_decides_controllability_that_one_point_cannot(robots):
     """Force on the base alone: the frozen matrices leave it open, the motion does not."""
     robot = robots["astrobee_arm"]
     robot = robot.replace(inputs=[BaseForce(), *motors(robot)])
@@ -323,7 +323,7 @@ def test_in_orbit_no_momentum_is_conserved(robots):
     assert view.bound == 24 and view.detectable is None
 
 
-def test_momentum_that_is_no_rate_is_not_removed(robots):
+def test_momentum_that_is_not_a_rate_is_not_removed(robots):
     robot = robots["ets_vii"]
     spun = fflin.velocity(robot, {"joint_1": 0.1})
     for inputs, text in (

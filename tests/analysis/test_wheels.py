@@ -98,7 +98,7 @@ def test_attitude_and_joints_stay_and_the_quotient_is_exact(count, frame):
 
 @pytest.mark.parametrize("count", [3, 4])
 @pytest.mark.parametrize("speed", [0.0, 400.0])
-def test_what_is_left_is_the_carrier_without_its_wheels_under_minus_a_u(count, speed):
+def test_the_reduced_model_is_the_carrier_without_wheels_under_minus_a_u(count, speed):
     """Beside another robot: its base lacks J a a^T, holds the momentum, and bears -a u."""
     bare, J = fflin.load("servicer_7dof"), 0.4
     speeds = {f"wheel_{k + 1}": speed * (1.0 + k) for k in range(count)}
@@ -134,7 +134,7 @@ def test_what_is_left_is_the_carrier_without_its_wheels_under_minus_a_u(count, s
     assert part.M == pytest.approx(expected, abs=1e-11 * np.abs(expected).max())
 
 
-def test_which_speeds_stay_is_what_the_inputs_can_hold():
+def test_the_inputs_determine_which_speeds_remain():
     bare = fflin.load("cubesat")
     three, four = wheels(AXES[:3], 1e-5), wheels(AXES[:4], 1e-5)
     about_x = [Thruster("base", (0, y, 0), (0, 0, 1)) for y in (0.1, -0.1)]
@@ -179,7 +179,7 @@ def test_the_speed_of_a_wheel_matters_on_a_carrier_that_turns_and_with_friction(
     assert "q_m.wheel_1" in regulated_part(fflin.linearize(sprung), False).state_names
 
 
-def test_what_grows_without_an_input_is_named_beside_speeds_alone():
+def test_states_that_grow_without_an_input_are_named_if_only_speeds_are_regulated():
     """Of the first-order models that speeds without angles make."""
     ship = fflin.load("cubesat").replace(inputs=[BaseTorque(), *wheels(AXES[:3], 1e-5)])
     part = regulated_part(fflin.linearize(ship))
@@ -195,7 +195,7 @@ def test_what_grows_without_an_input_is_named_beside_speeds_alone():
         require_detectable(replace(part, A=A, C=np.delete(part.C, 1, axis=0)))
 
 
-def test_from_inputs_to_what_stays_the_transfer_function_is_kept():
+def test_the_transfer_function_to_the_kept_states_is_unchanged():
     robot = fflin.load("servicer_7dof")
     ship = robot.replace(
         inputs=[*motors(robot), *wheels(AXES[:4], 0.05)],
@@ -250,7 +250,7 @@ def test_joints_that_are_rotors_stay_joints():
 )
 @pytest.mark.parametrize("speed", [1.0, 4000.0])
 @pytest.mark.parametrize("net", [True, False])
-def test_what_rounding_leaves_of_a_spin_is_no_spring(name, J, speed, net):
+def test_rounding_errors_of_a_spin_are_not_springs(name, J, speed, net):
     """Balanced wheels and others: the reduction keeps as many states as at rest."""
     bare = fflin.load(name)
     axes = [(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)]  # whose sum is zero

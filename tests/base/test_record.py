@@ -114,7 +114,7 @@ def test_no_flipped_bit_is_silent_or_a_crash(kind, ending, flips, tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["model", "gain"])
-def test_every_bit_of_what_stands_before_the_figures_of_a_mat(kind, tmp_path):
+def test_every_bit_of_the_header_of_a_mat_file_is_checked(kind, tmp_path):
     """Header and digest, where a flip is the likeliest to be taken for a file of another."""
     thing, path = made(kind), tmp_path / "x.mat"
     thing.save(path)
@@ -175,7 +175,7 @@ def test_a_file_without_a_digest_is_read_and_said_to_be_unverified(
     "trials", [FLIPS, pytest.param(6 * FLIPS, marks=pytest.mark.fuzz)]
 )
 @pytest.mark.parametrize("ending", [".npz", ".json"])
-def test_a_damaged_file_without_a_digest_is_no_crash(ending, trials, tmp_path):
+def test_a_damaged_file_without_a_digest_is_not_a_crash(ending, trials, tmp_path):
     thing, path = made("gain"), tmp_path / f"x{ending}"
     thing.save(path)
     unsealed(path)
@@ -231,7 +231,7 @@ def test_an_impossible_value_in_a_file_without_a_digest_is_refused(
         type(thing).load(path)
 
 
-def test_an_edited_file_is_refused_and_says_what_to_do(tmp_path):
+def test_an_edited_file_is_refused_with_a_remedy(tmp_path):
     path = tmp_path / "x.json"
     made("model").save(path)
     record = json.loads(path.read_text())
@@ -248,7 +248,7 @@ def test_each_ending_has_a_codec():
     assert tuple(CODECS) == RECORDS
 
 
-def test_the_digest_is_what_the_documents_say(tmp_path):
+def test_the_digest_is_as_documented(tmp_path):
     """Others can make and check it."""
     for ending in (".npz", ".mat", ".json"):
         made("model").save(tmp_path / f"x{ending}")
@@ -311,7 +311,7 @@ def test_matlab_files_of_others_are_read(tmp_path):
         fflin.Gain.load(tmp_path / "x.mat")
 
 
-def test_plain_numpy_and_scipy_read_what_is_saved(tmp_path):
+def test_plain_numpy_and_scipy_read_saved_files(tmp_path):
     from scipy.io import loadmat
 
     gain = made("gain")
@@ -360,7 +360,7 @@ def test_a_header_of_mat_that_is_nearly_sealed_is_refused(kind, tmp_path):
             type(made(kind)).load(path)
 
 
-def test_a_record_of_others_says_what_it_has_not(tmp_path):
+def test_a_record_of_another_program_names_its_missing_fields(tmp_path):
     np.savez(tmp_path / "x.npz", a=1.0)
     with pytest.raises(fflin.FileError, match="'state_names'"):
         fflin.LinearModel.load(tmp_path / "x.npz")
@@ -386,7 +386,7 @@ def test_a_batch_that_is_not_held_against_its_digest_says_so(tmp_path):
         (b"\x89HDF\r\n\x1a\n", "HDF5 file"),
     ],
 )
-def test_other_formats_of_octave_and_matlab_are_told_with_the_remedy(
+def test_other_formats_of_octave_and_matlab_are_reported_with_the_remedy(
     tmp_path, content, format_
 ):
     (tmp_path / "x.mat").write_bytes(content.ljust(200, b" "))

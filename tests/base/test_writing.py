@@ -136,7 +136,9 @@ def test_other_inputs_are_protected_too(urdf, tmp_path, capsys, monkeypatch):
     assert code == 2 and "input file" in error and error.count("\n") == 1
 
 
-def test_a_session_may_save_over_what_it_has_read(urdf, tmp_path, capsys, monkeypatch):
+def test_a_session_may_overwrite_a_file_that_it_read(
+    urdf, tmp_path, capsys, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
     robot = fflin.load(urdf)
     t, q = np.array([0.0, 1.0]), np.tile(robot.neutral(), (2, 1))
@@ -169,7 +171,7 @@ def linked(tmp_path, read, *command):
 
 @pytest.mark.process
 @pytest.mark.parametrize("included", ["inc.xacro", "deep.xacro", "mass.yaml"])
-def test_what_a_xacro_reads_is_protected(included, tmp_path):
+def test_files_that_a_xacro_reads_are_protected(included, tmp_path):
     pytest.importorskip("xacrodoc")
     namespace = 'xmlns:xacro="http://www.ros.org/wiki/xacro"'
     (tmp_path / "mass.yaml").write_text("m: 3\n")
@@ -291,7 +293,7 @@ def test_a_limit_of_the_size_of_a_file_is_one_line(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_room_that_is_not_there_is_told_before_work(tmp_path, monkeypatch):
+def test_room_that_is_not_there_is_reported_before_work(tmp_path, monkeypatch):
     """The disk is full although it said that it has room, as with quotas."""
     pytest.importorskip("h5py")
 

@@ -35,7 +35,7 @@ def robot(robots):
 @pytest.mark.compiled
 @pytest.mark.process
 @pytest.mark.parametrize("moving", [False, True])
-def test_processes_give_what_this_one_gives(moving, pool, robot):
+def test_processes_agree_with_this_process(moving, pool, robot):
     q, v, u = points(robot, 50)
     arguments = (v, u) if moving else ()
     batch = fflin.sweep(robot, q, *arguments, executor=pool, chunk=4)
@@ -183,7 +183,7 @@ def test_there_are_no_more_workers_than_cores(robot):
         (["what is this"], 8),
     ],
 )
-def test_cores_are_those_of_the_container(files, cores, tmp_path, monkeypatch):
+def test_cores_match_the_container(files, cores, tmp_path, monkeypatch):
     paths = [tmp_path / str(index) for index in range(len(files))]
     for path, text in zip(paths, files, strict=True):
         path.write_text(text)
@@ -211,7 +211,7 @@ def test_workers_that_cannot_start_are_one_line(tmp_path):
 
 @pytest.mark.compiled
 @pytest.mark.process
-def test_an_executor_that_dies_is_one_line_and_what_is_finished_is_kept(
+def test_a_failed_executor_gives_a_one_line_error_and_keeps_finished_chunks(
     robot, killing, tmp_path
 ):
     pytest.importorskip("h5py")

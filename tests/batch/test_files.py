@@ -77,7 +77,7 @@ def test_hdf5_is_plain(robot, tmp_path):
 
 
 @pytest.mark.parametrize("ending", FORMATS)
-def test_what_is_no_batch_is_refused(ending, robot, tmp_path):
+def test_an_invalid_batch_is_refused(ending, robot, tmp_path):
     path = tmp_path / f"b{ending}"
     with pytest.raises(fflin.FileError, match="No such file"):
         fflin.LinearBatch.load(path)
@@ -144,7 +144,7 @@ def test_a_run_goes_on_from_the_chunks_that_are_there_and_intact(
     assert np.abs(batch.B_lower / fflin.sweep(robot, q).B_lower - 1).max() < 1e-9
 
 
-def test_a_run_that_cannot_go_on_keeps_what_is_finished(robot, tmp_path, monkeypatch):
+def test_a_failed_run_keeps_its_finished_chunks(robot, tmp_path, monkeypatch):
     """The disk has become full since the first part of the run."""
     path, part = tmp_path / "b.h5", tmp_path / "b.h5.part"
     q = fflin.random_configurations(robot, 12)

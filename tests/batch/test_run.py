@@ -93,7 +93,7 @@ def test_where_all_chunks_are_needed_the_first_that_fails_is_the_last():
     assert told == [8, 16]
 
 
-def test_in_memory_the_error_has_what_is_made_of_the_rest():
+def test_an_error_in_memory_carries_the_partial_result():
     store = MemoryStore(COUNT, CHUNK, STORED)
     with (
         pytest.warns(fflin.FflinWarning, match="tired"),
@@ -120,7 +120,7 @@ class CountedWalks(Walks):
         return super().run(rows, start, out)[:0]
 
 
-def test_a_second_call_in_memory_computes_only_what_is_missing(expected):
+def test_a_second_call_in_memory_computes_only_the_missing_rows(expected):
     job, store = CountedWalks(), MemoryStore(COUNT, CHUNK, STORED)
     run_chunks(job, seeds, store, ALONE, upto=20)
     assert job.starts == [0, 8, 16]

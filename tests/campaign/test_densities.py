@@ -33,7 +33,7 @@ def same_bodies(robot, other):
         ("robots/inspector.toml", {"base": 0.2, "gripper": -0.3}),
     ],
 )
-def test_a_density_is_that_of_uncertain_robots(name, changes):
+def test_a_density_matches_uncertain_robots(name, changes):
     robot = fflin.load(name)
     ranges = {f"{link}.density": (0.1, 4.0) for link in changes}
     of = fflin.uncertain(robot, ranges)
@@ -221,7 +221,7 @@ def test_lanes_and_patterns():
     assert len(names) == len(robot.links)
 
 
-def test_what_is_wrong_is_one_line():
+def test_errors_are_one_line():
     robot = fflin.load("servicer_7dof")
     both_of = {"link_3.density": 0.1, "joint_3.mass": 0.1}
     with pytest.raises(fflin.InputError, match=r"'joint_3\.mass'.*'link_3\.density'"):

@@ -201,7 +201,7 @@ def test_noise_is_white_and_each_run_has_its_own(engine):
 
 
 @pytest.mark.parametrize("spread", [0.05, (0.01, 0.05)])
-def test_the_worst_runs_of_noise_are_told_by_its_deviation(spread):
+def test_the_worst_runs_of_noise_are_reported_by_its_deviation(spread):
     """The seed of a run's noise is drawn too and is none of what errors come of."""
     campaign = turned_by_noise("python", spread, runs=4, duration=1.0)
     rows = worst_runs(campaign, 2)[1].splitlines()
@@ -223,7 +223,7 @@ def test_noise_is_the_same_for_any_chunks_and_threads_and_whatever_else_ends():
 
 
 @pytest.mark.compiled
-def test_a_delay_that_is_drawn_is_that_of_a_run(robots):
+def test_a_drawn_delay_is_the_delay_of_its_run(robots):
     robot = robots["planar_detumble"]
     lin = fflin.linearize(robot)
     policy = fflin.StateFeedback(lin, fflin.lqr(lin).K)
@@ -254,7 +254,7 @@ def test_a_delay_that_is_drawn_is_that_of_a_run(robots):
         ({"delay.x": 0.1}, "delay.x"),
     ],
 )
-def test_what_cannot_be_dispersed_is_told(robots, given, words):
+def test_a_quantity_that_cannot_be_dispersed_is_refused(robots, given, words):
     robot = robots["planar_detumble"]
     lin = fflin.linearize(robot)
     policy = fflin.StateFeedback(lin, fflin.lqr(lin).K)
@@ -290,7 +290,7 @@ def test_dask_flies_the_same(robots):
 
 
 @pytest.mark.process
-def test_a_lost_worker_of_dask_is_told(robots):
+def test_a_lost_worker_of_dask_is_reported(robots):
     distributed = pytest.importorskip("distributed")
     robot = robots["planar_detumble"]
     case = {"runs": 64, "duration": 0.2, "dt": 0.02, "engine": "python", "chunk": 8}

@@ -91,7 +91,7 @@ def test_a_tied_spread_is_one_draw(tmp_path, robots):
         ("q_b = 0.6", 1, "attitude"),
     ],
 )
-def test_what_is_wrong_has_file_and_line(tmp_path, robots, text, line, said):
+def test_errors_have_file_and_line(tmp_path, robots, text, line, said):
     with pytest.raises(fflin.FflinError, match=said) as caught:
         given = read(tmp_path, "r_b = 0.01\n" + text)
         fflin.monte_carlo(
@@ -113,7 +113,7 @@ def test_what_is_wrong_has_file_and_line(tmp_path, robots, text, line, said):
         ("[dispersions]\nq_b = 1\nq_b.sensor = 1", 3, '"q_b.sensor"'),
     ],
 )
-def test_what_is_no_such_file(tmp_path, text, line, said):
+def test_a_missing_file_is_refused(tmp_path, text, line, said):
     with pytest.raises(fflin.FflinError, match=said) as caught:
         read(tmp_path, text, head="")
     assert f"uncertain.toml:{line}: " in str(caught.value)
@@ -179,7 +179,7 @@ def test_a_distribution_draws_each_value_once_whatever_is_asked_for(robots):
         ),
     ],
 )
-def test_what_cannot_be_drawn_is_refused_before_the_runs(
+def test_an_invalid_dispersion_is_refused_before_the_runs(
     ppf, said, robots, monkeypatch
 ):
     monkeypatch.setattr("fflin.campaign.monte_carlo.run_chunks", None)  # the runs

@@ -49,7 +49,7 @@ def loop_of(robot):
     return lin, gain, fflin.StateFeedback(lin, gain.K)
 
 
-def test_a_campaign_and_validity_say_what_they_will_take(clock):
+def test_a_campaign_and_validity_estimate_their_duration(clock):
     robot = fflin.load("cubesat")
     lin, gain, policy = loop_of(robot)
     bar, options = Told(), {"duration": 10.0, "dt": 0.1, "engine": "python"}

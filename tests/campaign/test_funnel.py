@@ -139,7 +139,7 @@ def test_a_narrower_goal_is_a_narrower_funnel(still, schedule):
     assert weak.rho[0] < strong.rho[0]
 
 
-def test_what_is_sure_is_so_in_as_many_cases_as_it_says(still, schedule):
+def test_confidence_intervals_have_their_stated_coverage(still, schedule):
     """The share inside that succeeds at least, over many funnels of the linear loop."""
     goal, rng = 1e-8, np.random.default_rng(1)
     M, count, held = ends(still, schedule, 0.0), 40, 0
@@ -295,7 +295,7 @@ def test_command(arm, tmp_path, monkeypatch):
     assert "--schedule" in refused("funnel", "cubesat", *goal)
 
 
-def test_bad_input(arm):
+def test_invalid_input(arm):
     robot, schedule = arm
     good = {"attitude": 1.0}
     for arguments, options, words in (

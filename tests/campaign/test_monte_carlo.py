@@ -52,7 +52,7 @@ def feedback(robot, frame="hybrid"):
 
 @pytest.mark.compiled
 @pytest.mark.parametrize("name", BUNDLED)
-def test_lanes_give_what_single_runs_give(robots, name):
+def test_lanes_agree_with_single_runs(robots, name):
     robot = robots[name]
     given = START | {"*.mass": 0.1, "*.com": 0.1, "*.inertia": (-0.2, 0.2)}
     if robot.n:
@@ -118,7 +118,7 @@ def test_mimic_joints(tmp_path):
 
 
 @pytest.mark.compiled
-def test_bodies_are_their_own_beside_wheels_on_another_branch(robots):
+def test_wheels_on_another_branch_do_not_change_bodies(robots):
     """The wheel's joint stands before the joints of the arm's other branch."""
     robot = robots["dual_arm"]
     first, last = robot.joint_names[0], robot.joint_names[-1]
@@ -311,7 +311,7 @@ def test_another_campaign_does_not_go_on_in_a_file(tmp_path, robots):
     assert np.array_equal(campaign.replay(23).q[-1], campaign.q[23])
 
 
-def test_a_dispersion_does_not_change_what_another_draws(robots):
+def test_a_dispersion_does_not_change_the_draws_of_another(robots):
     robot, case = robots["planar_detumble"], {"runs": 5, "duration": 0.02}
     one = fflin.monte_carlo(robot, None, {"omega_b.x": 0.1}, **case)
     two = fflin.monte_carlo(robot, None, {"base.mass": 0.1, "omega_b": 0.1}, **case)
@@ -522,7 +522,7 @@ def test_its_tables_have_every_figure_with_its_unit(tmp_path):
 
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("engine", ENGINES)
-def test_histories_are_those_of_the_motions(robots, engine, tmp_path):
+def test_histories_match_the_motions(robots, engine, tmp_path):
     robot = robots["ets_vii"]
     given = START | {"tau_b.x.gain": [0.0, 0.0, -60.0]}
     case = {"runs": 12, "duration": 4.0, "dt": 0.02, "engine": engine, "seed": 1}
@@ -556,7 +556,7 @@ def test_histories_are_those_of_the_motions(robots, engine, tmp_path):
 
 
 @pytest.mark.compiled
-def test_goals_are_told_and_say_what_the_worst_is(robots):
+def test_goals_appear_in_the_report_with_the_worst_run(robots):
     robot = robots["ets_vii"]
     goals = ["position < 1 mm and settle < 5 s", "attitude > 0 deg"]
     case = {"runs": 30, "duration": 6.0, "dt": 0.02, "goals": goals, "confidence": 0.9}
@@ -576,7 +576,7 @@ def test_goals_are_told_and_say_what_the_worst_is(robots):
 
 
 @pytest.mark.compiled
-def test_figures_are_those_of_the_motions(campaign):
+def test_figures_match_the_motions(campaign):
     run = campaign.worst(1)[0]
     motion = campaign.replay(run)
     of = {
@@ -593,7 +593,7 @@ def test_figures_are_those_of_the_motions(campaign):
 
 
 @pytest.mark.compiled
-def test_the_time_to_settle_is_that_of_the_motions_table(robots):
+def test_the_time_to_settle_matches_the_motions_table(robots):
     robot = robots["planar_detumble"]
     campaign = fflin.monte_carlo(
         robot,
@@ -693,7 +693,7 @@ BAD = [
 
 
 @pytest.mark.parametrize("case, said", BAD, ids=[said for _, said in BAD])
-def test_bad_input_is_one_line(robots, case, said, tmp_path, monkeypatch):
+def test_invalid_input_is_one_line(robots, case, said, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     options = {"given": {"q_b": 0.01}, "runs": 100, "duration": 0.1} | case
     with pytest.raises(fflin.FflinError, match=said) as caught:
@@ -716,7 +716,7 @@ def test_a_policy_in_python_runs_in_python(robots):
     assert campaign.engine == "python" and campaign.largest_u.max() == 0.5
 
 
-def test_what_cannot_be_sent_to_workers_is_named(robots):
+def test_an_object_that_cannot_be_pickled_is_named(robots):
     def nothing(t, q, v):
         return np.zeros(9)
 
@@ -732,7 +732,7 @@ def test_what_cannot_be_sent_to_workers_is_named(robots):
 
 
 @pytest.mark.compiled
-def test_what_is_kept_does_not_grow_with_the_duration(robots):
+def test_stored_data_do_not_grow_with_the_duration(robots):
     robot = robots["planar_detumble"]
     short, long = (
         fflin.monte_carlo(
@@ -767,7 +767,7 @@ def test_warnings_are_given_once(robots):
 
 
 @pytest.mark.compiled
-def test_a_mean_with_what_never_settled_is_refused(robots):
+def test_a_mean_over_runs_that_did_not_settle_is_refused(robots):
     robot = robots["cubesat"]
     lin = fflin.linearize(robot)
     policy = fflin.StateFeedback(lin, fflin.lqr(lin).K)
@@ -894,7 +894,7 @@ def test_a_file_of_another_policy_or_robot_is_refused_before_compiling(
 
 
 @pytest.mark.compiled
-def test_what_no_input_pushes_is_judged_in_no_campaign_either():
+def test_uncontrolled_states_are_not_judged_in_campaigns():
     robot = fflin.load("cubesat", inputs=[fflin.BaseTorque()])
     lin = fflin.linearize(robot)
     K = np.zeros((3, 12))
@@ -927,7 +927,7 @@ def wheels_of(robot):
     )
 
 
-def test_the_table_shows_wheels_and_leaves_out_what_is_always_zero():
+def test_the_table_shows_wheels_and_omits_columns_of_zeros():
     robot = wheels_of(fflin.load("cubesat"))
     lin = fflin.linearize(robot)
     policy = fflin.StateFeedback(lin, fflin.lqr(lin).K)
@@ -944,7 +944,7 @@ def test_the_table_shows_wheels_and_leaves_out_what_is_always_zero():
     assert "attitude" in rows
 
 
-def test_what_an_earlier_call_has_written_is_told(tmp_path):
+def test_a_message_from_an_earlier_call_is_reported(tmp_path):
     pytest.importorskip("h5py")
     robot = fflin.load("planar_detumble")
     call = {

@@ -102,7 +102,7 @@ def defined(job, target, q, nu, u, stop):
     }
 
 
-def test_statistics_of_a_run_in_python_are_those_of_the_definition(tmp_path):
+def test_statistics_of_a_run_in_python_match_the_definition(tmp_path):
     for made, frame, follows in itertools.product(
         (turning, wheeled, flexible), FRAMES, (False, True)
     ):
@@ -185,7 +185,7 @@ def as_lists(value):
 @pytest.mark.parametrize("follows", [False, True])
 @pytest.mark.parametrize("frame", FRAMES)
 @pytest.mark.parametrize("made", [turning, wheeled, arm])
-def test_marks_of_lanes_are_those_of_the_definition(tmp_path, made, frame, follows):
+def test_marks_of_lanes_match_the_definition(tmp_path, made, frame, follows):
     pytest.importorskip("numba")
     robot, rng = made(tmp_path), np.random.default_rng(7)
     turn = pin.Quaternion(0.5, -0.1, 0.7, 0.3).normalized()

@@ -71,7 +71,7 @@ def test_trust_ends_where_the_error_reaches_a_tenth():
     assert _slope(0.3 * _LEVELS) == pytest.approx(2.0)
 
 
-def test_the_loop_is_that_of_aba_in_world_coordinates(robots):
+def test_the_loop_matches_aba_in_world_coordinates(robots):
     """A run against an integration of (q, v) by Pinocchio, which knows nothing of the chart."""
     robot = robots["ets_vii"]
     lin, gain = held(robot)
@@ -199,7 +199,7 @@ def test_a_run_that_ends_unsettled_may_settle_later_or_never():
 
 
 @pytest.mark.compiled
-def test_what_the_counts_say(robots):
+def test_counts_have_their_confidence_intervals(robots):
     """A loop that is lost far out: the runs below the first failure, and both intervals."""
     robot = robots["ets_vii"]
     lin, gain = held(robot)
@@ -243,7 +243,9 @@ def test_both_engines_say_the_same(robots, name):
     )
 
 
-def test_a_linear_loop_is_foreseen_to_rounding_and_settles_when_it_says(robots):
+def test_a_linear_loop_is_predicted_to_machine_precision_and_settles_at_the_reported_time(
+    robots,
+):
     """A body that is only moved away: poles in closed form, and so the time to settle."""
     robot = robots["cubesat"]
     lin, gain = held(robot)
@@ -271,7 +273,7 @@ def test_limits_are_those_that_are_given(robots):
 
 
 @pytest.mark.compiled
-def test_what_turns_fast_is_flown_in_shorter_steps():
+def test_fast_rotations_are_simulated_with_shorter_steps():
     robot = fflin.load("canadarm2")
     lin = fflin.linearize(robot)
     found = fflin.validity(robot, lin, fflin.lqr(lin), attitude=120.0, samples=50)
@@ -311,7 +313,7 @@ def test_joints_only_hold_the_reduced_model(robots):
 
 
 @pytest.mark.compiled
-def test_what_cannot_be_told_is_not(robots, arm):
+def test_an_undefined_decision_is_not_reported(robots, arm):
     robot = robots["cubesat"]
     lin, gain = held(robot)
     # A body that is only moved away comes back as the linear model says, to the last digit.
@@ -331,7 +333,7 @@ def test_what_cannot_be_told_is_not(robots, arm):
 
 
 @pytest.mark.compiled
-def test_what_a_reduced_model_has_not_is_not_told(robots):
+def test_a_reduced_model_omits_missing_states_in_its_report(robots):
     robot = robots["ets_vii"]
     robot = robot.replace(
         inputs=[fflin.JointTorque(name) for name in robot.joint_names]
@@ -344,7 +346,7 @@ def test_what_a_reduced_model_has_not_is_not_told(robots):
         fflin.validity(robot, lin, gain, joint=0.0, samples=2)
 
 
-def test_bad_input(arm):
+def test_invalid_input(arm):
     lin, gain = held(arm)
     for arguments, words in (
         ((arm, lin, -gain.K), "stable"),
@@ -404,7 +406,7 @@ def test_jobs_are_at_most_one_for_each_core():
 
 
 @pytest.mark.compiled
-def test_progress_is_told_up_to_every_run(robots):
+def test_progress_is_reported_up_to_every_run(robots):
     robot = robots["cubesat"]
     lin, gain = held(robot)
     for executor in (None, ThreadPoolExecutor(2)):
@@ -480,7 +482,7 @@ def test_it_shows_a_bar_on_a_terminal_and_ends_at_ctrl_c(jobs):
 
 
 @pytest.mark.exhaustive
-def test_the_table_of_frames_is_what_its_command_makes():
+def test_the_table_of_frames_is_the_output_of_its_command():
     frames = runpy.run_path(str(DOCS / "frames.py"))
     table = (DOCS / "conventions.md").read_text(encoding="utf-8")
     design = "acceleration_lqr(lin, 1, 1, 1)"

@@ -118,7 +118,7 @@ def test_linearize_prints_readable_tables():
     assert f"{lin.B[12, 0]:.5g}" in row.split()
 
 
-def test_units_stand_above_the_tables():
+def test_units_are_above_the_tables():
     motion = ("--velocity", "joint_1=0.1", "--stiffness", "panel_left=100")
     code, out, err = run(
         "linearize", "servicer_7dof", *motion, "--output", "frame:tool"
@@ -143,7 +143,7 @@ def test_units_stand_above_the_tables():
     assert "q_m [rad], omega_b [rad/s]" in out
 
 
-def test_sampled_model_is_that_of_python(tmp_path):
+def test_sampled_model_matches_python(tmp_path):
     path = tmp_path / "m.mat"
     options = ("planar_detumble", "--dt", 0.1, "--velocity", "joint_1=0.1")
     code, _, err = run("linearize", *options, "-o", path)
@@ -204,7 +204,7 @@ def test_terminal_dims_zeros():
 
 
 @pytest.mark.parametrize("ending", [".npz", ".mat", ".json"])
-def test_linearize_saves_what_python_gives(ending, tmp_path):
+def test_linearize_saves_the_model_of_python(ending, tmp_path):
     path = tmp_path / f"m{ending}"
     options = (
         "--joint",
@@ -227,7 +227,7 @@ def test_linearize_saves_what_python_gives(ending, tmp_path):
     assert saved.frame == "local" and saved.certificate == lin.certificate
 
 
-def test_linearize_for_a_tool_saves_what_python_gives(tmp_path):
+def test_linearize_for_a_tool_saves_the_model_of_python(tmp_path):
     code, out, _ = run(
         *(
             "linearize",
@@ -268,7 +268,7 @@ def test_reference_world_keeps_the_attitude_in_the_state(tmp_path):
     assert json.loads(path.read_text())["x0"][:6] == [0.0] * 6
 
 
-def test_bad_input_is_one_line_and_leaves_nothing(tmp_path):
+def test_invalid_input_is_one_line_and_leaves_nothing(tmp_path):
     output = tmp_path / "m.npz"
     bad = tmp_path / "bad.urdf"
     bad.write_text("<robot name='r'><link")
@@ -403,7 +403,7 @@ def test_names_neither_split_nor_fill_the_line(arguments):
     )
 
 
-def test_an_empty_name_is_said_to_be_empty():
+def test_an_empty_name_is_reported_to_be_empty():
     assert "empty" in refused("linearize", "cubesat", "-o", "")
     assert "empty" in refused("linearize", "cubesat", "--inputs", "")
     assert "empty" in refused("simulate", "cubesat", "--duration", "1", "--plot", "")
@@ -411,7 +411,7 @@ def test_an_empty_name_is_said_to_be_empty():
         fflin.linearize(fflin.load("cubesat")).save("")
 
 
-def test_negative_numbers_are_no_options():
+def test_negative_numbers_are_not_options():
     code, out, _ = run(
         "check", "cubesat", "--rpy", "-30", "-1e-3", "0", "--position", "-.5", 0, 0
     )
@@ -453,7 +453,7 @@ def test_passive_joints_and_gravity(tmp_path):
     assert code == 0 and "A and B are verified" in out
 
 
-def test_inputs_and_outputs_are_those_of_python(tmp_path):
+def test_inputs_and_outputs_match_python(tmp_path):
     path = tmp_path / "m.mat"
     springs = ("--stiffness", "panel_left=100", "--stiffness", "panel_right=100")
     inputs = fflin.load_inputs("servicer_7dof")
@@ -478,7 +478,7 @@ def test_inputs_and_outputs_are_those_of_python(tmp_path):
     assert code == 0 and "A and B are verified" in out
 
 
-def test_output_and_output_file_are_told_apart(tmp_path):
+def test_output_and_output_file_are_distinguished(tmp_path):
     for option in (("--output-file",), ("--output-f",), ("-o",)):
         path = tmp_path / f"m{len(option[0])}.json"
         code, _, err = run("linearize", "ets_vii", "--output=com", *option, path)
@@ -568,7 +568,7 @@ joints = { joint_2 = 0.6 }
 """
 
 
-def test_info_shows_what_was_set_beside_the_urdf(tmp_path):
+def test_info_shows_the_settings_that_are_not_in_the_urdf(tmp_path):
     (tmp_path / "sat.toml").write_text(SETTINGS)
     code, out, err = run(
         "info", "sat.toml", "--damping", "panel_left=0.4", cwd=tmp_path
@@ -655,7 +655,7 @@ def test_warnings_of_bundled_robots_fit_a_terminal(name, capfd):
         ),
     ],
 )
-def test_plot_draws_what_the_command_found(command, tmp_path, monkeypatch):
+def test_plot_draws_the_result_of_the_command(command, tmp_path, monkeypatch):
     pytest.importorskip("matplotlib")
     code, out, _ = run(*command, "--plot", tmp_path / "a.svg")
     assert code == 0 and out.endswith(f"wrote {tmp_path / 'a.svg'}\n")
@@ -734,7 +734,7 @@ def test_options_that_repeat_a_robot_file_are_in_one_group():
 
 @pytest.mark.sample
 @pytest.mark.process
-def test_closed_pipe_is_no_error():
+def test_closed_pipe_is_not_an_error():
     command = f"{sys.executable} -m fflin linearize talos | head -n 1"
     done = finished(
         ["bash", "-c", command],

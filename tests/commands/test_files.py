@@ -38,7 +38,7 @@ def said(action, value):
 
 
 @pytest.mark.parametrize("name, actions, read, write", [*pairs()])
-def test_no_output_is_what_an_option_reads(
+def test_an_output_file_is_not_an_input_file(
     name, actions, read, write, tmp_path, capsys, monkeypatch
 ):
     monkeypatch.chdir(tmp_path)
@@ -89,7 +89,9 @@ def test_every_option_that_takes_a_file_says_whether_it_is_written():
 
 
 @pytest.mark.parametrize("included", ["r.urdf", "in.toml"])
-def test_what_a_robot_file_names_is_kept_too(included, tmp_path, capsys, monkeypatch):
+def test_files_that_a_robot_file_names_are_protected(
+    included, tmp_path, capsys, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "r.urdf").write_text(
         '<robot name="r"><link name="l"><inertial><mass value="1"/>'
@@ -117,7 +119,7 @@ WRITES = {
 
 
 @pytest.mark.parametrize("name", WRITES)
-def test_a_command_replaces_files_of_its_own_kind_alone(name, tmp_path, monkeypatch):
+def test_a_command_replaces_only_files_of_the_same_kind(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     options, endings = WRITES[name]
     command = (name, *options.split(), "-o")

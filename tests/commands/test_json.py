@@ -198,7 +198,7 @@ def test_an_error_leaves_stdout_empty_and_a_failed_check_prints_json(python):
     assert json.loads(out)["max_error"] == worst > 0.0
 
 
-def test_what_is_not_finite_is_null():
+def test_nonfinite_values_are_null():
     from fflin.commands.cli import plain
 
     assert plain({"a": np.array([1.0, np.inf]), "_b": 1}) == {"a": [1.0, None]}

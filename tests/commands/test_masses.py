@@ -11,7 +11,7 @@ from tests.support.commands import refused, run
 
 
 @pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
-def test_what_matters_most_is_shown_and_saved(tmp_path):
+def test_the_most_important_parameters_are_shown_and_saved(tmp_path):
     point = ("--joint", "joint_2=0.6", "--velocity", "omega_b.z=0.1")
     code, out, err = run(
         *("sensitivity", "servicer_7dof", *point, "--top", 4, "-o", tmp_path / "c.mat")
@@ -83,7 +83,7 @@ def test_the_fraction_is_saved(tmp_path):
     ]
 
 
-def test_what_is_wrong_is_one_line(tmp_path):
+def test_errors_are_one_line(tmp_path):
     vary = ("uncertain", "cubesat", "--vary")
     assert "'bas.mass'" in refused(*vary, "bas.mass=0.1")
     assert "NAME=FRACTION" in refused(*vary, "base.mass")

@@ -25,7 +25,9 @@ def folder(tmp_path):
     return tmp_path
 
 
-def test_it_flies_what_python_flies_and_says_it_as_text_and_json(folder, robots):
+def test_the_command_simulates_the_motion_of_python_and_reports_it_as_text_and_json(
+    folder, robots
+):
     robot = robots["planar_detumble"]
     options = (
         "--runs",
@@ -72,7 +74,7 @@ def test_it_flies_what_python_flies_and_says_it_as_text_and_json(folder, robots)
     assert said["quantiles"]["attitude"]["0.99"][2] is None
 
 
-def test_tables_are_those_of_the_campaign(folder):
+def test_tables_match_the_campaign(folder):
     command = ("montecarlo", "planar_detumble", *SHORT, "--runs", 6)
     assert run(*command, "-o", "runs.npz", cwd=folder)[0] == 0
     fflin.Campaign.load(folder / "runs.npz").save(folder / "runs.csv")
@@ -101,7 +103,7 @@ def test_tables_are_those_of_the_campaign(folder):
         (("--runs", "3", "--delay", "1e9"), "delay"),
     ],
 )
-def test_bad_input_is_one_line_and_leaves_nothing(arguments, said, folder):
+def test_invalid_input_is_one_line_and_leaves_nothing(arguments, said, folder):
     error = refused("montecarlo", "planar_detumble", *SHORT, *arguments, cwd=folder)
     assert re.search(said, error), error
     assert {x.name for x in folder.iterdir()} == {"u.toml"}
@@ -260,7 +262,7 @@ def test_the_same_command_goes_on_after_a_killed_worker(folder):
 
 
 @pytest.mark.process
-def test_a_full_disk_is_said_and_leaves_nothing(folder):
+def test_a_full_disk_is_reported_and_leaves_no_file(folder):
     pytest.importorskip("h5py")
     small = folder / "small"
     small.mkdir()

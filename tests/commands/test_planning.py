@@ -122,7 +122,7 @@ def test_an_equilibrium_has_its_inputs_and_its_stability(tmp_path):
     assert "--effort" in refused("equilibrium", ROBOT, "--effort", "tau_m.joint_1=1")
 
 
-def test_an_equilibrium_beyond_the_limits_is_told():
+def test_an_equilibrium_beyond_the_limits_is_reported():
     heavy = ("equilibrium", "servicer_7dof", "--gravity", 0, 0, -9.81)
     said = json.loads(run(*heavy, "--json")[1])
     robot = fflin.load("servicer_7dof", gravity=(0.0, 0.0, -9.81))

@@ -97,7 +97,7 @@ def test_joints_alone_cannot_hold_the_base(capsys):
     assert code == 2 and "'cubesat'" in err
 
 
-def test_bad_input_is_one_line_and_leaves_no_file(capsys, tmp_path):
+def test_invalid_input_is_one_line_and_leaves_no_file(capsys, tmp_path):
     for words, arguments in {
         "state named 'nope'": ("--q", "nope=1"),
         "input named 'nope'": ("--r", "nope=1"),
@@ -223,7 +223,7 @@ def test_margins_and_allocation_are_in_json(capsys):
     assert found["margins"]["gain"] == pytest.approx(margins.gain, rel=1e-9)
 
 
-def test_what_the_limits_cannot_hold_in_gravity_is_said_and_not_refused(capsys):
+def test_gravity_beyond_the_limits_is_reported_and_not_refused(capsys):
     options = ("--gravity", "0", "0", "-9.81", "--equilibrium")
     with warnings.catch_warnings():
         warnings.simplefilter("always", fflin.FflinWarning)

@@ -85,7 +85,7 @@ def test_target_sampling_limits_and_delay(tmp_path):
 
 
 @pytest.mark.process
-def test_thrusts_are_allocated_or_their_cut_is_told(tmp_path):
+def test_thrusts_are_allocated_or_their_cut_is_reported(tmp_path):
     command = (
         "simulate",
         "cubesat",
@@ -187,7 +187,7 @@ def test_the_motion_is_kept_though_nobody_reads_the_table(tmp_path):
 
 
 @pytest.mark.parametrize("option", ["-o", "--plot"])
-def test_a_place_that_cannot_be_written_is_said_before_the_run(tmp_path, option):
+def test_a_place_that_cannot_be_written_is_reported_before_the_run(tmp_path, option):
     there = tmp_path / "nowhere" / ("m.npz" if option == "-o" else "m.png")
     code, out, err = run("simulate", "cubesat", option, there, cwd=tmp_path)
     assert (code, out) == (2, "")
@@ -290,14 +290,16 @@ def test_joints_alone_cannot_hold_the_base_but_the_reduced_part():
         (["--method", "rk4"], "method"),
     ],
 )
-def test_bad_input_is_one_line_and_leaves_nothing(tmp_path, arguments, said):
+def test_invalid_input_is_one_line_and_leaves_nothing(tmp_path, arguments, said):
     assert said in refused(
         "simulate", "ets_vii", "--duration", 20, *arguments, cwd=tmp_path
     )
     assert not list(tmp_path.iterdir())
 
 
-def test_inputs_are_cut_to_the_limits_of_the_robot_unless_told_otherwise(tmp_path):
+def test_inputs_are_cut_to_the_limits_of_the_robot_unless_another_limit_is_given(
+    tmp_path,
+):
     (tmp_path / "weak.toml").write_text(
         "[[input]]\ntype = 'base_torque'\nmax = 1e-3\n[[input]]\ntype = 'base_force'\n"
     )
@@ -404,7 +406,7 @@ def test_a_target_velocity_is_the_points_and_is_held(tmp_path):
     )
 
 
-def test_what_nothing_regulates_is_not_passed_over(tmp_path):
+def test_unregulated_modes_are_reported(tmp_path):
     wheels = ("cubesat", "--inputs", wheels_file(tmp_path), "--position", 1, 0, 0)
     joints = ("ets_vii", "--inputs", "joints", "--reduce", "--rpy", 30, 0, 0)
     for command, error in ((wheels, "position"), (joints, "attitude")):
@@ -421,7 +423,7 @@ def test_show_is_checked_before_the_run(tmp_path):
     assert "'q_x'" in said
 
 
-def test_an_on_off_thruster_without_samples_is_told_of_dt(tmp_path):
+def test_an_on_off_thruster_without_samples_names_dt_in_its_error(tmp_path):
     (tmp_path / "t.toml").write_text(
         'urdf = "cubesat"\n[[input]]\ntype = "base_torque"\n[[input]]\ntype = "thruster"\n'
         'frame = "base"\nposition = [0, 0, 0]\ndirection = [1, 0, 0]\nmax = 1\non_off = true\n'

@@ -83,7 +83,7 @@ def test_the_chain_goes_from_a_file_to_gains(flown):
     assert not schedule.verified  # as the csv is not
 
 
-def test_what_is_no_motion_is_said_and_what_is_no_trajectory_refused(flown):
+def test_an_inconsistent_motion_is_reported_and_an_invalid_trajectory_is_refused(flown):
     folder = flown[0]
     given = ("planar_detumble", "--trajectory", folder / "flown.csv")
     code, out, _ = run("check", *given, "--hold", "previous")
@@ -116,7 +116,7 @@ OFFSET = ("--offset", "yaw=1", "--offset", "q_m=0.05", "--offset", "omega_b.z=0.
 
 
 @pytest.mark.exhaustive
-def test_a_trajectory_is_followed_from_beside_it_to_files(flown):
+def test_a_trajectory_is_followed_from_next_to_it_to_files(flown):
     folder, robot, motion = flown
     code, out, err = chain(
         folder,
@@ -210,7 +210,7 @@ def test_a_sampled_trajectory_of_a_mat_file_is_followed_past_its_end(flown):
         (("--allocate",), "thrusters"),
     ],
 )
-def test_what_a_trajectory_already_says_is_refused(flown, options, said):
+def test_arguments_that_a_trajectory_defines_are_refused(flown, options, said):
     folder, robot, motion = flown
     if not (folder / "other.npz").exists():
         along = fflin.linearize_trajectory(robot, motion.resampled(0.5))
@@ -219,7 +219,7 @@ def test_what_a_trajectory_already_says_is_refused(flown, options, said):
     assert said in refused("simulate", "planar_detumble", *given, *options, cwd=folder)
 
 
-def test_the_table_of_a_motion_is_no_trajectory(flown):
+def test_the_table_of_a_motion_is_not_a_trajectory(flown):
     folder, robot, _ = flown
     fflin.simulate(robot, duration=0.1, dt=0.05).save(folder / "table.csv")
     given = ("--trajectory", folder / "table.csv")

@@ -94,7 +94,7 @@ def test_redundant_thrusters_share_the_least_forces():
     assert gain.K == pytest.approx(np.linalg.pinv(lin.B[6:]) @ lin.B[6:] @ gain.K)
 
 
-def test_what_has_no_closed_form_is_refused():
+def test_a_guess_without_a_closed_form_is_refused():
     robot = fflin.load("ets_vii")
     lin = fflin.linearize(robot)
     joints = robot.replace(

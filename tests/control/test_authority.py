@@ -23,7 +23,7 @@ def tilted(robot, **joints):
     return fflin.configuration(robot, joints, pin.SE3.Random())
 
 
-def test_mass_properties_are_those_of_the_bodies_in_base_axes():
+def test_mass_properties_match_the_bodies_in_base_axes():
     robot = fflin.load("servicer_7dof")
     q = tilted(robot, joint_2=0.7, joint_4=-1.1)
     data = robot.create_data()
@@ -40,7 +40,7 @@ def test_mass_properties_are_those_of_the_bodies_in_base_axes():
 
 
 @pytest.mark.parametrize("m", [3, 6])
-def test_the_least_reach_is_that_of_linear_programs(m):
+def test_the_least_reach_matches_linear_programs(m):
     rng = np.random.default_rng(m)
     W = rng.normal(size=(m, 3 * m)) * np.logspace(-1, 2, m)[:, None]
     # so that thrusts can cancel one another

@@ -175,7 +175,7 @@ def test_efforts_hold_for_every_displacement_and_one_limit_binds(loops, name):
     assert max(share) == pytest.approx(1.0, rel=5e-3)
 
 
-def test_a_limit_of_zero_or_beyond_all_use_is_none(loops):
+def test_a_zero_or_huge_limit_is_ignored(loops):
     robot, lin, gain = loops("double_pendulum")
     assert not robot.model.effortLimit[6:].any() and not lin.limits.keys() & set(
         lin.input_names
@@ -239,7 +239,7 @@ def test_thrusters_springs_gravity_and_reduced_models_have_weights_too():
     assert gain.margins.disk > 0.6 and gain.margin > 0.0
 
 
-def test_a_point_that_asks_for_more_than_the_limits_is_told(loops):
+def test_a_point_that_asks_for_more_than_the_limits_is_reported(loops):
     model = loops("talos_arm")[0].model.copy()
     model.effortLimit[6:] *= 1e-2
     heavy = fflin.from_model(model, gravity=(0.0, 0.0, -3.0))
@@ -254,7 +254,7 @@ def test_a_point_that_asks_for_more_than_the_limits_is_told(loops):
     assert beyond and said.endswith(words)
 
 
-def test_what_the_limits_leave_beside_gravity_is_what_the_loop_may_use(loops):
+def test_the_loop_may_use_the_limits_minus_gravity(loops):
     robot, _, _ = loops("talos_arm")
     still = fflin.lqr(fflin.linearize(robot))
     heavy = robot.replace(gravity=(0.0, 0.0, -3.0))
@@ -293,7 +293,7 @@ def test_a_sampled_model_gets_the_same_cost_and_keeps_its_margins(
         )
 
 
-def test_identity_and_given_weights_are_said(loops):
+def test_identity_and_given_weights_are_reported(loops):
     _, lin, _ = loops("ets_vii")
     plain = fflin.lqr(lin, weights="identity")
     assert (plain.K == fflin.lqr(lin, 1.0, 1.0).K).all()
@@ -365,7 +365,7 @@ def test_limits_of_thrusters_wheels_and_the_base_bind_too():
     assert re.search(r"limited by the effort of [xyz]_(plus|minus)_", gain.weights)
 
 
-def test_displacements_that_ask_for_more_than_the_limits_are_warned_of(loops):
+def test_displacements_that_ask_for_more_than_the_limits_give_a_warning(loops):
     model = loops("talos_arm")[0].model.copy()
     model.effortLimit[6:] *= 0.1
     heavy = fflin.from_model(model, gravity=(0.0, 0.0, -9.81))
@@ -395,7 +395,7 @@ def test_displacements_that_ask_for_more_than_the_limits_are_warned_of(loops):
         ("servicer_7dof", {"stiffness": {"panel_left": 100.0, "panel_right": 100.0}}),
     ],
 )
-def test_bundled_inputs_fly_within_what_they_say_they_give(name, fields):
+def test_bundled_inputs_stay_within_their_limits(name, fields):
     pytest.importorskip("numba")
     robot = fflin.load(name, inputs=fflin.load_inputs(name), **fields)
     lin = fflin.linearize(robot)
@@ -418,7 +418,7 @@ def test_bundled_inputs_fly_within_what_they_say_they_give(name, fields):
 @pytest.mark.compiled
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("damping", [0.2, 5.0, 20.0])
-def test_damped_joints_come_back_as_soon_as_it_is_said(damping):
+def test_damped_joints_return_within_the_reported_time(damping):
     """Light joints are moved against their dampers, not against their inertia."""
     pytest.importorskip("numba")
     panels = dict.fromkeys(("panel_left", "panel_right"), 100.0)
@@ -582,7 +582,9 @@ def test_a_robot_that_is_held_in_gravity_comes_back_from_five_degrees(name):
         ("servicer_7dof", "q_m.joint_2", "joint_2"),
     ],
 )
-def test_a_robot_that_cannot_hold_its_weight_names_what_grows(name, mode, effort):
+def test_a_robot_that_cannot_hold_its_weight_names_the_growing_states(
+    name, mode, effort
+):
     robot = fflin.load(name, gravity=(0.0, 0.0, -9.81))
     lin = fflin.linearize(robot, u=fflin.equilibrium(robot).u)
     growth = np.linalg.eigvals(lin.A).real.max()

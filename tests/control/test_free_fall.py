@@ -115,7 +115,7 @@ def test_a_filter_starts_in_free_fall():
     assert filtered.P[0] == pytest.approx(P, abs=1e-7 * np.abs(P).max())
 
 
-def test_a_robot_that_neither_rests_nor_falls_says_what_to_give():
+def test_a_robot_that_neither_rests_nor_falls_names_the_missing_argument():
     robot = fflin.load("astrobee_arm", inputs=INPUTS, gravity=GRAVITY)
     u = fflin.effort(robot, {"thruster_1": 2.0})
     motion = fflin.simulate(robot, lambda t, q, v: u, duration=0.2, dt=0.01)

@@ -37,7 +37,7 @@ def test_the_closed_loop_is_the_same(tool):
     assert np.abs(theirs - ours - (moved - free)).max() < 1e-12 * np.abs(ours).max()
 
 
-def test_the_inputs_are_those_of_the_law_in_pinocchios_coordinates():
+def test_the_inputs_match_the_law_in_pinocchios_coordinates():
     """By differences along pin.integrate of the law of the simulation, with wrenches in base axes.
 
     The ROS 2 package linear_feedback_controller applies, with feedback_gain = K,

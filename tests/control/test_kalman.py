@@ -93,7 +93,7 @@ def test_a_direct_term_is_carried():
         assert np.abs(poles - pole).min() < 1e-6 * abs(pole)
 
 
-def test_what_is_not_seen_or_not_disturbed_is_named(lin):
+def test_undetectable_and_undisturbed_states_are_named(lin):
     robot = fflin.load("ets_vii")
     joints = fflin.linearize(robot.replace(outputs=[fflin.JointPositions()]))
     for model in (joints, joints.discretize(0.1)):

@@ -226,7 +226,7 @@ def test_the_fastest_pole_of_a_controller_chooses_the_step(arm):
         fflin.simulate(robot, fflin.LinearController(fast, lin), duration=0.1, dt=0.05)
 
 
-def test_poles_that_grow_are_told(arm):
+def test_poles_that_grow_are_reported(arm):
     robot, lin, gain, _ = arm
     state = fflin.linearize(robot.replace(outputs=[fflin.FullState()]))
     run = {"duration": 0.1}
@@ -309,7 +309,7 @@ def test_sizes_and_figures_that_do_not_fit_are_refused(lin, words, change):
         fflin.LinearController(tuple(parts.values()), lin)
 
 
-def test_what_is_no_controller_of_the_model_is_refused(lin, arm):
+def test_a_controller_of_another_model_is_refused(lin, arm):
     robot, _, gain, seen = arm
     A, B, C, D = matrices(lin)
     improper, tall = (
@@ -374,7 +374,7 @@ def test_files_that_hold_none_are_refused(lin, tmp_path):
         fflin.LinearController(tmp_path / "K.csv", lin)
 
 
-def test_outputs_are_those_of_the_model_everywhere():
+def test_outputs_match_the_model_everywhere():
     kinds = (
         *SEEN,
         fflin.FramePose("hand"),

@@ -100,7 +100,7 @@ def test_a_mode_that_the_weights_leave_out_is_not_held_by_rounding(lin, dt, seed
         fflin.lqr(lin.discretize(dt) if dt else lin, Q, 1.0)
 
 
-def test_bad_weights_are_named(lin):
+def test_invalid_weights_are_named(lin):
     indefinite = np.eye(24)
     indefinite[3, 7] = indefinite[7, 3] = 2.0
     for words, arguments in {
@@ -157,7 +157,7 @@ def test_weights_of_any_size_give_a_gain_or_one_clear_line(lin, dt):
         fflin.lqr(model, 1e308 * np.eye(nx), np.eye(nu))
 
 
-def test_what_is_no_fixed_point_is_refused_with_its_rows():
+def test_an_operating_point_that_is_not_a_fixed_point_is_refused_with_its_rows():
     robot = fflin.load("ets_vii")
     v = fflin.velocity(robot, {"omega_b.z": 0.1, "joint_1": 0.2})
     for point in (
@@ -176,7 +176,7 @@ def test_what_is_no_fixed_point_is_refused_with_its_rows():
 
 @pytest.mark.parametrize("name", [name for name in BUNDLED if name != "cubesat"])
 @pytest.mark.parametrize("dt", [0.0, 0.2])
-def test_what_the_inputs_cannot_hold_is_named(robots, name, dt):
+def test_states_that_inputs_cannot_hold_are_named(robots, name, dt):
     robot = robots[name]
     q = random_point(robot, np.random.default_rng(1))[0]
 
@@ -485,7 +485,7 @@ def test_files_keep_every_bit(gain, tmp_path, ending):
             fflin.Gain.load(tmp_path / f"{name}{ending}")
 
 
-def test_files_refuse_what_is_not_finite_and_unknown_endings(gain, tmp_path):
+def test_files_refuse_nonfinite_values_and_unknown_endings(gain, tmp_path):
     with pytest.raises(fflin.FileError, match=r"'\.csv'"):
         gain.save(tmp_path / "gain.csv")
     broken = replace(gain, K=np.full_like(gain.K, np.nan))

@@ -91,7 +91,7 @@ def test_a_loop_is_unstable_just_beyond_its_margins_and_no_sooner(lin):
     assert held
 
 
-def test_what_is_not_regulated_has_no_part_in_the_loops():
+def test_unregulated_states_do_not_affect_the_margins():
     robot = fflin.load("cubesat", inputs=fflin.load_inputs("cubesat"))
     lin = fflin.linearize(robot)
     gain = fflin.lqr(lin)

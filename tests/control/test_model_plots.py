@@ -22,7 +22,7 @@ pytest.importorskip("matplotlib")
         pytest.param("servicer_7dof", "servicer_7dof", marks=pytest.mark.exhaustive),
     ],
 )
-def test_the_pattern_is_that_of_a_and_b_by_groups(name, inputs):
+def test_the_pattern_matches_a_and_b_by_groups(name, inputs):
     robot = fflin.load(name)
     lin = fflin.linearize(
         robot.replace(inputs=fflin.load_inputs(inputs)) if inputs else robot
@@ -131,7 +131,7 @@ def test_modes_that_grow_and_robots_without_modes():
 
 
 @pytest.mark.parametrize("wrong", [False, True])
-def test_errors_of_a_check_stand_beside_what_they_must_not_exceed(wrong):
+def test_errors_of_a_check_are_drawn_with_their_tolerances(wrong):
     robot = fflin.load("servicer_7dof")
     lin = fflin.linearize(robot)
     found = fflin.check(robot, replace(lin, B=1.001 * lin.B) if wrong else lin)
@@ -172,7 +172,7 @@ def reach():
 
 
 @pytest.mark.compiled
-def test_validity_says_the_slope_that_is_drawn(reach):
+def test_validity_reports_the_slope_that_is_drawn(reach):
     figure = fflin.plot_validity(reach)
     assert_legible(figure)
     left, right = figure.axes
@@ -201,7 +201,7 @@ def test_joints_that_all_turn_are_displaced_by_radians(reach, name, unit):
 
 
 @pytest.mark.compiled
-def test_validity_of_what_leaves_the_chart_can_be_drawn(tmp_path):
+def test_validity_of_runs_that_leave_the_chart_can_be_drawn(tmp_path):
     robot = fflin.load("cubesat")
     lin = fflin.linearize(robot)
     gain = fflin.acceleration_lqr(lin, 1.0, 1.0, 1.0)
@@ -227,6 +227,6 @@ def test_validity_of_what_leaves_the_chart_can_be_drawn(tmp_path):
         ("plot_poles", "poles"),
     ],
 )
-def test_what_is_no_result_is_refused(function, expected):
+def test_an_invalid_result_is_refused(function, expected):
     with pytest.raises(fflin.InputError, match=expected):
         getattr(fflin, function)("stable" if function == "plot_poles" else 3)

@@ -169,7 +169,7 @@ def test_within_limits_it_is_the_best(servicer, size):
     assert left <= 1e-6 * np.abs(scale * m.g).max()
 
 
-def test_what_cannot_be_kept_is_passed_by_the_least(servicer):
+def test_an_infeasible_limit_is_violated_by_the_least(servicer):
     """From a speed beyond its limit, with torques that take samples to slow it down."""
     _, lin = servicer
     limits = {
@@ -201,7 +201,7 @@ def test_what_cannot_be_kept_is_passed_by_the_least(servicer):
     assert says(ahead.notes[0], "each of 12 samples of 0.1 s: 1", "qdot_m.joint")
 
 
-def test_what_the_robot_passes_is_said_though_no_plan_does(servicer):
+def test_violations_of_the_robot_are_reported_even_if_no_plan_has_them(servicer):
     """Far from the point the inertia is another, and rates pass their limit."""
     robot, lin = servicer
     rates = np.flatnonzero([name.startswith("qdot_m") for name in lin.state_names])
@@ -405,7 +405,7 @@ def test_campaigns_fly_it_and_the_compiled_loop_says_why_not(servicer):
         fflin.simulate(robot, policy, linear=True, **options)
 
 
-def test_a_plan_that_is_not_found_is_told_and_not_applied(servicer, monkeypatch):
+def test_a_plan_that_is_not_found_is_reported_and_not_applied(servicer, monkeypatch):
     robot, lin = servicer
     limits = ["urdf", WEAK]
     policy = fflin.mpc(lin, *weights(lin), dt=0.25, limits=limits)
@@ -421,7 +421,9 @@ def test_a_plan_that_is_not_found_is_told_and_not_applied(servicer, monkeypatch)
 
 
 @pytest.mark.exhaustive
-def test_what_it_cannot_do_is_said_in_a_line(servicer, planned, monkeypatch, tmp_path):
+def test_unsupported_uses_are_refused_in_one_line(
+    servicer, planned, monkeypatch, tmp_path
+):
     robot, lin = servicer
     _, along = planned
     weighed = weights(lin)

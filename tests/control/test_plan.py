@@ -148,7 +148,7 @@ def test_a_tumble_ends_within_limits(hold):
 
 
 @pytest.mark.exhaustive
-def test_what_is_planned_is_flown(servicer, tmp_path):
+def test_a_planned_motion_is_simulated(servicer, tmp_path):
     """The simulator under the same inputs ends where the plan does; the file says hold and axes."""
     robot, v, goal = servicer
     motion = fflin.plan(robot, (goal, None), 20.0, v0=v, knots=41, limits=None)
@@ -355,7 +355,7 @@ def test_a_start_or_goal_outside_a_limit_is_refused_before_planning(
 
 
 @pytest.mark.exhaustive
-def test_wheels_turn_a_body_and_may_keep_what_they_took(tmp_path):
+def test_wheels_rotate_a_body_and_may_keep_momentum(tmp_path):
     """Only wheels act, so that the turn's momentum is theirs, and angles of wheels are no goal."""
     wheels = [fflin.ReactionWheel(axis, inertia=1e-4, max=1e-3) for axis in np.eye(3)]
     robot = fflin.load("cubesat", inputs=wheels)
@@ -452,7 +452,7 @@ def test_starts_and_goals_are_given_in_every_form():
 
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("held", [True, False])
-def test_slopes_of_intervals_are_those_of_the_flow(servicer, held):
+def test_derivatives_of_intervals_match_the_flow(servicer, held):
     robot, v, goal = servicer
     t = np.linspace(0.0, 8.0, 41)
     q, v, u = Shooting(robot, t, held).guess(
@@ -494,7 +494,7 @@ def test_slopes_of_intervals_are_those_of_the_flow(servicer, held):
 
 
 @pytest.mark.parametrize("held", [True, False])
-def test_limited_values_between_knots_are_those_of_finer_motions(servicer, held):
+def test_limited_values_between_knots_match_finer_motions(servicer, held):
     """At the ends of 16 parts, by as many steps or more: errors fall with the fourth power."""
     robot, v, goal = servicer
     t = np.linspace(0.0, 4.0, 5)
@@ -514,7 +514,7 @@ def test_limited_values_between_knots_are_those_of_finer_motions(servicer, held)
     )
 
 
-def test_rows_of_motions_are_those_of_single_motions(servicer):
+def test_rows_of_motions_match_single_motions(servicer):
     """The motion flown from a start and the motions of its intervals are the same."""
     robot, v, goal = servicer
     shooting = Shooting(robot, np.linspace(0.0, 4.0, 5), False)
@@ -831,7 +831,7 @@ def test_with_a_base_torque_the_base_of_a_guess_moves_to_the_goal(first_guess):
         (3.0, "guess has type float"),
     ],
 )
-def test_a_guess_that_is_no_motion_of_the_joints_is_refused(loop, guess, words):
+def test_a_guess_that_is_not_a_motion_of_the_joints_is_refused(loop, guess, words):
     robot, _ = loop
     with pytest.raises(fflin.FflinError, match=words):
         fflin.plan(robot, (None, None), 5.0, knots=5, guess=guess)
@@ -915,7 +915,7 @@ def test_a_plan_is_a_minimum_for_another_optimiser():
         ({"x0": np.zeros(12), "q0": np.zeros(7)}, "x0"),
     ],
 )
-def test_what_is_no_plan_is_refused(cube, wrong, said):
+def test_an_invalid_plan_is_refused(cube, wrong, said):
     robot, _ = cube
     with pytest.raises(fflin.FflinError, match=said):
         fflin.plan(robot, **{"goal": (None, None), "duration": 1.0} | wrong)
@@ -956,7 +956,7 @@ def test_progress_shows_iterations_cost_and_violation(cube, capsys):
     assert shown.endswith("\r\x1b[2K")
 
 
-def test_a_file_of_other_inputs_names_what_differs(free_floating, tmp_path):
+def test_a_file_with_other_inputs_names_the_difference(free_floating, tmp_path):
     robot, _ = free_floating
     whole = fflin.load("planar_detumble")
     path = tmp_path / "plan.npz"

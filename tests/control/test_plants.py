@@ -104,7 +104,7 @@ class Renamed:
         return fflin.from_model(model, name="other")
 
 
-def test_what_has_other_names_is_refused_with_the_names(nominal):
+def test_models_with_other_names_are_refused_with_the_names(nominal):
     robot, lin = nominal
     policy = fflin.StateFeedback(lin, np.zeros(lin.B.T.shape))
 

@@ -312,7 +312,7 @@ def test_lyapunov_equations_by_modes(monkeypatch):
     )
 
 
-def test_what_is_not_stable_is_no_solution(robots):
+def test_an_unstable_solution_is_rejected(robots):
     lin = fflin.linearize(robots["cubesat"])
     for model in (lin, lin.discretize(0.1)):
         equation = Riccati(model.A, model.B, np.eye(12), np.eye(6), None, model.dt)

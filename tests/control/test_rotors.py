@@ -48,7 +48,7 @@ def models(others=(), axes=AXES[:4], spinning=True, dt=0.0, moving=False, **fiel
 @pytest.mark.parametrize(
     "spinning, dt", [(True, 0.1), (False, 0.0), *exhaustive((True, 0.0), (False, 0.1))]
 )
-def test_designs_are_those_of_reaction_wheels(others, spinning, dt):
+def test_designs_match_reaction_wheels(others, spinning, dt):
     (_, lin), (_, other) = models(INPUTS[others], spinning=spinning, dt=dt)
     x, u = matched(lin, other)
     assert lin.wheels == other.wheels == ("wheel_1", "wheel_2", "wheel_3", "wheel_4")
@@ -97,7 +97,7 @@ def test_the_speed_limit_of_a_wheel_without_motor_does_not_bound_the_loop():
 
 
 @pytest.mark.parametrize("spinning", [True, False])
-def test_filters_and_reductions_are_those_of_reaction_wheels(spinning):
+def test_filters_and_reductions_match_reaction_wheels(spinning):
     (robot, lin), (twin, other) = models((BaseTorque(),), spinning=spinning)
     x, _ = matched(lin, other)
     noise = {"omega_b": 1e-4, "q_b": 1e-6, "qdot_m": 1e-4, "q_m.arm": 1e-6}
@@ -149,7 +149,7 @@ def laws_of(lin, kind):
         pytest.param("outputs", 0.2, "compiled", marks=pytest.mark.compiled),
     ],
 )
-def test_motions_and_reports_are_those_of_reaction_wheels(kind, dt, engine):
+def test_motions_and_reports_match_reaction_wheels(kind, dt, engine):
     found = []
     for robot, lin in models(
         (BaseTorque(),), axes=AXES[:3], dt=dt if kind != "mpc" else 0.0
@@ -273,7 +273,7 @@ def test_a_joint_spins_above_a_speed(factor, flown):
     ],
     ids=lambda value: value.split()[-1] if isinstance(value, str) else "",
 )
-def test_a_joint_that_cannot_spin_freely_is_no_wheel(changes, why):
+def test_a_joint_that_cannot_spin_freely_is_not_a_wheel(changes, why):
     """It cannot be named, and its spin is no steady motion."""
     robot = hub_with_wheel(**changes)
     with pytest.raises(fflin.InputError, match=why):
@@ -362,7 +362,7 @@ def test_batches_keep_the_wheels_of_each_point(ending, tmp_path):
     assert [each.wheels for each in found] == [("wheel_1",), ("wheel_1", "wheel_2")]
 
 
-def test_the_gain_in_the_coordinates_of_tools_is_that_of_reaction_wheels():
+def test_the_gain_in_the_coordinates_of_tools_matches_reaction_wheels():
     (_, lin), (_, other) = models((BaseTorque(),))
     gain, expected = fflin.lqr(lin), fflin.lqr(other)
     for tool in ("pinocchio", "mujoco", "drake"):
@@ -467,7 +467,7 @@ def test_a_wheel_without_a_motor_keeps_its_momentum():
     )
 
 
-def test_the_wrist_of_a_moving_arm_is_no_wheel():
+def test_the_wrist_of_a_moving_arm_is_not_a_wheel():
     # The last link of ets_vii is symmetric about its joint, which has no limits.
     robot = fflin.load("ets_vii")
     wrist = robot.joint_names[-1]

@@ -107,7 +107,7 @@ def test_scales_change_nothing_and_hard_bounds_may_leave_nothing():
     assert beyond[0] > beyond[1] + 0.1 and np.abs(free[1]).max() <= 0.2
 
 
-def test_without_the_solver_it_is_said_how_to_install_it(monkeypatch):
+def test_without_the_solver_the_error_names_the_package(monkeypatch):
     monkeypatch.setitem(sys.modules, "piqp", None)
     with pytest.raises(MissingPackageError, match=r"'fflin\[mpc\]'"):
         solved()

@@ -79,7 +79,7 @@ def fly(robot, along, policy, e, **options):
     return np.array(rows), np.array(estimates)
 
 
-def test_the_linear_loop_foresees_it_to_second_order(loop):
+def test_the_linear_loop_predicts_it_to_second_order(loop):
     robot, along, gains, seen = loop
     assert seen.D.any() and np.ptp(seen.C, axis=0).max() > 0.1
     policy, apart = fflin.TrajectoryOutputFeedback(along, gains, seen), []
@@ -193,7 +193,7 @@ def test_held_inputs_follow_linear_ones_by_their_mean(monkeypatch):
 
 
 @pytest.mark.exhaustive
-def test_what_does_not_fit_is_refused(loop):
+def test_a_mismatched_argument_is_refused(loop):
     robot, along, gains, seen = loop
     make = fflin.TrajectoryOutputFeedback
     with pytest.raises(fflin.InputError, match="FilterSchedule"):

@@ -141,7 +141,7 @@ def test_filters_are_kept(moving, tmp_path, ending):
     assert repr(schedule).startswith(start)
 
 
-def test_what_is_wrong_is_told(moving):
+def test_errors_are_reported(moving):
     for words, (traj, *arguments), sample in (
         ("LinearTraj", (moving[0], 1, 1), 0.1),
         ("sampled", (moving.discretize(0.1), 1, 1), 0.1),

@@ -181,7 +181,7 @@ def test_inputs_that_soon_reach_less_are_solved_in_shorter_steps():
     assert values[0, 0, 0] == pytest.approx(found.y[0, -1], rel=1e-5)
 
 
-def test_schedules_are_kept_and_bad_input_is_told(moving, tmp_path):
+def test_schedules_are_kept_and_bad_input_is_reported(moving, tmp_path):
     Q, R = weights(moving)
     schedule = fflin.tvlqr(moving, Q, R, {"q_b": 5.0})
     for ending in ("npz", "mat", "json"):
@@ -262,7 +262,7 @@ def test_held_inputs_have_the_cost_that_is_promised_and_no_other_is_less(tumblin
 
 
 @pytest.mark.exhaustive
-def test_held_inputs_at_rest_are_those_of_the_sampled_regulator():
+def test_held_inputs_at_rest_match_the_sampled_regulator():
     robot, traj = resting("ets_vii", 200.0)
     Q, R = weights(traj)
     lin = fflin.linearize(robot, moving=True)
@@ -314,7 +314,7 @@ def test_at_a_steady_end_wheels_spin_on():
 
 @pytest.mark.exhaustive
 @pytest.mark.filterwarnings("ignore:t, q, v, u are not a motion")
-def test_a_steady_end_leaves_out_what_inputs_cannot_hold(tumbling):
+def test_a_steady_end_omits_states_that_inputs_cannot_hold(tumbling):
     robot, traj = tumbling
     robot = robot.replace(inputs=robot.inputs[2:])
     traj = fflin.linearize_trajectory(robot, traj.t, traj.q, traj.v, traj.u[:, 6:])
@@ -333,7 +333,7 @@ def test_a_steady_end_leaves_out_what_inputs_cannot_hold(tumbling):
 
 
 @pytest.mark.exhaustive
-def test_weights_are_those_of_lqr(tumbling):
+def test_weights_match_lqr(tumbling):
     _, traj = tumbling
     with pytest.raises(fflin.InputError, match="Q and R"):
         fflin.tvlqr(traj, 1.0)

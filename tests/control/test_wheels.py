@@ -52,7 +52,7 @@ def attitude(lin):
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_the_gain_is_that_of_the_single_body(layout):
+def test_the_gain_matches_the_single_body(layout):
     axes = LAYOUTS[layout]
     lin = fflin.linearize(wheeled(axes))
     Q, R = (
@@ -107,7 +107,7 @@ def test_orthogonal_wheels_have_the_textbooks_closed_form():
 
 
 @pytest.mark.parametrize("layout", mostly(LAYOUTS, "pyramid", "skew"))
-def test_the_motion_is_that_of_the_rigid_body_under_the_textbooks_law(layout):
+def test_the_motion_matches_the_rigid_body_under_the_textbooks_law(layout):
     """With the wheels' inertia taken out of it and their momentum carried along; H is kept."""
     axes = LAYOUTS[layout]
     robot = wheeled(axes)
@@ -258,7 +258,7 @@ def test_a_large_wheel_turns_against_the_rest_of_the_robot(axis):
 
 
 @pytest.mark.parametrize("spin", [-1.0, 3.0])
-def test_a_wheel_that_is_at_its_limit_is_told_and_quickens_nothing(spin):
+def test_a_wheel_that_is_at_its_limit_is_reported_and_quickens_nothing(spin):
     added = [ReactionWheel(each, inertia=J, max_speed=1.0) for each in ORTHOGONAL]
     robot = body().replace(inputs=added)
     still = fflin.lqr(fflin.linearize(robot))
@@ -344,7 +344,7 @@ def test_four_wheels_turn_against_each_other_on_request():
     assert np.abs(motion.v[-1] - idle).max() < 1e-6
 
 
-def test_what_is_not_regulated_is_said(tmp_path):
+def test_unregulated_states_are_reported(tmp_path):
     lin = fflin.linearize(wheeled(ORTHOGONAL))
     gain = fflin.lqr(lin)
     assert says(str(gain), "not regulated: r_b.x, r_b.y, r_b.z, q_m.wheel_1")
@@ -366,7 +366,7 @@ def test_what_is_not_regulated_is_said(tmp_path):
     assert replace(whole, regulated=()).margins == whole.margins
 
 
-def test_what_cannot_be_held_is_refused():
+def test_an_equilibrium_that_inputs_cannot_hold_is_refused():
     for count, words in (
         (1, "angular momentum y/z"),
         (2, "angular momentum z"),
@@ -381,7 +381,7 @@ def test_what_cannot_be_held_is_refused():
         fflin.lqr(fflin.linearize(idle))
 
 
-def test_damping_of_wheels_is_said_to_be_why_nothing_is_held():
+def test_damping_of_wheels_is_reported_to_be_why_nothing_is_held():
     """Their speeds stay in the model with it, and the momentum of all that no input changes."""
     names = [f"wheel_{k}" for k in (1, 2, 3)]
     lin = fflin.linearize(
@@ -436,7 +436,7 @@ def test_the_closed_form_holds_too():
         assert gain.P == pytest.approx(same.P, abs=1e-7 * np.abs(gain.P).max())
 
 
-def test_a_filter_estimates_what_is_regulated():
+def test_a_filter_estimates_the_regulated_states():
     robot = wheeled(AXES[:3]).replace(
         outputs=[fflin.BasePose(), fflin.JointVelocities()]
     )

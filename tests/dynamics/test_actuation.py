@@ -126,7 +126,7 @@ def test_thruster_column_is_the_work_of_its_force(thruster):
     assert generalised @ nu == pytest.approx(power, rel=1e-11)
 
 
-def test_thrust_slope_by_the_closed_form():
+def test_thrust_derivative_by_the_closed_form():
     """M^-1 sum dB/dq u, with dJ_j/dq_l = J_j x J_l for l on a deeper supporting joint, else 0."""
     robot = fflin.load("servicer_7dof", inputs=THRUSTERS[2:])
     bare = fflin.load("servicer_7dof")
@@ -296,7 +296,7 @@ def test_hovering_quadrotor_is_held_by_thrust():
     assert fflin.check(robot, lin).ok
 
 
-def test_bad_fields_are_told():
+def test_invalid_fields_are_reported():
     robot = fflin.load("servicer_7dof")
     cases = {
         "'tol'": {"inputs": [fflin.Thruster("tol", (0, 0, 0), (1, 0, 0))]},

@@ -171,7 +171,7 @@ def test_the_names_of_the_payload_have_its_prefix():
     assert again.robot.mass == pytest.approx(robot.mass + payload.mass + 500.0)
 
 
-def test_a_body_that_was_caught_has_parameters_of_its_own():
+def test_a_captured_payload_has_separate_parameters():
     robot = fflin.load("servicer_7dof")
     found = fflin.capture(robot, "tool", DEBRIS)
     S = fflin.sensitivity(fflin.linearize(found.robot))
@@ -187,7 +187,7 @@ def test_a_body_that_was_caught_has_parameters_of_its_own():
 
 
 @pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
-def test_what_is_wrong_is_one_line():
+def test_errors_are_one_line():
     robot, other = fflin.load("ets_vii"), fflin.load("cubesat")
     cases = [
         (lambda: fflin.capture(robot, "claw", DEBRIS), "claw"),

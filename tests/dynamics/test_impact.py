@@ -84,7 +84,7 @@ def test_a_wheel_that_seizes_gives_its_momentum_to_its_carrier():
     assert np.abs(found.momentum_after - found.momentum).max() < 1e-15
 
 
-def test_fields_lose_what_is_of_the_joint():
+def test_fields_lose_the_entries_of_the_jammed_joint():
     robot = fflin.load(
         "ets_vii",
         stiffness=2.0,
@@ -109,7 +109,7 @@ def test_fields_lose_what_is_of_the_joint():
 
 
 @pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
-def test_what_mimics_a_joint_stops_with_it(tmp_path):
+def test_mimic_joints_stop_with_their_leader(tmp_path):
     mimic = '<mimic joint="b" multiplier="-2" offset="0.3"/>'
     document = MIMIC.format(
         links=LINKS, a="revolute", b="revolute", parent="base", mimic=mimic
@@ -127,7 +127,7 @@ def test_what_mimics_a_joint_stops_with_it(tmp_path):
     )
 
 
-def test_what_was_caught_may_jam_too():
+def test_joints_of_the_payload_may_jam_too():
     robot, payload = fflin.load("ets_vii"), fflin.load("servicer_7dof")
     caught = fflin.capture(robot, "tool", payload)
     left = fflin.jam(caught.robot, "payload.panel_left", q=caught.q, v=caught.v)
@@ -140,7 +140,7 @@ def test_what_was_caught_may_jam_too():
 @pytest.mark.parametrize(
     "payload", [pin.Inertia(5.0, np.zeros(3), np.eye(3)), "cubesat"]
 )
-def test_a_link_of_what_was_caught_never_stands_for_a_whole_body(payload):
+def test_a_link_of_the_payload_never_replaces_a_whole_body(payload):
     """A model of other origin has no links, so the body that grasps keeps its own name."""
     model = fflin.load("planar_detumble").model
     robot = fflin.from_model(model)
@@ -155,14 +155,14 @@ def test_a_link_of_what_was_caught_never_stands_for_a_whole_body(payload):
     assert heavier.mass == pytest.approx(caught.mass + 100.0 - found["joint_3"])
 
 
-def test_a_joint_of_what_was_caught_keeps_the_spring_of_its_own_name():
+def test_a_joint_of_the_payload_keeps_its_spring():
     robot = fflin.load("ets_vii", stiffness=3.0)
     caught = fflin.capture(robot, "tool", robot.replace(stiffness=4.0))
     left = fflin.jam(caught.robot, "joint_2", q=caught.q, v=caught.v).robot
     assert left.stiffness["payload.joint_2"] == 4.0 and "joint_2" not in left.stiffness
 
 
-def test_what_is_wrong_is_one_line():
+def test_errors_are_one_line():
     robot = fflin.load("ets_vii")
     only = robot.replace(inputs=[fflin.JointTorque("joint_1")])
     for call, said in [

@@ -74,7 +74,7 @@ def rows_of(robot, count, seed=0):
 
 
 @pytest.mark.parametrize("name", ROBOTS)
-def test_sums_are_those_of_pinocchio(name):
+def test_sums_match_pinocchio(name):
     robot = ROBOTS[name]()
     model, data = robot.model, robot.create_data()
     q, v = rows_of(robot, 20)

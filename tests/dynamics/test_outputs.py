@@ -333,7 +333,7 @@ def test_laws(name):
     assert not feeling.evaluate(data, q, v, a).by_q[:, :6].any()
 
 
-def test_free_fall_is_not_felt():
+def test_accelerometers_do_not_measure_free_fall():
     """Under gravity and no forces an accelerometer reads what it reads without either."""
     robot = ROBOTS["servicer_7dof"]()
     q, v, _ = point(robot, np.random.default_rng(4))
@@ -349,7 +349,7 @@ def test_free_fall_is_not_felt():
 
 @pytest.mark.parametrize("degrees", mostly([0.0, 1e-6, 90.0, 160.0], 1e-6, 160.0))
 @pytest.mark.parametrize("name", mostly(ROBOTS, "ets_vii", "moved_root", "tree_2"))
-def test_derivatives_are_those_of_the_nonlinear_outputs(name, degrees):
+def test_derivatives_match_the_nonlinear_outputs(name, degrees):
     robot = ROBOTS[name]()
     q, v, a = point(robot, np.random.default_rng(int(degrees)), degrees)
     assert_derivatives(robot, q, v, a)
@@ -371,7 +371,7 @@ def test_derivatives_at_orbital_speed(name):
 
 
 @pytest.mark.parametrize("name", ROBOTS)
-def test_orbit_costs_no_digits(name):
+def test_orbit_loses_no_accuracy(name):
     """Where the base is and how fast it moves along changes what it must, and no digit more."""
     robot = ROBOTS[name]().replace(gravity=GRAVITY)
     rng = np.random.default_rng(7)
@@ -519,7 +519,7 @@ def test_a_link_comes_before_a_joint_of_its_name():
         (["tool"], fflin.InputError, "'tool'"),
     ],
 )
-def test_what_cannot_be_is_refused(outputs, error, message):
+def test_an_impossible_value_is_refused(outputs, error, message):
     with pytest.raises(error, match=message):
         Sensing(StateMap(fflin.load("servicer_7dof")), outputs)
 

@@ -38,7 +38,7 @@ def test_feedback_reads_the_state_whose_angles_are_near(name, frame):
 
 
 @pytest.mark.parametrize("name", ["ets_vii", "servicer_7dof", "tiago_dual"])
-def test_a_small_error_of_a_joint_keeps_its_digits(name):
+def test_a_small_error_of_a_joint_keeps_its_accuracy(name):
     robot, rng = fflin.load(name), np.random.default_rng(2)
     state, at = fflin.StateMap(robot, frame="local"), slice(6, 6 + robot.n)
     for size in (1e-9, 1e-8, 1e-3, 2.0):
@@ -111,7 +111,7 @@ def test_cf4_is_the_published_scheme():
     assert times[:4] == times[4:8]
 
 
-def test_a_policy_may_keep_what_it_is_given():
+def test_a_policy_may_keep_its_arguments():
     robot = fflin.load("servicer_7dof")
     _, v0 = anywhere(robot, np.random.default_rng(8))
     kept = []

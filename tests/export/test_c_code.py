@@ -251,7 +251,7 @@ def test_a_law_from_a_file_needs_its_robot(tmp_path):
         ({"law": "compensator"}, "continuous, expected a sampled"),
     ],
 )
-def test_what_cannot_be_written_is_refused(change, match, tmp_path):
+def test_a_law_that_cannot_be_exported_is_refused(change, match, tmp_path):
     robot, by = law("hybrid")
     if change.get("law") == "continuous":
         robot, along, _ = tracking()
@@ -439,7 +439,7 @@ def test_folders_that_cannot_be_used_are_one_line(tmp_path, monkeypatch):
         fflin.CLaw(tmp_path / "c")  # the name of the temporary folder is random
 
 
-def test_what_fails_leaves_no_folder(tmp_path, monkeypatch):
+def test_a_failure_leaves_no_folder(tmp_path, monkeypatch):
     def full(*_):
         raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -511,7 +511,7 @@ def test_half_a_turn_is_decided_as_in_python(axis, side, about_neutral):
     assert u == pytest.approx(other, rel=1e-14, abs=1e-14 * np.abs(other).max())
 
 
-def test_units_of_a_compensator_are_those_of_its_robot(tmp_path):
+def test_units_of_a_compensator_match_its_robot(tmp_path):
     robot = fflin.load("planar_detumble")
     lin = fflin.linearize(robot).discretize(0.1)
     by = replace(

@@ -35,7 +35,7 @@ def test_machine_code_gives_the_figures_of_the_record(golden, case):
     assert not differences(case, "compiled", golden)
 
 
-def test_the_record_notices_what_is_changed(golden):
+def test_the_golden_record_detects_changes(golden):
     case = "policies state planar_detumble"
     found = figures(case, "python")
     for key, change in (("q", 1.0 + 1e-11), ("rows", 2), ("stopped", None)):

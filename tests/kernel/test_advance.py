@@ -118,7 +118,7 @@ def both(plan, tolerance=1e-10):
     ],
     ids=lambda make: make.__name__,
 )
-def test_the_mechanics_are_those_of_pinocchio_under_every_policy(robots, make):
+def test_the_mechanics_match_pinocchio_under_every_policy(robots, make):
     robot, policy, options = make(plain(robots["ets_vii"]))
     x0 = displaced(fflin.linearize(robot), degrees=20.0)
     options = {"x0": x0, "dt": 0.02} | options
@@ -172,7 +172,7 @@ def test_gains_between_grid_points_agree_with_pinocchio_in_all_cells_and_outside
         assert np.abs(u).max() > 1e-3
 
 
-def test_a_gyroscope_measures_the_rotation_in_the_axes_of_its_own_frame():
+def test_a_gyroscope_measures_the_rotation_in_the_axes_of_its_frame():
     """The command is D omega, with omega in the axes of a frame that is turned in its link."""
     rng = np.random.default_rng(1)
     model = random_tree(rng, 3).model.copy()

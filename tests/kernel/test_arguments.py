@@ -53,7 +53,7 @@ VALUE = Outer(
 )
 
 
-def test_every_kind_of_field_is_read_where_it_stands():
+def test_every_kind_of_field_is_read_from_its_words():
     opened = opener(OUTER)
 
     @numba.njit
@@ -83,7 +83,7 @@ def test_every_kind_of_field_is_read_where_it_stands():
     assert flags == (True, False, True)
 
 
-def test_what_is_written_in_compiled_code_stands_in_the_arrays():
+def test_compiled_code_writes_to_the_arrays():
     opened = opener(OUTER)
 
     @numba.njit
@@ -131,7 +131,7 @@ def twice(x):
     return 2.0 * square(x)
 
 
-def test_parts_are_compiled_with_what_calls_them():
+def test_parts_are_compiled_with_their_callers():
     one, other = translated(square), translated(twice)
 
     @numba.njit

@@ -42,7 +42,7 @@ def planted(lin, matrix, rows, columns):
 
 @pytest.mark.parametrize("column", (*GROUPS, *INPUTS))
 @pytest.mark.parametrize("row", GROUPS)
-def test_planted_error_is_found_in_its_block(moving, row, column):
+def test_planted_error_is_detected_in_its_block(moving, row, column):
     robot, lin, groups = moving
     matrix = "A" if column in GROUPS else "B"
     columns = groups[column] if column in GROUPS else INPUTS[column]
@@ -60,7 +60,7 @@ def test_planted_error_is_found_in_its_block(moving, row, column):
 
 
 @pytest.mark.parametrize("matrix", ["A", "B"])
-def test_flipped_sign_of_any_nonzero_block_is_found(moving, matrix):
+def test_flipped_sign_of_any_nonzero_block_is_detected(moving, matrix):
     robot, lin, groups = moving
     columns = groups if matrix == "A" else INPUTS
     flipped = 0
@@ -78,7 +78,7 @@ def test_flipped_sign_of_any_nonzero_block_is_found(moving, matrix):
     assert flipped >= (10 if matrix == "A" else 9)
 
 
-def test_wrong_point_is_found():
+def test_wrong_point_is_detected():
     robot = fflin.load("ets_vii")
     lin = fflin.linearize(robot, *random_point(robot, np.random.default_rng(2)))
     for name in ("x0", "f0"):
@@ -90,7 +90,7 @@ def test_wrong_point_is_found():
         }
 
 
-def test_model_of_another_inertia_is_found():
+def test_model_of_another_inertia_is_detected():
     """The matrices of one robot do not pass as those of another with the same joints."""
     robot = fflin.load("ets_vii")
     model = robot.model.copy()
@@ -169,7 +169,7 @@ def test_not_a_number_is_not_ok():
     assert not fflin.check(robot, replace(lin, A=A)).ok
 
 
-def test_check_of_what_it_cannot_check_is_refused():
+def test_an_unsupported_model_is_refused_by_check():
     robot = fflin.load("cubesat")
     lin = fflin.linearize(robot)
     with pytest.raises(fflin.InputError, match=r"0\.1"):
@@ -188,7 +188,7 @@ def test_report_fits_80_columns():
     )
 
 
-def test_rounding_of_a_large_acceleration_is_no_failure():
+def test_rounding_of_a_large_acceleration_is_not_a_failure():
     # Where an accelerometer sits at the pushed origin, its slopes vanish and only rounding is left.
     robot = fflin.load("cubesat")
     push = fflin.Thruster("base", (0.3, -1.1, 0.4), (1.0, 0.2, -0.5))
@@ -400,7 +400,7 @@ def test_aba_of_light_links_with_mimic_joints_is_accurate(seed):
     assert np.abs((route.B.value - lin.B)[rows] / units).max() < 1e-13
 
 
-def test_a_velocity_that_is_zero_but_for_rounding_is_no_scale():
+def test_a_velocity_that_is_zero_but_for_rounding_is_not_a_scale():
     robot = fflin.load("servicer_7dof")
     tug = robot.replace(
         stiffness={"panel_left": 100.0, "panel_right": 100.0}, damping=0.5

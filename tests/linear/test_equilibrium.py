@@ -26,7 +26,7 @@ def sprung(name, rng, **fields):
 
 
 @pytest.mark.parametrize("name", BUNDLED)
-def test_what_is_balanced_is_a_fixed_point(name):
+def test_a_balanced_robot_is_at_a_fixed_point(name):
     rng = np.random.default_rng(1)
     robot, q = sprung(name, rng)
     found = fflin.equilibrium(robot, q)
@@ -47,7 +47,7 @@ def test_what_is_balanced_is_a_fixed_point(name):
 
 
 @pytest.mark.parametrize("frame", FRAMES)
-def test_axes_are_those_of_the_frame_and_reference(frame):
+def test_axes_match_the_frame_and_reference(frame):
     rng = np.random.default_rng(2)
     robot, q = sprung("ets_vii", rng)
     for reference in (None, pin.SE3.Identity(), random_pose(rng, 100.0)):
@@ -133,7 +133,7 @@ def test_least_norm_against_every_active_set(trials):
     assert balanced >= trials // 4 and refused >= trials // 12 and bound >= trials // 6
 
 
-def test_refusal_names_what_is_left():
+def test_the_error_names_the_remaining_modes():
     heavy = fflin.load("servicer_7dof", gravity=(0, 0, -9.81), passive=["joint_2"])
     with pytest.raises(fflin.EquilibriumError, match=r"tau_m.joint_2 -?\d+ N m"):
         fflin.equilibrium(heavy)
@@ -149,7 +149,7 @@ def test_refusal_names_what_is_left():
         fflin.equilibrium(heavy.replace(inputs=[fflin.BaseTorque(), down]))
 
 
-def test_what_is_needed_is_shown_with_units():
+def test_required_inputs_are_shown_with_units():
     robot = fflin.load("servicer_7dof", gravity=(0.0, 0.0, -9.81))
     found = fflin.equilibrium(robot)
     lines = str(found).splitlines()
@@ -242,7 +242,7 @@ def test_passive_joints_sag_under_gravity(seed):
         assert np.array_equal(at[stiff], state.joint_positions(q)[stiff])
 
 
-def test_springs_that_give_no_hold_are_told():
+def test_springs_that_give_no_hold_are_reported():
     """A pendulum that stands on a spring weaker than its weight, and beside it."""
     for gravity, words in ((20.0, "hold"), (1e5, "hold|settle")):
         robot = fflin.load(
@@ -303,7 +303,7 @@ def test_steady_motion_of_random_trees(seed):
         fflin.equilibrium(robot, q, v=v)
 
 
-def test_bad_input_is_told():
+def test_invalid_input_is_reported():
     robot = fflin.load("cubesat")
     with pytest.raises(fflin.InputError, match=r"\(1,\)"):
         fflin.equilibrium(robot, [0.0])

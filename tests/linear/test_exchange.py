@@ -50,7 +50,7 @@ def relative(a, b):
 
 @pytest.mark.parametrize("case", CASES, ids=ids)
 @pytest.mark.parametrize("name", mostly([*BUNDLED, "tree"], "cubesat", "tree"))
-def test_there_and_back(name, case):
+def test_round_trip_is_the_identity(name, case):
     robot = (
         random_tree(np.random.default_rng(3), 6) if name == "tree" else fflin.load(name)
     )
@@ -153,7 +153,7 @@ class Formulas:
 
 @pytest.mark.parametrize("tool", TOOLS)
 @pytest.mark.parametrize("name", ["inspector", *exhaustive("servicer_7dof")])
-def test_slopes_are_those_of_the_rates_in_the_tools_coordinates(name, tool):
+def test_derivatives_match_the_rates_in_the_tools_coordinates(name, tool):
     """A, B and f0 by differences of dx/dt: x by formulas, the motion by ABA."""
     robot = fflin.load(name).replace(
         gravity=(0.3, -0.2, 0.5), stiffness=3.0, damping=0.2
@@ -305,7 +305,7 @@ def test_the_step_of_mujoco_comes_back():
     assert relative(only.A, lin.A) < 1e-13 and relative(only.B, lin.B) < 1e-13
 
 
-def test_wrong_matrices_are_found_out():
+def test_wrong_matrices_are_detected():
     robot = fflin.load("servicer_7dof")
     q, v, u, _ = point(robot, 6, {})
     m = fflin.linearize(robot, q, v, u).to("drake")
@@ -388,7 +388,7 @@ def refused(match, function, *arguments, kind=fflin.InputError, **options):
     assert "\n" not in str(caught.value)
 
 
-def test_what_is_no_point_of_a_tool_is_refused_in_one_line():
+def test_an_invalid_point_of_a_tool_is_refused_in_one_line():
     robot, rng = fflin.load("planar_detumble"), np.random.default_rng(0)
     lin, n = fflin.linearize(robot), robot.n
     to, back = fflin.transform, fflin.from_tool

@@ -103,7 +103,7 @@ def test_a_schedule_that_goes_on_is_the_same_in_either_engine(pair, lined_up):
     assert motions[0].x == pytest.approx(motions[1].x, abs=1e-12)
 
 
-def test_what_cannot_be_lined_up_is_one_line(pair):
+def test_models_that_cannot_be_matched_give_a_one_line_error(pair):
     free, held = (fflin.linearize(each) for each in pair)
     gain = fflin.lqr(free)
     other = fflin.linearize(fflin.load("panda"))

@@ -58,7 +58,7 @@ def test_wheels_take_up_the_torque_of_the_gravity_gradient(massive, frame):
     assert np.abs(lin.f0[at]).max() < 1e-15
 
 
-def test_wheels_gain_in_flight_what_the_report_says():
+def test_wheels_gain_the_reported_momentum():
     """One orbit of the nonlinear loop; the momentum is measured in the flight."""
     robot, q = hub(wheels(*np.eye(3).tolist()))
     lin = fflin.linearize(robot, q)
@@ -118,7 +118,7 @@ def test_a_base_torque_holds_the_gravity_gradient(dt):
     assert fflin.lqg(gain, noise).poles.size == len(gain.poles) + len(noise.poles)
 
 
-def test_a_centre_of_mass_beside_the_origin_is_put_on_the_orbit():
+def test_a_centre_of_mass_next_to_the_origin_is_put_on_the_orbit():
     """No input pushes this robot, so its origin leaves the orbit instead of its centre of mass."""
     robot = fflin.load(
         "servicer_7dof", lock=["*"], inputs=wheels(*np.eye(3).tolist()), orbit=ORBIT

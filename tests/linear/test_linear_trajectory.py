@@ -77,7 +77,7 @@ def test_interpolation_is_on_the_manifold():
         along.A[0] = 0.0
 
 
-def test_what_is_no_motion_is_told_with_the_time_and_refused_where_asked():
+def test_an_inconsistent_motion_is_reported_with_its_time_and_refused_on_request():
     robot = fflin.load("ets_vii")
     t, q, v, u = motion(robot, knots=17)
     jump = q.copy()
@@ -204,7 +204,7 @@ def along(request):
 
 
 @pytest.mark.parametrize("dt", mostly((0.2, 0.05, 0.01), 0.05))
-def test_samples_are_those_of_the_variational_equation(along, dt):
+def test_samples_match_the_variational_equation(along, dt):
     sampled = along.discretize(dt)
     count = round(0.4 / dt)
     assert (sampled.dt, len(sampled), len(sampled.t)) == (dt, count, count + 1)
@@ -245,7 +245,7 @@ def test_a_step_of_the_transition_is_of_order_four(monkeypatch):
     )
 
 
-def test_at_rest_samples_are_those_of_one_model():
+def test_at_rest_samples_match_one_model():
     robot = fflin.load("ets_vii")
     t = np.linspace(0.0, 1.0, 3)
     q = np.tile(robot.neutral(), (3, 1))

@@ -22,7 +22,7 @@ def test_check_holds_at_random_points(name):
         assert found.ok, found
 
 
-def test_kinematics_are_those_of_a_turning_reference():
+def test_kinematics_match_a_turning_reference():
     robot = fflin.load("cubesat")
     q, v, u = random_point(robot, np.random.default_rng(2))
     lin = fflin.linearize(robot, q, v, u, moving=True)

@@ -71,7 +71,7 @@ def test_pitch_libration_of_a_stable_body_is_the_closed_form():
     assert np.abs(poles - LEO * math.sqrt(3.0 * (x - z) / y)).min() < 1e-12 * LEO
 
 
-def test_the_kinds_of_attitudes_are_told_and_margins_decide():
+def test_the_kinds_of_attitudes_are_reported_and_margins_decide():
     stable, *others = fflin.relative_equilibria(
         in_orbit(free_body((3.0, 5.0, 4.0)), LEO)
     )[::4]
@@ -88,7 +88,7 @@ def test_the_kinds_of_attitudes_are_told_and_margins_decide():
     assert len(kinds) == 8
 
 
-def test_what_has_no_such_attitudes_is_refused():
+def test_models_without_such_attitudes_are_refused():
     robot = fflin.load("cubesat", orbit=700e3)
     wheel = fflin.ReactionWheel([0.0, 1.0, 0.0], momentum=0.02)
     with pytest.raises(fflin.InputError, match="momentum"):

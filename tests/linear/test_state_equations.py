@@ -84,7 +84,7 @@ def test_many_rows_are_the_same_as_one_after_the_other(
             )
 
 
-def test_the_charts_of_rows_are_those_of_each(robots):
+def test_charts_of_rows_match_charts_of_single_points(robots):
     robot = robots["planar_detumble"]
     rng = np.random.default_rng(5)
     state = fflin.StateMap(robot, reference=random_pose(rng, 70.0))

@@ -73,7 +73,7 @@ def test_one_step_of_torque_holds_at_every_spacing(knots):
         ({"sample": 0.4, "every": 40}, "previous", 1e-6),
     ],
 )
-def test_what_is_simulated_holds(loop, options, hold, largest):
+def test_the_simulated_loop_holds_the_point(loop, options, hold, largest):
     """Held inputs to the integrator's order; of others the knots have what is linear between."""
     _, run = loop
     found = run(**options)
@@ -86,7 +86,7 @@ def test_what_is_simulated_holds(loop, options, hold, largest):
         assert coarse / along.residual.max() == pytest.approx(4.0, abs=0.8)
 
 
-def test_axes_of_inputs_are_those_of_the_frame():
+def test_axes_of_inputs_match_the_frame():
     robot = fflin.load("ets_vii")
     reference = pin.SE3(pin.rpy.rpyToMatrix(0.4, -0.2, 0.9), np.array([1.0, 2.0, 3.0]))
     v0 = fflin.velocity(robot, {"omega_b.x": 0.5, "omega_b.y": -0.3, "v_b.z": 0.1})
@@ -158,7 +158,7 @@ def test_intervals_are_integrated_once(monkeypatch):
         ("t", 80, 1e300, "from t = 0.395 to 1e+300 s the integration overflows"),
     ],
 )
-def test_what_overflows_is_refused_with_its_place(name, row, value, where, monkeypatch):
+def test_an_overflow_is_refused_with_its_index(name, row, value, where, monkeypatch):
     robot = fflin.load("astrobee_arm")
     given = dict(zip("tqvu", map(np.array, motion(robot)), strict=True))
     given[name][row if name == "t" else (row, 2)] = value
@@ -238,7 +238,7 @@ def test_points_between_knots_are_of_order_four():
     )
 
 
-def test_a_bad_interval_is_told_at_both_its_knots(loop):
+def test_a_bad_interval_is_reported_at_both_its_knots(loop):
     _, run = loop
     along = run(sample=0.1, every=10).trajectory()
     u = along.u.copy()
@@ -247,7 +247,7 @@ def test_a_bad_interval_is_told_at_both_its_knots(loop):
 
 
 @pytest.mark.parametrize("ending", ["npz", "mat", "json", "csv"])
-def test_what_is_saved_is_read_to_the_last_bit(loop, tmp_path, ending):
+def test_saved_results_are_read_bit_for_bit(loop, tmp_path, ending):
     robot, run = loop
     along = run(sample=0.1, every=10).trajectory()
     along.save(tmp_path / f"a.{ending}")
@@ -409,7 +409,7 @@ def _of_world(along):
     return u
 
 
-def test_rows_that_miss_the_samples_are_told():
+def test_rows_that_miss_the_samples_are_reported():
     robot = fflin.load("cubesat")
     options = {"duration": 2.0, "dt": 0.01, "sample": 0.1}
     run = fflin.simulate(robot, lambda t, q, v: np.zeros(6), every=7, **options)
@@ -420,7 +420,7 @@ def test_rows_that_miss_the_samples_are_told():
         ).notes
 
 
-def test_a_base_that_turns_too_far_between_knots_is_told():
+def test_a_base_that_turns_too_far_between_knots_is_reported():
     robot = fflin.load("cubesat")
     for speed, far in ((3.3, True), (2.0, False)):
         v0 = fflin.velocity(robot, {"omega_b.z": speed})

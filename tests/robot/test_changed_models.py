@@ -66,7 +66,7 @@ def test_a_changed_model_is_refused_wherever_results_are_made(change, said, tmp_
     assert not list(tmp_path.iterdir())
 
 
-def test_a_model_of_a_changed_robot_is_refused_by_what_uses_it():
+def test_a_model_of_a_changed_robot_is_refused_by_its_users():
     robot = fflin.load("ets_vii")
     linearizer = fflin.Linearizer(robot)
     batch = fflin.sweep(robot, [robot.neutral()])
@@ -87,7 +87,7 @@ def test_a_model_of_a_changed_robot_is_refused_by_what_uses_it():
         fflin.lqr_batch(batch, 1.0, 1.0)
 
 
-def test_what_is_made_of_a_model_remembers_the_robot():
+def test_objects_made_from_a_model_keep_the_robot():
     robot = fflin.load("ets_vii", lock=["joint_6"])
     lin = fflin.linearize(robot)
     made = [
@@ -101,7 +101,7 @@ def test_what_is_made_of_a_model_remembers_the_robot():
             each.to_scipy()
 
 
-def test_a_replaced_robot_remembers_what_was_made():
+def test_a_replaced_robot_keeps_its_cached_results():
     robot = fflin.load("ets_vii")
     heavier(robot.model)
     with pytest.raises(fflin.ModelError, match=r"inertia .*'joint_1'"):
@@ -120,7 +120,7 @@ def test_a_robot_made_of_the_changed_model_works_and_differs():
     assert np.abs(lin.B - B).max() > 1e-6
 
 
-def test_copies_remember_what_was_made():
+def test_copies_keep_cached_results():
     robot = fflin.load("ets_vii")
     heavier(robot.model)
     for twin in (pickle.loads(pickle.dumps(robot)), copy.deepcopy(robot)):
@@ -139,7 +139,7 @@ def test_limits_and_new_frames_are_no_change():
     assert fflin.check(pushed, fflin.linearize(pushed)).ok
 
 
-def test_a_limit_that_is_no_number_is_no_change():
+def test_a_limit_that_is_not_a_number_is_not_a_change():
     model = fflin.load("ets_vii").model.copy()
     model.lowerPositionLimit[7] = np.nan
     fflin.linearize(fflin.from_model(model))

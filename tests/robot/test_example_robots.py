@@ -19,7 +19,7 @@ REFUSED = {
 NAMES = [n for n in fflin.list_robots() if find_robot(n).origin == "example-robot-data"]
 
 
-def test_names_are_those_of_the_package():
+def test_names_match_the_package():
     from example_robot_data.robots_loader import ROBOTS
 
     # SDF only, and a robot that its loader makes from the URDF of another.
@@ -47,7 +47,7 @@ def test_check_holds(name):
         assert found.ok, found
 
 
-def test_an_inertia_that_is_negative_by_rounding_is_that_of_a_link():
+def test_an_inertia_that_is_negative_only_by_rounding_is_accepted():
     robot = fflin.load("icub", lock=["neck_roll", "neck_yaw"])
     link = robot.links["r_hip_2"]
     assert -1e-18 < np.linalg.eigvalsh(link.inertia)[0] < 0.0 < link.mass

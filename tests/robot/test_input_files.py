@@ -64,7 +64,7 @@ def written(tmp_path):
     "start", [b"", b"\xef\xbb\xbf"], ids=["plain", "byte order mark"]
 )
 @pytest.mark.parametrize("ending", ["\n", "\r\n"])
-def test_order_in_the_file_is_that_of_u(written, start, ending):
+def test_order_in_the_file_matches_u(written, start, ending):
     path = written(start + WHOLE.replace("\n", ending).encode())
     inputs = (
         fflin.Thruster("tool", (0.1, 2, -0.3), (0, 0, 1)),
@@ -189,7 +189,7 @@ def test_every_mistake_has_its_line(written, content):
     assert line in text and keyword in text
 
 
-def test_files_that_are_none(tmp_path, written):
+def test_invalid_files_are_refused(tmp_path, written):
     for path, words in (
         (tmp_path / "none.toml", "No such file"),
         (tmp_path, "folder"),

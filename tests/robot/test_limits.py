@@ -141,7 +141,7 @@ def test_limits_make_no_second_input():
         ),
     ],
 )
-def test_limits_that_are_none_are_refused_in_a_line(make, said):
+def test_invalid_limits_are_refused_in_one_line(make, said):
     with pytest.raises(fflin.InputError, match=said):
         make()
 
@@ -155,7 +155,7 @@ def test_limits_that_are_none_are_refused_in_a_line(make, said):
         ({"tau_b": "much"}, fflin.InputError, "'much'"),
     ],
 )
-def test_given_limits_that_are_none_are_refused_in_a_line(limits, error, said):
+def test_invalid_limit_arguments_are_refused_in_one_line(limits, error, said):
     with pytest.raises(error, match=said):
         fflin.load("cubesat", limits=limits)
 
@@ -172,7 +172,7 @@ URDF = """<robot name="arm"><link name="base">{0}</link><link name="a">{0}</link
 )
 
 
-def test_efforts_and_velocities_of_zero_are_said_once_and_are_none(tmp_path):
+def test_efforts_and_velocities_of_zero_are_reported_once_and_ignored(tmp_path):
     path = tmp_path / "arm.urdf"
     path.write_text(URDF)
     with pytest.warns(fflin.FflinWarning) as told:
@@ -240,7 +240,7 @@ max_speed = 600
         ("type = 'joint_torque'\njoint = 'a'\nlimit = 1", ":4: .*'l"),
     ],
 )
-def test_wrong_limits_in_toml_files_are_told_with_their_line(tmp_path, text, said):
+def test_wrong_limits_in_toml_files_are_reported_with_their_line(tmp_path, text, said):
     path = tmp_path / "inputs.toml"
     path.write_text(f"[[input]]\n{text}\n")
     with pytest.raises(fflin.FflinError, match=said):

@@ -185,7 +185,7 @@ def test_every_route_works_on_them():
         assert motion.urdf_sha256 == other.urdf_sha256 == lin.urdf_sha256
 
 
-def test_wheels_stay_in_what_carries_them():
+def test_wheels_remain_part_of_their_carrier():
     robot = wheeled()
     heavy = robot.with_mass_properties({"base": {"mass": 7.0}})
     assert heavy.wheels == robot.wheels and heavy.joint_names == robot.joint_names
@@ -243,7 +243,7 @@ def test_results_of_the_one_are_not_taken_for_the_others(tmp_path):
         (3, "bodies"),
     ],
 )
-def test_what_is_no_body_is_refused_in_a_line(given, said):
+def test_an_invalid_body_is_refused_in_one_line(given, said):
     with pytest.raises(fflin.FflinError, match=said) as caught:
         fflin.load("ets_vii").with_mass_properties(given)
     assert "\n" not in str(caught.value)
@@ -258,7 +258,7 @@ def test_what_is_no_body_is_refused_in_a_line(given, said):
         ({"seed": 0.5}, "seed"),
     ],
 )
-def test_spreads_that_are_none_are_refused(given, said):
+def test_invalid_spreads_are_refused(given, said):
     with pytest.raises(fflin.InputError, match=said):
         fflin.load("ets_vii").perturbed(**given)
 

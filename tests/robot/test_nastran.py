@@ -147,7 +147,7 @@ def test_units_origin_and_number_of_modes_are_as_told(files):
             read(op4, asm, frame="base", **wrong)
 
 
-def test_a_link_that_differs_from_the_file_is_told_and_may_be_replaced(files):
+def test_a_link_that_differs_from_the_file_is_reported_and_may_be_replaced(files):
     op4, asm, (rigid_mass, _, _) = files
     robot = fflin.load("planar_detumble")
     read = fflin.FlexibleAppendage.from_nastran
@@ -174,7 +174,7 @@ def test_a_link_that_differs_from_the_file_is_told_and_may_be_replaced(files):
         robot.replace(appendages=twice)
 
 
-def test_what_is_no_superelement_is_refused(files, tmp_path):
+def test_an_invalid_superelement_is_refused(files, tmp_path):
     op4, asm, _ = files
     read = fflin.FlexibleAppendage.from_nastran
     text = tmp_path / "text.asm"

@@ -61,14 +61,14 @@ def test_refused(given, said):
         (79e3, "earth", "79000 m"),
     ],
 )
-def test_a_doubtful_altitude_is_warned_of(altitude, body, said):
+def test_a_doubtful_altitude_gives_a_warning(altitude, body, said):
     with pytest.warns(fflin.FflinWarning, match=said) as record:
         fflin.CircularOrbit(altitude, body=body)
     assert [each.filename for each in record] == [__file__]
 
 
 @pytest.mark.filterwarnings("error::fflin.FflinWarning")
-def test_no_other_altitude_is_warned_of():
+def test_no_other_altitude_gives_a_warning():
     # of LAGEOS, O3b, GPS
     for altitude in (100e3, 400e3, 5860e3, 8062e3, 20200e3, 35786e3):
         fflin.CircularOrbit(altitude)

@@ -63,7 +63,7 @@ def test_check_holds_with_every_output(name, link, frame, turned):
 
 @pytest.mark.parametrize("first", mostly(range(6), 0))
 @pytest.mark.parametrize("matrix", ["C", "D", "y0"])
-def test_planted_error_is_found_in_every_row(matrix, first):
+def test_planted_error_is_detected_in_every_row(matrix, first):
     bare = fflin.load("planar_detumble")
     robot = watched(bare, "hand")
     q, v, _ = random_point(bare, np.random.default_rng(2))
@@ -138,7 +138,7 @@ def test_sampled_model_keeps_its_outputs(tmp_path):
         fflin.check(bare, loaded)
 
 
-def test_bad_outputs_are_told():
+def test_invalid_outputs_are_reported():
     robot = fflin.load("servicer_7dof")
     for words, outputs in {
         "'tol'": [fflin.FramePose("tol")],

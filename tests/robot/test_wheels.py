@@ -504,7 +504,7 @@ def test_axis_is_fixed_in_its_frame(fields):
         assert given == pytest.approx(expected, abs=1e-12 * np.abs(expected).max())
 
 
-def test_bad_wheels_are_told_in_a_line():
+def test_invalid_wheels_are_reported_in_a_line():
     robot = fflin.load("servicer_7dof")
     none = ReactionWheel((0, 0, 1))
     cases = {

@@ -249,7 +249,7 @@ def test_a_run_stops_at_the_same_step_with_the_same_words(robots):
     assert 20 < len(motion.t) < 1001
 
 
-def test_an_orbit_costs_no_digits(robots):
+def test_an_orbit_loses_no_accuracy(robots):
     robot = robots["canadarm2"]
     reference = pin.SE3(HOME.rotation, np.array([7e6, 1e5, -2e5]))
     lin = fflin.linearize(
@@ -263,7 +263,7 @@ def test_an_orbit_costs_no_digits(robots):
     both(robot, policy, 1e-7, 1e-8, x0=x0, duration=3.0)
 
 
-def test_ctrl_c_keeps_what_is_done(robots, monkeypatch):
+def test_ctrl_c_keeps_finished_work(robots, monkeypatch):
     count = itertools.count()
 
     def update(self, done, total):
@@ -319,7 +319,7 @@ def nothing(t, q, v):
     return np.zeros(9)
 
 
-def test_what_cannot_be_compiled_says_why(robots):
+def test_a_policy_that_cannot_be_compiled_gives_the_reason(robots):
     robot, options = robots["planar_detumble"], {"duration": 0.1, "engine": "compiled"}
     cases = (
         ({"policy": nothing}, "Python"),
@@ -430,7 +430,7 @@ def test_arguments_are_laid_out_or_refused():
         tree.laid_out(given._replace(at=np.zeros((1, 1))), loop.WHEELS)
 
 
-def test_a_command_that_is_no_number_is_told(robots):
+def test_a_command_that_is_not_a_number_is_refused(robots):
     robot = robots["cubesat"]
     lin = fflin.linearize(robot)
     policy = fflin.StateFeedback(lin, np.full(lin.B.shape[::-1], 1e308))
@@ -445,7 +445,7 @@ def test_a_command_that_is_no_number_is_told(robots):
     assert "tau_b.x" in said[0]
 
 
-def test_a_long_run_in_python_says_what_the_compiled_loop_would_take(
+def test_a_long_run_in_python_estimates_the_duration_of_the_compiled_loop(
     robots, monkeypatch, caplog
 ):
     monkeypatch.setattr("fflin.simulation.simulate.LONG_RUN", 0.0)

@@ -168,7 +168,7 @@ def test_the_attitude_is_lost_where_the_wheel_is_full():
     assert says(str(told), "spin 500 rad/s", "100 s", "300")
 
 
-def test_the_linear_model_foresees_the_wheel_that_saturates():
+def test_the_linear_model_predicts_the_wheel_that_saturates():
     robot = spinner()
     lin = fflin.linearize(robot.replace(inputs=[*robot.inputs, fflin.BaseTorque()]))
     robot = robot.replace(inputs=[*robot.inputs, fflin.BaseTorque()])
@@ -187,7 +187,7 @@ def test_the_linear_model_foresees_the_wheel_that_saturates():
 
 
 @pytest.mark.parametrize("asked", [0.0, 0.5, -0.2])
-def test_a_wheel_that_begins_too_fast_takes_no_torque_but_what_brakes_it(asked):
+def test_a_wheel_beyond_its_largest_speed_accepts_only_braking_torque(asked):
     robot = spinner()
     motion = fflin.simulate(
         robot,
@@ -279,7 +279,7 @@ def test_a_command_becomes_pulses_of_the_same_impulse():
 
 
 @pytest.mark.parametrize("on_off", [True, False])
-def test_what_is_below_the_least_impulse_is_carried_until_it_is_enough(on_off):
+def test_impulses_below_the_least_impulse_accumulate(on_off):
     thruster = fflin.Thruster(*AT, max=2.0, on_off=on_off, least_impulse=0.05)
     robot = free_body((20.0, 30.0, 40.0)).replace(inputs=[thruster])
     motion = fflin.simulate(
@@ -295,7 +295,7 @@ def test_what_is_below_the_least_impulse_is_carried_until_it_is_enough(on_off):
         assert motion.u[25, 0] == pytest.approx(0.6)
 
 
-def test_pulses_are_late_where_there_is_a_delay_and_begin_with_what_the_model_asks():
+def test_pulses_are_delayed_and_begin_with_the_command_of_the_model():
     robot = free_body((20.0, 30.0, 40.0)).replace(
         inputs=[fflin.Thruster(*AT, max=1.0, on_off=True)]
     )
@@ -314,7 +314,7 @@ def test_pulses_are_late_where_there_is_a_delay_and_begin_with_what_the_model_as
     np.testing.assert_array_equal(late.u[15:25, 0], [1.0] * 4 + [0.0] * 6)
 
 
-def test_the_linear_model_foresees_pulses():
+def test_the_linear_model_predicts_pulses():
     robot = free_body((20.0, 30.0, 40.0)).replace(
         inputs=[fflin.Thruster(*AT, max=1.0, on_off=True), fflin.BaseTorque()]
     )
@@ -345,7 +345,7 @@ def test_the_linear_model_foresees_pulses():
         ),
     ],
 )
-def test_pulses_without_samples_are_refused_in_a_line(thruster, options, said):
+def test_pulses_without_samples_are_refused_in_one_line(thruster, options, said):
     robot = free_body((20.0, 30.0, 40.0))
     robot = robot.replace(inputs=[fflin.Thruster(*AT, max=2.0, **thruster)])
     with pytest.raises(fflin.InputError, match=said):
@@ -364,12 +364,12 @@ def test_pulses_without_samples_are_refused_in_a_line(thruster, options, said):
         ({"tau_b": -1.0}, fflin.InputError, "-1.0"),
     ],
 )
-def test_limits_that_are_none_are_refused_in_a_line(limits, error, said):
+def test_invalid_limits_are_refused_in_one_line(limits, error, said):
     with pytest.raises(error, match=said):
         fflin.simulate(fflin.load("cubesat"), duration=0.1, limits=limits)
 
 
-def test_what_was_passed_is_told_with_value_time_and_limit():
+def test_violations_are_reported_with_value_time_and_limit():
     robot = fflin.load("canadarm2")
     asked = np.zeros(13)
     asked[8] = 4000.0
@@ -437,7 +437,7 @@ def held_up(**limits):
     return robot, q, fflin.equilibrium(robot, q).u
 
 
-def test_limits_that_cannot_hold_the_robot_are_said_before_the_run():
+def test_limits_that_cannot_hold_the_robot_are_reported_before_the_run():
     robot, q, u = held_up()
     names = fflin.linearize(robot).input_names
     most = int(np.abs(u[6:]).argmax()) + 6
@@ -457,7 +457,7 @@ def test_limits_that_cannot_hold_the_robot_are_said_before_the_run():
             fflin.simulate(robot, policy, q0=q, duration=0.02, limits=limits)
 
 
-def test_allocation_keeps_within_the_thrusters_and_shares_what_one_alone_cannot_give():
+def test_allocation_respects_limits_and_distributes_force_over_several_thrusters():
     body = free_body((20.0, 30.0, 40.0))
     thrusters = [fflin.Thruster(*AT, max=1.0), fflin.Thruster(*AT, max=9.0)]
     design = body.replace(inputs=[fflin.BaseForce()])

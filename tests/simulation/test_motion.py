@@ -58,14 +58,14 @@ def test_a_free_robot_has_no_target():
         ({"q": 1}, "target"),
     ],
 )
-def test_a_target_that_is_none_is_refused_in_a_line(target, said):
+def test_an_invalid_target_is_refused_in_one_line(target, said):
     robot = fflin.load("ets_vii")
     with pytest.raises(fflin.InputError, match=said) as caught:
         fflin.simulate(robot, duration=0.1, target=target)
     assert "\n" not in str(caught.value)
 
 
-def test_a_model_of_another_robot_is_no_target():
+def test_a_model_of_another_robot_is_not_a_target():
     lin = fflin.linearize(fflin.load("planar_detumble"))
     with pytest.raises(fflin.InputError, match="'planar_detumble'"):
         fflin.simulate(fflin.load("ets_vii"), duration=0.1, target=lin)

@@ -432,7 +432,7 @@ WARNINGS = {
 
 
 @pytest.mark.parametrize("case", WARNINGS)
-def test_a_command_warns_of_what_python_warns_of(case):
+def test_a_command_gives_the_warnings_of_the_python_call(case):
     command, call, word = WARNINGS[case]
     with any_wording():
         said = warned(*command)

@@ -15,7 +15,7 @@ def flown():
     return phases()
 
 
-def test_the_rows_are_those_of_the_phases_one_after_the_other(flown):
+def test_the_rows_match_the_phases_one_after_the_other(flown):
     robot, approach, _, held, _, after, whole = flown
     assert whole.phases == (
         "servicer_7dof",
@@ -192,7 +192,7 @@ def test_it_goes_on_step_by_step_and_under_another_policy(flown):
     assert not both.u[-1, 8] and (both.u[-1, [6, 7]] == on.u[-1, [6, 7]]).all()
 
 
-def test_what_does_not_go_on_is_one_line(flown):
+def test_a_file_that_cannot_be_continued_gives_a_one_line_error(flown):
     robot, approach, caught, held, jammed, after, whole = flown
     away = fflin.capture(robot, "tool", DEBRIS)
     turned = fflin.simulate(

@@ -37,7 +37,7 @@ def lines(axes):
     return {line.get_label(): line for line in axes.get_lines()}
 
 
-def test_motion_shows_linear_beside_nonlinear_and_their_difference(loop):
+def test_motion_shows_linear_next_to_nonlinear_and_their_difference(loop):
     _, _, motion = loop
     figure = motion.plot()
     axes = {each.get_title(): each for each in figure.axes if each.get_title()}
@@ -68,7 +68,7 @@ def along():
     return tracked(fflin.load("planar_detumble"), 2.0, run=4.0, limits=0.3)
 
 
-def test_a_reference_lies_pale_under_what_follows_it(along):
+def test_a_reference_is_drawn_in_a_pale_colour_below_the_motion(along):
     _, motion = along
     figure = motion.plot()
     found = panels(figure)
@@ -147,7 +147,7 @@ def test_motion_without_a_prediction_has_no_differences():
     ]
 
 
-def test_many_inputs_and_joints_are_named_beside_the_panels_each_in_its_colour():
+def test_many_inputs_and_joints_are_named_next_to_the_panels_each_in_its_colour():
     bare = fflin.load("servicer_7dof")
     thrusters = [
         fflin.Thruster(
@@ -224,7 +224,7 @@ def panels(figure):
     return {each.get_title(): each for each in figure.axes if each.get_title()}
 
 
-def test_each_axis_has_one_unit_and_wheels_have_panels_of_their_own(limited):
+def test_each_axis_has_one_unit_and_wheels_have_separate_panels(limited):
     found = panels(limited.plot())
     units = {title: axes.get_ylabel() for title, axes in found.items()}
     assert units["base torque"] == "[N m]"
@@ -313,7 +313,7 @@ def test_figures_are_saved_whole(loop, tmp_path, suffix):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_bad_figures_are_refused(loop, tmp_path, monkeypatch):
+def test_invalid_figures_are_refused(loop, tmp_path, monkeypatch):
     _, _, motion = loop
     with pytest.raises(fflin.FileError, match=r"'\.bmp'"):
         motion.plot(tmp_path / "loop.bmp")

@@ -37,7 +37,7 @@ def cells(motion, title):
     return line.removeprefix(title).split()
 
 
-def test_what_has_settled_says_so_first_and_when():
+def test_a_settled_motion_reports_first_when_it_settled():
     motion = course(lambda t: np.exp(-t / 2.0))
     # 2 % of the largest is passed at 2 ln 50 = 7.82 s.
     assert first(motion).startswith("settled")
@@ -58,7 +58,7 @@ def test_the_margin_is_two_percent_of_the_largest_error_for_the_last_twentieth(
     assert ("not yet" in motion_report(motion)) is not settled
 
 
-def test_what_stays_away_says_by_how_much():
+def test_a_motion_that_does_not_settle_reports_its_error():
     motion = course(lambda t: np.exp(-t / 10.0))
     assert says(first(motion), "not settled", "2.7 deg", "0.068 rad")
     motion = course(lambda t: np.exp(-t), joint=0.0)
@@ -88,7 +88,7 @@ def test_the_headline_names_the_rates_that_the_table_calls_unsettled():
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-17, 1e-12])
-def test_what_never_left_its_target_but_for_rounding_has_settled(size):
+def test_a_motion_that_leaves_its_target_only_by_rounding_has_settled(size):
     motion = course(lambda t: 0.0 * t)
     noise = size * np.random.default_rng(0).normal(size=motion.x.shape)
     motion = replace(motion, x=motion.x + noise)
@@ -96,13 +96,13 @@ def test_what_never_left_its_target_but_for_rounding_has_settled(size):
     assert "not yet" not in motion_report(motion)
 
 
-def test_what_is_below_rounding_is_shown_as_none():
+def test_values_below_the_rounding_error_are_shown_as_zero():
     motion = course(lambda t: np.exp(-25.0 * t))
     assert 0.0 < motion.x[-1, 6] < 1e-199
     assert cells(motion, "joints") == ["rad", "0.5", "0.5", ".", "0.16"]
 
 
-def test_what_was_stopped_says_so_first():
+def test_a_stopped_motion_reports_the_reason_first():
     motion = course(lambda t: np.exp(-t), stopped="diverged at t = 20 s")
     assert says(first(motion), "diverged", "t = 20 s")
     free = fflin.simulate(
@@ -175,7 +175,7 @@ def test_where_no_input_pushes_the_base_its_position_is_not_judged():
         assert says(motion_report(pushing), "not controlled: position")
 
 
-def test_wheels_are_no_joints():
+def test_wheels_are_not_joints():
     robot = fflin.load("cubesat", inputs=fflin.load_inputs("cubesat"))
     lin = fflin.linearize(robot)
     x = np.zeros(len(lin.x0))
@@ -201,7 +201,7 @@ def test_a_base_that_no_force_pushes_is_off_its_target_by_a_figure():
     )
 
 
-def test_lengths_and_angles_of_joints_have_rows_of_their_own():
+def test_lengths_and_angles_of_joints_have_separate_rows():
     motion = course(lambda t: np.exp(-t))
     units = list(motion.state_units)
     units[motion.state_names.index("q_m.joint_2")] = "m"
@@ -214,7 +214,7 @@ def test_lengths_and_angles_of_joints_have_rows_of_their_own():
     assert ["joints", "rad"] in rows and ["joints", "m"] in rows
 
 
-def test_what_no_policy_steers_is_told_apart():
+def test_states_that_no_policy_controls_are_distinguished():
     steered = tuple(
         n for n in course(np.exp).state_names if n.startswith(("q_m", "qdot_m"))
     )
@@ -273,7 +273,9 @@ def test_an_input_that_goes_from_limit_to_limit_is_at_its_limit_all_along():
         ),
     ],
 )
-def test_the_command_says_it_first_and_unsettled_is_no_failure(options, code, begins):
+def test_the_command_says_it_first_and_unsettled_is_not_a_failure(
+    options, code, begins
+):
     found, out, _ = run("simulate", "planar_detumble", "--duration", 2, *options)
     assert found == code
     assert out.splitlines()[0].startswith(begins)
@@ -281,7 +283,7 @@ def test_the_command_says_it_first_and_unsettled_is_no_failure(options, code, be
 
 
 @pytest.mark.parametrize("duration", [10.0, 30.0, *exhaustive(40.0, 50.0, 60.0)])
-def test_what_tumbles_or_swings_through_its_target_has_not_settled(duration):
+def test_a_robot_that_passes_through_its_target_has_not_settled(duration):
     robot = fflin.load("cubesat")
     lin = fflin.linearize(robot)
     x0 = np.zeros(12)
@@ -299,7 +301,7 @@ def test_what_tumbles_or_swings_through_its_target_has_not_settled(duration):
 
 
 @pytest.mark.exhaustive
-def test_a_wheel_at_its_largest_speed_is_told_and_its_angle_is_no_difference():
+def test_a_wheel_at_its_largest_speed_is_reported_and_its_angle_is_not_a_difference():
     wheels = [
         fflin.ReactionWheel(axis, inertia=3e-6, max_speed=60.0, name=name)
         for name, axis in zip("abc", np.eye(3).tolist(), strict=True)

@@ -78,7 +78,7 @@ def test_which_thrusters_give_every_wrench():
     assert thrusters_give_every_wrench(inspector.replace(inputs=helped))
 
 
-def test_what_is_not_fed_back_does_not_lengthen_or_shorten_a_run():
+def test_states_that_are_not_fed_back_do_not_change_the_duration_of_a_run():
     wheels = [fflin.ReactionWheel(axis, inertia=1e-4) for axis in np.eye(3).tolist()]
     robot = fflin.load("cubesat", inputs=wheels)
     lin = fflin.linearize(robot)

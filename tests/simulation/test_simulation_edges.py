@@ -69,7 +69,7 @@ def test_an_infinite_command_within_limits_is_the_limit():
         fflin.simulate(robot, after_half_a_second(math.nan), duration=1.0, limits=2.0)
 
 
-def test_a_policy_may_keep_and_change_what_it_is_given_and_gives():
+def test_a_policy_may_keep_and_change_its_arguments_and_results():
     robot = free_body((20.0, 30.0, 40.0))
     kept, u = [], np.zeros(6)
 
@@ -132,7 +132,7 @@ def test_a_speed_whose_square_overflows_is_refused_or_a_divergence(size):
     assert finite(motion)
 
 
-def test_the_prediction_is_that_of_the_last_row_too():
+def test_the_prediction_matches_the_last_row_too():
     robot, lin, gain = regulated("ets_vii")
     policy = fflin.StateFeedback(lin, gain.K)
     x0 = lin.x0 + 1e-6 * (displaced(lin) - lin.x0)
@@ -194,7 +194,7 @@ def test_the_default_step_divides_samples_delay_and_duration():
         ({"linear": 3}, "fflin.LinearModel"),
     ],
 )
-def test_bad_input_is_one_line(options, said):
+def test_invalid_input_is_one_line(options, said):
     with pytest.raises(fflin.FflinError) as caught:
         fflin.simulate(free_body((20.0, 30.0, 40.0)), **{"duration": 1.0, **options})
     assert said in str(caught.value)
@@ -240,7 +240,7 @@ def test_energy_of_gravity_and_springs_is_part_of_the_whole():
     ).energy[0] == pytest.approx(25.0 * 0.16 + 10.0 * 0.09)
 
 
-def test_the_linear_loop_is_that_of_scipy_late_limited_and_off_a_fixed_point():
+def test_the_linear_loop_matches_scipy_late_limited_and_off_a_fixed_point():
     from scipy.signal import cont2discrete
 
     robot = fflin.load("ets_vii", gravity=(0.0, 0.0, -0.2))
@@ -297,7 +297,7 @@ def test_feedback_along_a_trajectory_does_not_see_the_quaternions_sign():
         fflin.TrajectoryFeedback(3, 4)
 
 
-def test_an_allocation_is_sampled_as_its_policy_is_and_refuses_what_is_no_command():
+def test_an_allocation_is_sampled_as_its_policy_is_and_refuses_an_invalid_command():
     design = fflin.load("cubesat", inputs=[fflin.BaseTorque(), fflin.BaseForce()])
     robot = design.replace(inputs=strong_thrusters())
     lin = fflin.linearize(design)
@@ -321,7 +321,7 @@ def test_an_allocation_is_sampled_as_its_policy_is_and_refuses_what_is_no_comman
         fflin.simulate(robot, fflin.Allocation(inner, 3), duration=1.0)
 
 
-def test_an_allocation_to_the_same_inputs_gives_what_was_asked():
+def test_an_allocation_to_the_same_inputs_returns_the_command():
     # The force is held in reference axes, while the base is turned.
     robot = fflin.load("ets_vii")
     lin = fflin.linearize(robot)
@@ -349,7 +349,7 @@ def test_the_attitude_error_is_the_angle_to_the_target_that_is_turned_too():
     assert motion.attitude_error[0] == pytest.approx(angle, abs=1e-9)
 
 
-def test_a_motion_of_unequal_rows_is_none(tmp_path):
+def test_a_motion_with_unequal_rows_is_refused(tmp_path):
     motion = fflin.simulate(free_body((20.0, 30.0, 40.0)), duration=0.1)
     motion.save(tmp_path / "m.json")
     record = json.loads((tmp_path / "m.json").read_text())
@@ -370,7 +370,7 @@ def test_a_motion_that_is_not_finite_is_not_saved(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_step_that_a_fast_gain_makes_short_is_told_once():
+def test_a_step_that_a_fast_gain_makes_short_is_reported_once():
     robot = free_body((20.0, 30.0, 40.0))
     lin = fflin.linearize(robot)
     K = fflin.lqr(lin, 1.0, 1.0).K
@@ -393,7 +393,7 @@ def test_a_step_that_a_fast_gain_makes_short_is_told_once():
         fflin.simulate(robot, policy, **{"duration": 2.0} | times, events=[at_once])
 
 
-def test_a_gain_that_is_not_finite_is_said_to_hold_nan():
+def test_a_gain_that_is_not_finite_is_reported_to_hold_nan():
     lin = fflin.linearize(free_body((20.0, 30.0, 40.0)))
     with pytest.raises(fflin.InputError, match=r"K\[0, 0\] is nan"):
         fflin.StateFeedback(lin, np.full((6, 12), np.nan))

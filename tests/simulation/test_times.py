@@ -36,7 +36,7 @@ def test_runs_of_up_to_100000_rows_are_recorded_step_by_step():
 @pytest.mark.parametrize(
     ("sample", "every"), [(0.01, 24), (0.03, 24), (0.5, 50), (0.07, 28)]
 )
-def test_what_is_recorded_of_a_sampled_loop_are_samples_or_parts_of_them(sample, every):
+def test_recorded_rows_of_a_sampled_loop_divide_the_samples(sample, every):
     found = of(2400.0 - 2400.0 % sample, sample=sample)
     assert found.every == every
     assert found.every % found.sample == 0
@@ -60,7 +60,7 @@ def test_a_thinned_run_is_the_run_at_some_of_its_rows(monkeypatch):
     assert len(short.t) == 101 and not short.notes
 
 
-def test_the_pole_that_makes_a_run_slow_is_told():
+def test_the_pole_that_makes_a_run_slow_is_reported():
     robot = fflin.load("ets_vii")
     lin = fflin.linearize(robot)
     K = fflin.lqr(lin).K.copy()

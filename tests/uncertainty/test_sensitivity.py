@@ -219,7 +219,7 @@ def test_a_single_body_in_closed_form():
 
 
 @pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
-def test_links_that_are_fixed_to_each_other_have_parameters_of_their_own():
+def test_links_that_are_fixed_to_each_other_have_separate_parameters():
     robot = fflin.load("planar_detumble")
     S = fflin.sensitivity(fflin.linearize(robot))
     parts = S["link_3.density"].dB + S["hand.density"].dB + S["target.density"].dB
@@ -276,7 +276,7 @@ def test_poles_move_as_differences_say():
     )
 
 
-def test_its_own_check_finds_it_right_and_what_is_wrong_wrong():
+def test_correct_models_pass_check_and_wrong_models_fail():
     robot = fflin.load("ets_vii")
     q, v, _ = random_point(robot, np.random.default_rng(4), degrees=30.0, speed=0.2)
     S = fflin.sensitivity(fflin.linearize(robot, q, v))
@@ -287,7 +287,7 @@ def test_its_own_check_finds_it_right_and_what_is_wrong_wrong():
     assert min(S.check(names).values()) > 1e-6
 
 
-def test_what_is_wrong_is_one_line():
+def test_errors_are_one_line():
     robot = fflin.load("ets_vii")
     lin = fflin.linearize(robot)
     S = fflin.sensitivity(lin)
@@ -345,7 +345,7 @@ def test_a_thruster_that_burns_on_a_link_and_a_spring_out_of_rest():
             assert np.abs(got - expected).max() <= 1e-10 * np.abs(expected).max(), name
 
 
-def test_rotors_are_no_parameters_of_bodies():
+def test_rotors_are_not_parameters_of_bodies():
     model = fflin.load("ets_vii").model.copy()
     model.armature = np.r_[np.zeros(6), np.linspace(0.1, 2.0, model.nv - 6)]
     robot = fflin.from_model(model)
@@ -357,7 +357,7 @@ def test_rotors_are_no_parameters_of_bodies():
 
 
 @pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
-def test_its_table_has_what_a_tenth_of_each_changes_and_the_most_first():
+def test_the_table_shows_the_effect_of_a_ten_percent_change_in_descending_order():
     S = fflin.sensitivity(fflin.linearize(fflin.load("servicer_7dof")))
     _, rows = S.table(len(S.names)).split("B [%]\n")
     rows = rows.splitlines()
@@ -378,7 +378,7 @@ def test_its_table_has_what_a_tenth_of_each_changes_and_the_most_first():
 
 
 @pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
-def test_its_table_ranks_links_or_what_is_asked_for():
+def test_the_table_ranks_links_or_the_requested_parameters():
     S = fflin.sensitivity(fflin.linearize(fflin.load("planar_detumble")))
 
     def shown(only=None):
@@ -436,7 +436,7 @@ def test_every_place_and_direction_of_a_thruster(axis, torque):
         assert all(0.15 < -each.inputs[0].torque < 0.45 for each in drawn)
 
 
-def test_in_orbit_masses_change_what_the_field_does():
+def test_in_orbit_masses_change_the_gravity_gradient():
     robot, rng = in_orbit(fflin.load("servicer_7dof")), np.random.default_rng(6)
     joints = {name: rng.uniform(-1.0, 1.0) for name in robot.joint_names}
     for speed, frame in ((0.0, "hill"), (0.4, "lvlh")):

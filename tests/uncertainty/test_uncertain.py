@@ -77,7 +77,7 @@ def test_the_fraction_is_the_model_linearised_again(name):
 
 
 @pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
-def test_no_block_is_larger_than_the_rank_of_what_it_changes():
+def test_no_block_is_larger_than_the_rank_of_its_effect():
     robot = fflin.load("planar_detumble")
     q = posed(robot)
     S = fflin.sensitivity(fflin.linearize(robot, q))
@@ -150,7 +150,7 @@ def test_samples_are_rigid_bodies_and_corners_that_are_none_are_counted():
 
 
 @pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
-def test_what_is_wrong_is_one_line():
+def test_errors_are_one_line():
     robot = fflin.load("servicer_7dof")
     of = fflin.uncertain(robot, {"base.mass": 0.2})
     cases = [
@@ -205,7 +205,7 @@ def test_a_range_that_no_robot_has_is_refused():
     assert len(of.samples(3)) == 3 and of.draws(30)[1] > 0
 
 
-def test_a_wheel_with_friction_is_no_thruster():
+def test_a_wheel_with_friction_is_not_a_thruster():
     wheel = fflin.ReactionWheel((0.0, 0.0, 1.0), inertia=1e-3, name="w")
     robot = fflin.load("servicer_7dof", inputs=[wheel])
     of = fflin.uncertain(robot, {"w.damping": (0.1, 0.3)})
@@ -231,7 +231,7 @@ def test_rotors_count_in_the_fraction():
     )
 
 
-def test_a_wheel_too_large_for_its_carrier_is_no_robot():
+def test_a_wheel_too_large_for_its_carrier_is_not_a_robot():
     wheel = fflin.ReactionWheel((0.0, 0.0, 1.0), inertia=1e-3)
     robot = fflin.load("cubesat", inputs=[wheel])
     largest = robot._bare.model.inertias[1].inertia[2, 2]
@@ -253,7 +253,7 @@ def test_a_range_that_leaves_hardly_any_robot_is_one_line():
             call()
 
 
-def test_stored_momentum_is_no_fixed_point():
+def test_stored_momentum_is_not_a_fixed_point():
     wheel = fflin.ReactionWheel((0.0, 0.0, 1.0), momentum=2.0)
     robot = fflin.load("cubesat", inputs=[wheel])
     with pytest.raises(fflin.InputError, match="momentum"):
@@ -261,7 +261,7 @@ def test_stored_momentum_is_no_fixed_point():
 
 
 @pytest.mark.parametrize("output", [fflin.CenterOfMass(), fflin.Momentum()])
-def test_an_output_that_weighs_the_robot_is_no_fraction(output):
+def test_an_output_that_weighs_the_robot_is_not_a_fraction(output):
     robot = fflin.load("cubesat", outputs=[output])
     with pytest.raises(fflin.InputError, match="masses"):
         fflin.uncertain(robot, {"base.mass": 0.1}).lft()
@@ -342,7 +342,7 @@ def test_tied_parameters_share_a_value_between_ends_and_the_worst_names_it():
     )
 
 
-def test_a_tied_share_takes_what_is_below_zero_further_from_it():
+def test_a_tied_fraction_moves_negative_values_away_from_zero():
     robot = fflin.load("cubesat")
     robot = robot.with_mass_properties({"base": {"com": [0.01, -0.02, 0.03]}})
     of = fflin.uncertain(robot, {"base.com.*": {"range": 0.5, "tied": True}})

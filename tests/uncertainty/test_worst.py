@@ -38,7 +38,7 @@ def whole_of(loops):
 
 @pytest.mark.parametrize("drawn", [80, pytest.param(400, marks=pytest.mark.exhaustive)])
 @pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
-def test_nothing_that_is_drawn_is_worse_than_what_is_found(servicer, drawn):
+def test_no_draw_is_worse_than_the_result(servicer, drawn):
     of, gain, loops = servicer
     found = of.worst(gain, samples=30)
     draws, frequencies = of.draws(drawn, seed=9)[0], np.geomspace(0.02, 3.0, 20)
@@ -138,9 +138,7 @@ def springy(request):
 
 
 @pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
-def test_no_corner_and_no_draw_built_again_is_worse_than_what_is_found(
-    monkeypatch, springy
-):
+def test_no_rebuilt_corner_or_draw_is_worse_than_the_result(monkeypatch, springy):
     monkeypatch.setattr(worst, "_safe", lambda loops: np.inf)
     of, gain, figures = springy
     least = of.worst(gain, samples=40)
@@ -166,7 +164,7 @@ def test_more_samples_never_find_less(monkeypatch, springy):
         assert more.gain.value >= fewer.gain.value
 
 
-def test_what_exceeds_a_bound_is_told_from_what_does_not(servicer):
+def test_violations_are_distinguished_from_values_within_a_bound(servicer):
     of, _, loops = servicer
     figures, draws = loops.figures(whole_of(loops)), of.draws(12, seed=4)[0]
     exact = np.array([figures.exact(row[None])[0] for row in draws])
@@ -175,7 +173,7 @@ def test_what_exceeds_a_bound_is_told_from_what_does_not(servicer):
         assert (figures.above(draws, bound) == (exact > bound))[clear].all()
 
 
-def test_the_bound_by_scaling_is_that_of_textbooks():
+def test_the_bound_by_scaling_matches_textbooks():
     # Packard and Doyle, Automatica 29(1), 1993: of diagonal blocks the bound by D Z D^-1.
     def scaled(Z):
         d = worst.perron(Z)
@@ -192,7 +190,7 @@ def test_the_bound_by_scaling_is_that_of_textbooks():
     assert scaled(np.zeros((2, 2)))[1] == 0.0
 
 
-def test_slycot_gives_the_structured_singular_value_of_its_own_example():
+def test_slycot_gives_the_structured_singular_value_of_its_example():
     slycot = pytest.importorskip("slycot")
     rows = (
         (-1 + 6j, 2 - 3j, 3 + 8j, 3 + 8j, -5 - 9j, -6 + 2j),
@@ -234,7 +232,7 @@ def test_the_worst_loop_of_one_parameter_is_at_its_end():
     assert worst.unstable == 0
 
 
-def test_the_bound_is_that_of_the_structured_singular_value():
+def test_the_bound_matches_the_structured_singular_value():
     ab13md = pytest.importorskip("slycot").ab13md
     # A real number that multiplies one signal: only at frequencies without end, where M is
     # singular for an inertia of 0, is the loop at its limit.
@@ -249,7 +247,7 @@ def test_the_bound_is_that_of_the_structured_singular_value():
     assert ab13md(Z, [1, 1], [2, 2])[0] == pytest.approx(2.0, rel=1e-6)
 
 
-def test_what_is_safe_is_stable_and_no_more_is_promised():
+def test_loops_within_the_stability_bound_are_stable():
     pytest.importorskip("slycot")
     robot = fflin.load("ets_vii")
     gain = fflin.lqr(fflin.linearize(robot))
@@ -314,7 +312,7 @@ WHEELED = {
         pytest.param("position regulated", marks=pytest.mark.exhaustive),
     ],
 )
-def test_stability_is_that_of_the_regulated_states(layout):
+def test_stability_matches_the_regulated_states(layout):
     """Worst figures compared with loops of robots built again, over their regulated states."""
     robot = WHEELED[layout]()
     ranges = {

@@ -228,7 +228,7 @@ def test_frames_of_a_strip_have_their_time_and_the_first_a_legend(watched, size)
     assert not watched.page.locator("#legend label.strip:visible").count()
 
 
-def test_what_was_passed_leads_to_its_time(watch, tmp_path):
+def test_a_violation_links_to_its_time(watch, tmp_path):
     robot = fflin.load("ets_vii")
     motion = settling(robot, 20.0)
     names = ("tau_m.joint_1", "tau_m.joint_2")

@@ -94,7 +94,7 @@ def test_a_mesh_that_is_mended_is_read_again(tmp_path):
         load_mesh(path)
 
 
-def test_dust_is_no_mesh(tmp_path):
+def test_dust_is_not_a_mesh(tmp_path):
     path = tmp_path / "m.obj"
     corners = ("0 0 0", "1e-4 0 0", "0 1e-4 0", "1 1 1", "1.0001 1 1", "1 1.0001 1")
     path.write_text("".join(f"v {each}\n" for each in corners) + "f 1 2 3\nf 4 5 6\n")

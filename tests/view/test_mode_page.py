@@ -82,7 +82,7 @@ def test_the_robot_swings_as_the_eigenvector_says(shown):
 
 
 @pytest.mark.browser
-def test_the_base_swings_against_what_bends(shown):
+def test_the_base_oscillates_against_the_flexible_mode(shown):
     """Nothing pushes from outside: the centre of mass stays while the base moves."""
     robot, found, watched = shown
     data = robot.model.createData()
@@ -163,7 +163,9 @@ def test_it_plays_at_a_rate_to_be_watched(shown):
     assert text.startswith("shown at 0.50 Hz, ")
 
 
-def test_what_cannot_be_shown_is_one_line_and_no_file(robots, tmp_path, monkeypatch):
+def test_an_invalid_animation_gives_a_one_line_error_and_no_file(
+    robots, tmp_path, monkeypatch
+):
     # without Chromium the reasons are the same
     monkeypatch.setenv("PATH", str(tmp_path))
     page, bent = tmp_path / "m.html", fflin.load("servicer_7dof", stiffness=STIFF)

@@ -21,7 +21,7 @@ def pages(tmp_path_factory):
     return folder
 
 
-def test_what_pages_are_told(pages):
+def test_the_messages_to_pages_are_complete(pages):
     lvlh, hill, plain = (
         page_data(pages / f"{x}.html") for x in ("lvlh", "hill", "hybrid")
     )

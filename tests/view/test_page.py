@@ -147,7 +147,7 @@ def test_slider_play_speed_and_keys_work(settled, watched):
 
 
 @pytest.mark.browser
-def test_the_panel_says_what_the_motion_says(settled, watched):
+def test_the_panel_agrees_with_the_motion(settled, watched):
     _, motion, _ = settled
     for t in (0.0, 4.0):
         watched.do(f"fflin.seek({t})")
@@ -322,7 +322,7 @@ def test_forces_trails_and_the_legend(settled, watched):
 
 
 @pytest.mark.browser
-def test_the_camera_follows_the_base_when_it_is_told_to(settled, watched):
+def test_the_camera_follows_the_base_on_request(settled, watched):
     target = "viewer.controls.target.toArray()"
     watched.do("fflin.seek(0)")
     fixed = watched.do(target)
@@ -457,7 +457,7 @@ def test_the_floor_lies_below_all_of_the_motion_and_the_target(tmp_path):
     assert not shown["follow"]
 
 
-def test_on_a_long_way_the_camera_follows_unless_it_is_told_not_to(robots, tmp_path):
+def test_on_a_long_way_the_camera_follows_unless_switched_off(robots, tmp_path):
     robot = robots["servicer_7dof"]
     v0 = fflin.velocity(robot, {"v_b.x": 1000.0})
     motion = fflin.simulate(robot, None, v0=v0, duration=10.0, dt=0.1)
@@ -483,7 +483,7 @@ def test_two_minutes_at_2048_rows_a_second_are_below_5_megabytes(robots, tmp_pat
 
 
 @pytest.mark.browser
-def test_without_a_target_there_is_no_ghost(robots, watch, tmp_path):
+def test_without_a_target_no_ghost_is_drawn(robots, watch, tmp_path):
     robot = robots["planar_detumble"]
     motion = replace(settling(robot, duration=2.0), target=np.zeros(0))
     path = tmp_path / "free.html"
@@ -544,7 +544,7 @@ def middle_of(watched, *path, mesh):
 
 
 @pytest.mark.browser
-def test_the_paths_of_the_reference_are_dashed_beside_those_flown(led_page):
+def test_the_paths_of_the_reference_are_dashed_next_to_those_flown(led_page):
     robot, motion, watched, _ = led_page
     state = fflin.StateMap(robot, reference=motion.reference, frame=motion.frame)
     data, tool = robot.model.createData(), robot.model.getFrameId(tool_frame(robot))

@@ -45,7 +45,7 @@ def limited(motion, limits):
     )
 
 
-def test_errors_are_those_of_the_pose(robots):
+def test_errors_match_the_pose(robots):
     rng = np.random.default_rng(2)
     robot = robots["ets_vii"]  # its joints are continuous
     turns = dict(zip(robot.joint_names, (0.3, 3.0, -1.0, 0.0, 1.0, -3.0), strict=True))
@@ -68,7 +68,7 @@ def test_errors_are_those_of_the_pose(robots):
     assert "largest prismatic joint" not in found
 
 
-def test_errors_from_a_target_that_moves_are_those_of_the_same_moment(robots):
+def test_errors_from_a_moving_target_are_relative_to_the_same_instant(robots):
     robot = robots["ets_vii"]
     rng = np.random.default_rng(3)
     targets = np.array(
@@ -152,7 +152,7 @@ def test_plots_have_the_units_of_the_model():
         np.testing.assert_allclose(drawn[by][joint.name], u, rtol=1e-6)
 
 
-def test_wheels_have_charts_of_their_own():
+def test_wheels_have_separate_charts():
     """Speed, torque and momentum against saturation, and nothing of them among the joints."""
     wheels = [
         fflin.ReactionWheel((0, 0, 1), name=f"w{k}", inertia=1e-3 * k) for k in (1, 2)
@@ -244,7 +244,7 @@ def test_without_a_target_nothing_is_called_an_error(robots):
     )
 
 
-def test_what_was_passed_is_told_with_its_time(robots):
+def test_violations_are_reported_with_their_time(robots):
     robot = robots["planar_detumble"]
     motion = settling(robot, 1.0)
     name = f"tau_m.{robot.joint_names[0]}"
@@ -255,7 +255,7 @@ def test_what_was_passed_is_told_with_its_time(robots):
     assert time == motion.t[700] and text == f"{name} 3 N m at 0.35 s, limit 2"
 
 
-def test_what_is_followed_goes_with_joints_and_wheels():
+def test_references_include_joints_and_wheels():
     wheel = fflin.ReactionWheel((0, 0, 1), name="w", inertia=1e-3)
     robot = fflin.load("planar_detumble")
     robot = robot.replace(inputs=[*robot.inputs, wheel])

@@ -35,7 +35,7 @@ def write(folder, mesh="missing.stl", more=""):
 @pytest.mark.parametrize(
     "name", ["ets_vii", "canadarm2", "dual_arm", *exhaustive("talos", "panda", "tiago")]
 )
-def test_shapes_stand_where_pinocchio_puts_them(name):
+def test_shapes_are_at_the_placements_of_pinocchio(name):
     robot = fflin.load(name)
     found, notes = shapes(robot)
     file = find_robot(name)
@@ -199,7 +199,7 @@ def test_a_mesh_is_scaled_and_mirrored_and_then_placed(tmp_path):
     np.testing.assert_allclose(cKDTree(theirs).query(ours)[0], 0.0, atol=1e-6)
 
 
-def test_what_was_grasped_is_drawn_where_it_is_held():
+def test_a_captured_payload_is_drawn_at_its_grasp():
     robot, other = fflin.load("servicer_7dof"), fflin.load("ets_vii")
     at = pin.SE3(pin.rpy.rpyToMatrix(0.1, 0.2, 0.3), np.array([0.0, 0.1, 0.5]))
     whole = fflin.capture(robot, "tool", other, placement=at).robot

@@ -119,7 +119,7 @@ def test_the_inertia_is_turned_by_the_quaternion():
 
 
 @pytest.mark.parametrize("kind", ["revolute", "prismatic"])
-def test_without_a_limit_there_is_none(kind):
+def test_without_a_limit_nothing_is_limited(kind):
     model = read(arm(kind=kind, inside=AXIS)).model
     assert model.lowerPositionLimit[7] < -1e300 and model.upperPositionLimit[7] > 1e300
     assert model.effortLimit[6] > 1e300 and model.velocityLimit[6] > 1e300
@@ -292,7 +292,7 @@ def test_info_lists_the_warnings(tmp_path):
     assert says(text, "r: ", "'hinge'")
 
 
-def test_info_lists_mimic_joints_and_what_hangs_on_them(tmp_path):
+def test_info_lists_mimic_joints_and_their_children(tmp_path):
     from fflin.robot.summary import robot_info
 
     path = tmp_path / "r.urdf"
@@ -364,7 +364,7 @@ def test_the_stack_size_of_threads_is_left_as_it_was():
     assert threading.stack_size() == before
 
 
-def test_wrong_and_infinite_limits_are_none():
+def test_wrong_and_infinite_limits_are_ignored():
     for limit in (
         'lower="-inf" upper="inf" effort="inf"',
         'lower="" upper="-" effort="-1"',
@@ -376,7 +376,7 @@ def test_wrong_and_infinite_limits_are_none():
         assert model.effortLimit[6] > 1e300
 
 
-def test_a_note_is_told_once_for_all_its_lines():
+def test_a_note_is_reported_once_for_all_its_lines():
     document = robot(
         *(link(name) for name in "abc"), joint("j", "a", "b"), joint("k", "a", "c")
     )
