@@ -77,20 +77,20 @@ def test_peer_in_another_frame_is_detected():
 
 def test_peers_that_are_not_there_are_named(monkeypatch):
     missing = ("mujoco", "crocoddyl", "pydrake", "casadi")
-    there = builtins.__import__
+    original_import = builtins.__import__
 
     def without(name, *rest):
         if name.partition(".")[0] in missing:
             raise ImportError(f"No module named '{name}'")
-        return there(name, *rest)
+        return original_import(name, *rest)
 
     monkeypatch.setattr(builtins, "__import__", without)
     for name in peers.MODULES[1:]:
         monkeypatch.delitem(
             peers.importlib.sys.modules, f"benchmarks.peers.{name}", raising=False
         )
-    found, notes = methods("at_rest", random_point(load("cubesat")))
-    assert [method.name for method in found] == [pinocchio_peer.FLOOR]
+    result, notes = methods("at_rest", random_point(load("cubesat")))
+    assert [method.name for method in result] == [pinocchio_peer.FLOOR]
     assert len(notes) == 4 and all("not installed" in note for note in notes)
 
 

@@ -102,11 +102,11 @@ def test_a_command_writes_the_messages_of_all_workers(tmp_path):
         return done.returncode, done.stdout + done.stderr
 
     def tests(**sentences):
-        each = [
-            f"def test_{name}():\n    hear({said!r})\n"
-            for name, said in sentences.items()
+        item = [
+            f"def test_{name}():\n    hear({message!r})\n"
+            for name, message in sentences.items()
         ]
-        (tmp_path / "tests" / "test_it.py").write_text(HEAR + "".join(each))
+        (tmp_path / "tests" / "test_it.py").write_text(HEAR + "".join(item))
 
     def noted():
         return json.loads((tmp_path / "tests" / "messages.json").read_text())

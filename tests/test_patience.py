@@ -38,15 +38,15 @@ def test_a_busy_process_is_awaited():
 
 
 def test_an_idle_process_is_stopped_after_a_minute():
-    said = reasons(Scripted(0.001), 8)
-    assert said[:6] == [""] * 6
-    assert "the moon" in said[6]
+    message = reasons(Scripted(0.001), 8)
+    assert message[:6] == [""] * 6
+    assert "the moon" in message[6]
 
 
 def test_an_endless_computation_is_stopped():
-    said = reasons(Scripted(10.0), 62)
-    assert said[:60] == [""] * 60
-    assert "the moon" in said[61]
+    message = reasons(Scripted(10.0), 62)
+    assert message[:60] == [""] * 60
+    assert "the moon" in message[61]
 
 
 def test_a_condition_that_never_holds_is_named():

@@ -52,8 +52,8 @@ def test_unactuated_base_leaves_the_generalised_inertia(robots, name):
     assert reduced.M == pytest.approx(schur, rel=1e-9, abs=1e-9)
     assert schur @ reduced.B[n:] == pytest.approx(np.eye(n), abs=1e-8)
     assert np.linalg.inv(M)[6:, 6:] @ schur == pytest.approx(np.eye(n), abs=1e-8)
-    found = fflin.controllability(reduced)
-    assert found.dimension == 2 * n and found.stabilizable
+    result = fflin.controllability(reduced)
+    assert result.dimension == 2 * n and result.stabilizable
 
 
 @pytest.mark.parametrize("name", ARMS)

@@ -38,8 +38,8 @@ def test_reachable_forces_of_thrusters_are_known(n):
     for direction, dimension in expected.items():
         thrust = robot.replace(inputs=[fflin.Thruster(frame, center, direction)])
         lin = fflin.linearize(thrust, frame="hill")
-        found = fflin.controllability(lin)
-        assert (found.dimension, found.stabilizable) == (dimension, False)
+        result = fflin.controllability(lin)
+        assert (result.dimension, result.stabilizable) == (dimension, False)
         assert not len(fflin.momentum_reduction(lin).momenta)
         assert fflin.observability(lin).dimension == 12
     # The drift of a radial thrust's orbit, dy/dt + 2 n x, is what it cannot change.

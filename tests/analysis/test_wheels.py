@@ -60,18 +60,23 @@ def test_attitude_and_joints_stay_and_the_quotient_is_exact(count, frame):
             np.linalg.eigvalsh(body.inertia)[0]
             for body in robot.model.inertias.tolist()
         ]
-        own, J = motors(robot), 1e-3 * min(moment for moment in bodies if moment > 0.0)
+        default, J = (
+            motors(robot),
+            1e-3 * min(moment for moment in bodies if moment > 0.0),
+        )
         on = [None] if robot.name != "servicer_7dof" else [None, "link_3", "panel_left"]
         added = wheels(AXES[:count], J, on)
         passive = {}
-        if own:
+        if default:
             passive = {"stiffness": {robot.joint_names[-1]: 3.0}, "damping": 0.2}
-        ship = robot.replace(inputs=[*own, *added], **passive)
+        ship = robot.replace(inputs=[*default, *added], **passive)
         q = posed(ship, rng)
         at = fflin.linearize(ship, q).x0[6 : 6 + ship.n]
-        if own:
-            there = dict(zip(ship.joint_names, at, strict=True))
-            ship = ship.replace(rest={name: there[name] for name in robot.joint_names})
+        if default:
+            expected_value = dict(zip(ship.joint_names, at, strict=True))
+            ship = ship.replace(
+                rest={name: expected_value[name] for name in robot.joint_names}
+            )
         lin = fflin.linearize(ship, q, frame=frame, reference=pin.SE3.Identity())
         for model in (lin, lin.discretize(0.1)):
             part = fflin.momentum_reduction(model)
@@ -264,6 +269,6 @@ def test_rounding_errors_of_a_spin_are_not_springs(name, J, speed, net):
         )
         still, spun = (linearizer(q, v) for v in (None, fflin.velocity(ship, speeds)))
         expected = fflin.momentum_reduction(still)
-        found = fflin.momentum_reduction(spun)
-        assert found.state_names == expected.state_names
-        assert len(found.momenta) == len(expected.momenta) == 3 and not found.notes
+        result = fflin.momentum_reduction(spun)
+        assert result.state_names == expected.state_names
+        assert len(result.momenta) == len(expected.momenta) == 3 and not result.notes

@@ -19,7 +19,7 @@ NAMES = (
 
 
 @pytest.mark.parametrize(
-    ("key", "found"),
+    ("key", "result"),
     [
         ("q_m.hinge_2", [2]),
         ("q_m", [1, 2, 3]),
@@ -34,12 +34,12 @@ NAMES = (
         ("*", [0, 1, 2, 3, 4, 5]),
     ],
 )
-def test_keys_of_robot_files_have_their_documented_meaning(key, found):
-    if found is None:
+def test_keys_of_robot_files_have_their_documented_meaning(key, result):
+    if result is None:
         with pytest.raises(fflin.InputError, match=r"q_m\.hinge_"):
             matching("state", key, NAMES)
     else:
-        assert matching("state", key, NAMES) == found
+        assert matching("state", key, NAMES) == result
 
 
 @pytest.mark.parametrize("key", ["hinge_9", "q_n", "q_m.hinge_9*", "q_m.", ""])

@@ -173,9 +173,9 @@ def test_a_sweep_uses_the_kernel_and_omits_points_that_the_linearizer_refuses(ro
     for row in (0, 39):
         one = fflin.linearize(robot, q[row], v[row], u[row])
         for key in ("A", "B", "C", "D", "f0", "x0", "u0", "y0"):
-            found, expected = getattr(batch[row], key), getattr(one, key)
+            result, expected = getattr(batch[row], key), getattr(one, key)
             scale = max(1.0, np.abs(expected).max())
-            assert np.abs(found - expected).max() < 1e-12 * scale, key
+            assert np.abs(result - expected).max() < 1e-12 * scale, key
     # Turned by pi from the reference.
     q[17, 3:7] = 1.0, 0.0, 0.0, 0.0
     with pytest.raises(fflin.SweepError, match=r"17.*180 deg"):
@@ -239,9 +239,9 @@ def test_one_set_of_machine_code_serves_every_robot_and_option(robots):
         ]
         if name == "servicer_7dof":
             variants.append(robot.replace(inputs=thrusters))
-        for each in variants:
+        for variant in variants:
             for case in CASES.values():
-                q, v, u = operating_points(each, 9)
+                q, v, u = operating_points(variant, 9)
                 for point in ((q,), (q, v), (q, None, u), (q[:3], v[:3], u[:3])):
-                    fflin.sweep(each, *point, **case)
+                    fflin.sweep(variant, *point, **case)
     assert len(derive.signatures) == 1

@@ -331,12 +331,12 @@ def test_ill_conditioned_points_are_reported_once():
 
 @pytest.mark.compiled
 def test_progress_is_reported(robots):
-    told = []
+    messages = []
     q = np.tile(robots["cubesat"].neutral(), (25, 1))
     fflin.sweep(
-        robots["cubesat"], q, chunk=10, progress=lambda *counts: told.append(counts)
+        robots["cubesat"], q, chunk=10, progress=lambda *counts: messages.append(counts)
     )
-    assert told == [(10, 25), (20, 25), (25, 25)]
+    assert messages == [(10, 25), (20, 25), (25, 25)]
 
 
 def test_nothing_of_the_callers_is_changed_or_kept(robots):

@@ -61,14 +61,14 @@ def test_check_exits_0_on_every_bundled_robot(name):
 
 @pytest.mark.process
 def test_damping_that_is_asked_for_is_not_warned_of():
-    for option, said in (([], True), (["--damping", "urdf"], False)):
+    for option, message in (([], True), (["--damping", "urdf"], False)):
         done = finished(
             [sys.executable, "-m", "fflin", "modes", "planar_detumble", *option],
             capture_output=True,
             text=True,
             check=True,
         )
-        assert ("damping" in done.stderr) == said
+        assert ("damping" in done.stderr) == message
 
 
 @pytest.mark.process
@@ -395,11 +395,14 @@ def test_unwritable_stderr_does_not_change_the_exit_code(arguments):
     ],
 )
 def test_names_neither_split_nor_fill_the_line(arguments):
-    said = refused(
-        *(each.format("a\nb\x1b[31m" + 5000 * "c" + "d") for each in arguments)
+    message = refused(
+        *(argument.format("a\nb\x1b[31m" + 5000 * "c" + "d") for argument in arguments)
     )
     assert (
-        r"a\nb\x1b[31mc" in said and "...c" in said and "cd" in said and len(said) < 500
+        r"a\nb\x1b[31mc" in message
+        and "...c" in message
+        and "cd" in message
+        and len(message) < 500
     )
 
 
@@ -518,11 +521,11 @@ def test_warnings_of_other_packages_are_shown_as_those_of_fflin(monkeypatch, cap
     with warnings.catch_warnings():
         warnings.simplefilter("always")
         assert cli.main(["linearize", "cubesat"]) == 0
-        *_, foreign, own = capsys.readouterr().err.splitlines()
+        *_, foreign, own_line = capsys.readouterr().err.splitlines()
         outcome.append("error")
         assert cli.main(["linearize", "cubesat"]) == 2
         error = capsys.readouterr().err
-    assert own == "fflin: warning: mind this"
+    assert own_line == "fflin: warning: mind this"
     assert foreign == "fflin: warning: overflow encountered in multiply"
     assert error.endswith("fflin: warning: mind this\nfflin: error: too large\n")
 
@@ -662,8 +665,8 @@ def test_plot_draws_the_result_of_the_command(command, tmp_path, monkeypatch):
     assert (tmp_path / "a.svg").read_bytes().startswith(b"<?xml")
     assert "'.bmp'" in refused(*command, "--plot", tmp_path / "a.bmp")
     assert "No such" in (
-        said := refused(*command, "--plot", tmp_path / "no" / "a.png")
-    ) or ("folder" in said)
+        message := refused(*command, "--plot", tmp_path / "no" / "a.png")
+    ) or ("folder" in message)
     assert [path.name for path in tmp_path.iterdir()] == ["a.svg"]
 
 
@@ -698,7 +701,9 @@ def test_short_help_fits_a_screen_and_full_help_has_every_option():
     (parsers,) = cli._parser("")._subparsers._group_actions
     for name, parser in parsers.choices.items():
         options = [
-            each.option_strings[-1] for each in parser._actions if each.option_strings
+            action.option_strings[-1]
+            for action in parser._actions
+            if action.option_strings
         ]
         _, short, _ = run(name, "--help")
         _, full, _ = run(name, "--help", "all")
@@ -729,7 +734,9 @@ def test_options_that_repeat_a_robot_file_are_in_one_group():
         "funnel",
     ):
         (group,) = (x for x in parsers.choices[name]._action_groups if x.title == ROBOT)
-        assert {each.dest for each in group._group_actions} == repeated, name
+        assert {
+            group_action.dest for group_action in group._group_actions
+        } == repeated, name
 
 
 @pytest.mark.sample
@@ -788,8 +795,8 @@ def test_equilibria_in_orbit_are_taken_as_panels_sag(tmp_path):
     assert (code, err) == (0, "") and "not an equilibrium" not in out
     # A rigid body's libration, in closed form.
     code, out, _ = run("modes", "cubesat", "--orbit", "400e3", "--relative-equilibrium")
-    found = fflin.relative_equilibria(fflin.load("cubesat", orbit=400e3))[0]
-    assert code == 0 and all(f"{w:.6g}" in out for w in found.poles.imag if w > 0.0)
+    result = fflin.relative_equilibria(fflin.load("cubesat", orbit=400e3))[0]
+    assert code == 0 and all(f"{w:.6g}" in out for w in result.poles.imag if w > 0.0)
     for command in ("analyze", "lqr"):
         assert run(command, *soft, "--relative-equilibrium", 5)[0] == 0
     assert "--relative-equilibrium" in run("modes", *soft, "--rpy", 5, 0, 0)[1]

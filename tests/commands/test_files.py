@@ -24,8 +24,10 @@ def commands():
 def pairs():
     """Yield (command, option that is read, option that is written) for all of them."""
     for name, actions in commands():
-        reads = [each for each in actions if each.type in (input_file, input_name)]
-        writes = [each for each in actions if isinstance(each.type, OutputFile)]
+        reads = [
+            action for action in actions if action.type in (input_file, input_name)
+        ]
+        writes = [action for action in actions if isinstance(action.type, OutputFile)]
         for read, write in itertools.product(reads, writes):
             yield pytest.param(
                 name, actions, read, write, id=f"{name} {read.dest} {write.dest}"
@@ -43,8 +45,8 @@ def test_an_output_file_is_not_an_input_file(
 ):
     monkeypatch.chdir(tmp_path)
     precious, other = tmp_path / "precious.toml", tmp_path / "other.toml"
-    for each in (precious, other):
-        each.write_text(each.name)  # nothing that a command could read
+    for item in (precious, other):
+        item.write_text(item.name)  # nothing that a command could read
     (tmp_path / "symbolic.npz").symlink_to(precious)
     os.link(precious, "hard.npz")
     words = [name]

@@ -132,10 +132,10 @@ def test_inputs_come_in_the_order_of_their_numbers(tmp_path):
     )
     (tmp_path / "own.urdf").write_text(OWN.replace("</robot>", f"{nozzles}</robot>"))
     assert run("init", "own.urdf", cwd=tmp_path)[0] == 0
-    found = re.findall(
+    result = re.findall(
         '# name = "thruster_([0-9]+)"', (tmp_path / "own.toml").read_text()
     )
-    assert found == [str(k) for k in range(1, 13)]
+    assert result == [str(k) for k in range(1, 13)]
 
 
 def test_joints_that_all_have_no_effort_keep_their_motors(tmp_path):
@@ -203,7 +203,7 @@ def test_init_writes_over_nothing_unless_requested(tmp_path):
         "folder": ("ets_vii", "-o", "none/b.toml"),
     }.items():
         assert words in refused("init", *arguments, cwd=tmp_path)
-    assert sorted(each.name for each in tmp_path.iterdir()) == ["ets_vii.toml"]
+    assert sorted(item.name for item in tmp_path.iterdir()) == ["ets_vii.toml"]
 
 
 SAT = """

@@ -18,11 +18,11 @@ def test_the_most_important_parameters_are_shown_and_saved(tmp_path):
     )
     assert code == 0 and not err
     head, table = out.split("parameter ")
-    _, *rows, more, said = table.splitlines()
+    _, *rows, more, message = table.splitlines()
     assert "most" in head and len(rows) == 4 and more.startswith("... and ")
-    assert all(len(line) <= 80 for line in out.splitlines()[:-1]) and said.startswith(
-        "wrote "
-    )
+    assert all(
+        len(line) <= 80 for line in out.splitlines()[:-1]
+    ) and message.startswith("wrote ")
     robot = fflin.load("servicer_7dof")
     q = fflin.configuration(robot, {"joint_2": 0.6})
     lin = fflin.linearize(robot, q, fflin.velocity(robot, {"omega_b.z": 0.1}))

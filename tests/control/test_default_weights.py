@@ -246,12 +246,12 @@ def test_a_point_that_asks_for_more_than_the_limits_is_reported(loops):
     lin = fflin.linearize(heavy, u=fflin.equilibrium(heavy).u)
     asked = dict(zip(lin.input_names, np.abs(lin.u0), strict=True))
     beyond = [name for name in asked if asked[name] > lin.limits.get(name, np.inf)]
-    said = fflin.lqr(lin).weights
+    message = fflin.lqr(lin).weights
     words = (
         "; inputs already at or beyond the URDF limit at the operating point: "
         f"{', '.join(beyond)}"
     )
-    assert beyond and said.endswith(words)
+    assert beyond and message.endswith(words)
 
 
 def test_the_loop_may_use_the_limits_minus_gravity(loops):
@@ -349,8 +349,8 @@ def test_a_gain_that_bears_little_is_warned_of_wherever_it_is_shown():
     ]
     done = finished(command, capture_output=True, text=True, check=True)
     out, err = done.stdout, done.stderr
-    told = [line for line in err.splitlines() if "disk margin" in line]
-    assert len(told) == 1 and "dt" in told[0]
+    messages = [line for line in err.splitlines() if "disk margin" in line]
+    assert len(messages) == 1 and "dt" in messages[0]
     assert "warning" not in out
 
 
@@ -359,8 +359,10 @@ def test_limits_of_thrusters_wheels_and_the_base_bind_too():
     base = [fflin.BaseTorque(max=1e-4), fflin.BaseForce(max=1.0)]
     rule = fflin.lqr(fflin.linearize(bare.replace(inputs=base))).weights
     assert re.search(r"limited by the effort of (tau|F)_b\.[xyz]$", rule)
-    found = fflin.load_inputs("cubesat")
-    weak = [replace(x, max=1e-5) if isinstance(x, fflin.Thruster) else x for x in found]
+    result = fflin.load_inputs("cubesat")
+    weak = [
+        replace(x, max=1e-5) if isinstance(x, fflin.Thruster) else x for x in result
+    ]
     gain = fflin.lqr(fflin.linearize(bare.replace(inputs=weak)))
     assert re.search(r"limited by the effort of [xyz]_(plus|minus)_", gain.weights)
 
@@ -370,17 +372,17 @@ def test_displacements_that_ask_for_more_than_the_limits_give_a_warning(loops):
     model.effortLimit[6:] *= 0.1
     heavy = fflin.from_model(model, gravity=(0.0, 0.0, -9.81))
     lin = fflin.linearize(heavy, u=fflin.equilibrium(heavy).u)
-    with pytest.warns(fflin.FflinWarning) as told:
+    with pytest.warns(fflin.FflinWarning) as messages:
         gain = fflin.lqr(lin)
     assert says(gain.weights, "too small")
-    (said,) = (str(each.message) for each in told)
+    (message,) = (str(item.message) for item in messages)
     start = (
         "the input limits are too small for 'talos' to return from the displacements"
     )
     asked = re.findall(
-        r"(tau_m\.\w+) requires ([\d.]+) N m, its limit is ([\d.]+)", said
+        r"(tau_m\.\w+) requires ([\d.]+) N m, its limit is ([\d.]+)", message
     )
-    assert said.startswith(start) and asked
+    assert message.startswith(start) and asked
     for name, value, limit in asked:
         assert float(limit) == pytest.approx(lin.limits[name], rel=1e-3)
         assert float(value) > float(limit) > abs(lin.u0[lin.input_names.index(name)])
@@ -607,62 +609,65 @@ def test_largest_values_of_all_are_brysons_rule_and_of_some_are_on_its_scale(loo
         "qdot_m": 0.1,
     }
     efforts = {"tau_b": 100.0, "F_b": 100.0, "tau_m": 20.0}
-    found = fflin.lqr(lin, weights={"bryson": sizes | efforts})
-    Q, R = found.Q, found.R
+    result = fflin.lqr(lin, weights={"bryson": sizes | efforts})
+    Q, R = result.Q, result.R
     assert pytest.approx(fflin.bryson(lin, sizes), rel=1e-12) == Q.diagonal()
     assert pytest.approx(fflin.bryson(lin, efforts), rel=1e-12) == R.diagonal()
     assert np.count_nonzero(Q) == len(Q)
     # What the rule displaces the base by leaves the rule's own weight on it, on average.
-    own = np.sin(np.radians(15.0))
-    found = fflin.lqr(lin, weights={"bryson": {"q_b": own}})
-    R, rule = found.R, found.weights
+    values = np.sin(np.radians(15.0))
+    result = fflin.lqr(lin, weights={"bryson": {"q_b": values}})
+    R, rule = result.R, result.weights
     scale = R[0, 0] / gain.R[0, 0]
     assert scale * np.exp(np.log(gain.Q.diagonal()[:3]).mean()) == pytest.approx(
-        own**-2, rel=1e-9
+        values**-2, rel=1e-9
     )
     assert R == pytest.approx(scale * gain.R, rel=1e-12) and rule.endswith(
         "for this rule alone)"
     )
     # The tighter one is held, the more of every input it takes.
     norms = []
-    for size in (own, 0.1 * own, 0.01 * own):
-        found = fflin.lqr(lin, weights={"bryson": {"q_b": size}})
-        norms.append(np.linalg.norm(found.K[:, :3]))
+    for size in (values, 0.1 * values, 0.01 * values):
+        result = fflin.lqr(lin, weights={"bryson": {"q_b": size}})
+        norms.append(np.linalg.norm(result.K[:, :3]))
     assert norms[0] < norms[1] < norms[2]
 
 
 def test_a_given_weight_replaces_the_weight_of_the_rule(loops):
     _, lin, gain = loops("ets_vii")
-    own = {"q": {"q_b.x": 2.0 * gain.Q[0, 0]}}
-    found = fflin.lqr(lin, weights=own)
-    assert found.Q[0, 0] == 2.0 * gain.Q[0, 0] and (gain.R == found.R).all()
-    assert found.weights.startswith("q_b.x as given; all other weights: from")
+    values = {"q": {"q_b.x": 2.0 * gain.Q[0, 0]}}
+    result = fflin.lqr(lin, weights=values)
+    assert result.Q[0, 0] == 2.0 * gain.Q[0, 0] and (gain.R == result.R).all()
+    assert result.weights.startswith("q_b.x as given; all other weights: from")
     # As the robot's own weights, over which given ones take precedence, and which a rule replaces.
     robot = fflin.load("ets_vii").replace(
         weights={"q": {"q_b": 7.0}, "r": {"tau_b": 3.0}}
     )
     model = fflin.linearize(robot)
-    both = fflin.lqr(model, weights=own)
+    both = fflin.lqr(model, weights=values)
     assert (
-        both.Q[0, 0] == own["q"]["q_b.x"]
+        both.Q[0, 0] == values["q"]["q_b.x"]
         and both.Q[1, 1] == 7.0
         and both.R[0, 0] == 3.0
     )
-    alone = fflin.lqr(model, weights={"rule": "identity"} | own)
-    assert alone.Q.diagonal().tolist() == [own["q"]["q_b.x"], *[1.0] * (len(lin.A) - 1)]
-    for wrong, said in (
+    alone = fflin.lqr(model, weights={"rule": "identity"} | values)
+    assert alone.Q.diagonal().tolist() == [
+        values["q"]["q_b.x"],
+        *[1.0] * (len(lin.A) - 1),
+    ]
+    for wrong, message in (
         ({"Q": 1.0}, "'Q'"),
         ({"q": 1.0}, "q "),
         ({"rule": "none"}, "'none'"),
     ):
-        with pytest.raises(fflin.FflinError, match=said):
+        with pytest.raises(fflin.FflinError, match=message):
             fflin.lqr(lin, weights=wrong)
 
 
 def test_a_gain_says_which_thrusters_it_lets_pull():
     robot = fflin.load("cubesat", inputs=fflin.load_inputs("cubesat"))
     gain = fflin.lqr(fflin.linearize(robot))
-    thrusters = [each.name for each in robot.inputs if isinstance(each, fflin.Thruster)]
+    thrusters = [item.name for item in robot.inputs if isinstance(item, fflin.Thruster)]
     assert f"negative thrust ({', '.join(thrusters[:6])}" in cautions(gain)[-1]
     assert "warning: the gain commands negative thrust" in str(gain)
     assert not cautions(fflin.lqr(fflin.linearize(fflin.load("cubesat"))))

@@ -92,8 +92,8 @@ def test_the_area_rule_is_the_limit_of_small_loops():
     for e in (0.04, 0.02):
         circle = centre + e * (np.cos(phase) * a + np.sin(phase) * b)
         # The base turns by the joints on the way to the circle and back, in other axes.
-        there = np.linspace(centre, circle[0], 101)
-        loop = np.vstack((there, circle, there[::-1]))
+        path = np.linspace(centre, circle[0], 101)
+        loop = np.vstack((path, circle, path[::-1]))
         errors.append(np.abs(rotation_vector(base, loop) / e**2 - rule).max())
     assert errors[0] < 0.02 * np.abs(rule).max()
     assert errors[1] < 0.6 * errors[0]
@@ -133,10 +133,10 @@ def test_the_floating_base_moves_as_in_a_simulation():
         t = run.t[::every]
         base = FloatingBase(state, (q0, v0))
         R = base.rotations(t, joints[::every])
-        found = base.motion(t, joints[::every], rates[::every], R)
-        pairs = zip(q[::every], found[0], strict=True)
+        result = base.motion(t, joints[::every], rates[::every], R)
+        pairs = zip(q[::every], result[0], strict=True)
         gaps = [pin.difference(robot.model, *pair) for pair in pairs]
-        errors.append(max(np.abs(gaps).max(), np.abs(v[::every] - found[1]).max()))
+        errors.append(max(np.abs(gaps).max(), np.abs(v[::every] - result[1]).max()))
     assert errors[0] < 1e-2 and errors[1] < 0.3 * errors[0]
 
 

@@ -135,7 +135,7 @@ def swept(gain):
     most = np.pi / gain.dt if gain.dt else 1e3
     grid = np.geomspace(1e-6 * most, most, 600)
     sizes = np.linalg.norm(balance(gain, grid), 2, axis=(1, 2))
-    found = [(sizes[0], grid[0]), (sizes[-1], grid[-1])]
+    result = [(sizes[0], grid[0]), (sizes[-1], grid[-1])]
     inner = 1 + np.flatnonzero((sizes[1:-1] >= sizes[:-2]) & (sizes[1:-1] >= sizes[2:]))
     for at in sorted(inner, key=lambda at: -sizes[at])[:3]:
         peak = minimize_scalar(
@@ -143,8 +143,8 @@ def swept(gain):
             bounds=grid[[at - 1, at + 1]],
             method="bounded",
         )
-        found.append((-peak.fun, peak.x))
-    return max(found)
+        result.append((-peak.fun, peak.x))
+    return max(result)
 
 
 def beyond(gain, factors):

@@ -80,7 +80,7 @@ def test_schedules_and_allocations_run_on_another_robot():
 
 def test_an_allocation_weighs_with_the_masses_that_it_knows():
     cubesat = fflin.load("cubesat", inputs=fflin.load_inputs("cubesat"))
-    thrusters = [each for each in cubesat.inputs if isinstance(each, fflin.Thruster)][
+    thrusters = [item for item in cubesat.inputs if isinstance(item, fflin.Thruster)][
         :7
     ]
     robot = fflin.load("cubesat", inputs=thrusters)

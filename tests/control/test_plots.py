@@ -49,12 +49,12 @@ def test_margins_are_next_to_the_names(name):
     assert_legible(figure)
     *_, loops = input_loops(gain)
     legend = figure.legends[0]
-    for text, each, name in zip(
+    for text, item, name in zip(
         legend.get_texts(), loops, gain.input_names, strict=True
     ):
-        low, high = each.gain
+        low, high = item.gain
         assert (
-            text.get_text() == f"{name}: {each.phase:.0f} deg, {low:.2g} to {high:.3g}"
+            text.get_text() == f"{name}: {item.phase:.0f} deg, {low:.2g} to {high:.3g}"
         )
     colors = [line.get_color() for line in legend.get_lines()]
     assert len(set(colors)) == len(colors)

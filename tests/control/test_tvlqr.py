@@ -165,7 +165,7 @@ def test_inputs_that_soon_reach_less_are_solved_in_shorter_steps():
         return np.array((0.0 * S, S, 0.0 * S + 1e-6))
 
     times, values = solve_back(at, np.array([0.0, 1.0]), 1e3 * np.eye(1))
-    found = solve_ivp(
+    result = solve_ivp(
         lambda t, P: np.exp(12.0 * (1.0 - t)) * P * P - 1e-6,
         (1.0, 0.0),
         [1e3],
@@ -175,10 +175,11 @@ def test_inputs_that_soon_reach_less_are_solved_in_shorter_steps():
     )
     single = transitions(*(at(np.array([c])) for c in GAUSS), np.ones(1))[:, 0]
     assert (
-        np.abs(stepped_back(single, 1e3 * np.eye(1)) / found.y[0, -1] - 1.0).max() > 0.1
+        np.abs(stepped_back(single, 1e3 * np.eye(1)) / result.y[0, -1] - 1.0).max()
+        > 0.1
     )
     assert times[0] == 0.0
-    assert values[0, 0, 0] == pytest.approx(found.y[0, -1], rel=1e-5)
+    assert values[0, 0, 0] == pytest.approx(result.y[0, -1], rel=1e-5)
 
 
 def test_schedules_are_kept_and_bad_input_is_reported(moving, tmp_path):
@@ -415,16 +416,16 @@ def test_knots_need_not_be_close_for_the_motion_between_them():
     robot = fflin.load("planar_detumble")
     t, u = np.linspace(0.0, 1.0, 41), np.zeros((41, 9))
     u[:, 6:] = np.outer(np.sin(np.pi * t) ** 2, (4.0, -2.0, 1.0))
-    u = np.array([np.interp(t, t[::4], each) for each in u[::4].T]).T
+    u = np.array([np.interp(t, t[::4], item) for item in u[::4].T]).T
     run = fflin.simulate(
-        *(robot, lambda time, q, v: [np.interp(time, t, each) for each in u.T]),
+        *(robot, lambda time, q, v: [np.interp(time, t, item) for item in u.T]),
         v0=fflin.velocity(robot, {"omega_b.y": 0.3, "joint_1": 0.4, "joint_3": -0.5}),
         **{"duration": 1.0, "dt": 0.0125, "every": 2},
     )
     fine = fflin.linearize_trajectory(robot, t, run.q, run.v, u)
     coarse = fflin.linearize_trajectory(robot, t[::4], run.q[::4], run.v[::4], u[::4])
     Q, R = weights(fine)
-    all_, few = (fflin.tvlqr(each, Q, R, 1.0) for each in (fine, coarse))
+    all_, few = (fflin.tvlqr(item, Q, R, 1.0) for item in (fine, coarse))
     assert few.P[0] == pytest.approx(
         all_.P[0], rel=0.0, abs=1e-5 * np.abs(all_.P[0]).max()
     )

@@ -237,11 +237,11 @@ def test_the_speed_of_a_wheel_limits_the_loop(spin):
 
 
 @pytest.mark.parametrize(
-    "axis", [ORTHOGONAL[0], *exhaustive(*((each,) for each in ORTHOGONAL[1:]))]
+    "axis", [ORTHOGONAL[0], *exhaustive(*((item,) for item in ORTHOGONAL[1:]))]
 )
 def test_a_large_wheel_turns_against_the_rest_of_the_robot(axis):
     """Its speed per momentum is that of both, the carrier free: a fifth more than of it alone."""
-    added = [ReactionWheel(each, inertia=3e-3, max_speed=0.05) for each in ORTHOGONAL]
+    added = [ReactionWheel(item, inertia=3e-3, max_speed=0.05) for item in ORTHOGONAL]
     robot = fflin.load("cubesat").replace(inputs=added)
     lin = fflin.linearize(robot)
     gain = fflin.lqr(lin)
@@ -259,7 +259,7 @@ def test_a_large_wheel_turns_against_the_rest_of_the_robot(axis):
 
 @pytest.mark.parametrize("spin", [-1.0, 3.0])
 def test_a_wheel_that_is_at_its_limit_is_reported_and_quickens_nothing(spin):
-    added = [ReactionWheel(each, inertia=J, max_speed=1.0) for each in ORTHOGONAL]
+    added = [ReactionWheel(item, inertia=J, max_speed=1.0) for item in ORTHOGONAL]
     robot = body().replace(inputs=added)
     still = fflin.lqr(fflin.linearize(robot))
     spun = fflin.lqr(fflin.linearize(robot, v=fflin.velocity(robot, {"wheel_2": spin})))
@@ -393,9 +393,9 @@ def test_damping_of_wheels_is_reported_to_be_why_nothing_is_held():
         for weights in ((), (1.0, 1.0)):
             with pytest.raises(fflin.StabilizabilityError, match=words):
                 fflin.lqr(model, *weights)
-    with pytest.raises(fflin.StabilizabilityError) as told:
+    with pytest.raises(fflin.StabilizabilityError) as messages:
         fflin.lqr(fflin.linearize(wheeled(ORTHOGONAL[:1])))
-    assert "damping" not in str(told.value)
+    assert "damping" not in str(messages.value)
     helped = wheeled(ORTHOGONAL, others=[BaseTorque()]).replace(
         damping={"wheel_1": 1e-7}
     )
@@ -442,17 +442,17 @@ def test_a_filter_estimates_the_regulated_states():
     )
     lin = fflin.linearize(robot).discretize(0.1)
     gain = fflin.lqr(lin)
-    found = fflin.kalman(lin, {"wheel": 1e-4}, 1e-6, G=lin.B)
-    assert found.estimated == gain.regulated and found.residual < 1e-11
-    at = [lin.state_names.index(name) for name in found.estimated]
-    assert not np.delete(found.L, at, axis=0).any()
-    seen = [i for i, name in enumerate(lin.output_names) if found.L[:, i].any()]
+    result = fflin.kalman(lin, {"wheel": 1e-4}, 1e-6, G=lin.B)
+    assert result.estimated == gain.regulated and result.residual < 1e-11
+    at = [lin.state_names.index(name) for name in result.estimated]
+    assert not np.delete(result.L, at, axis=0).any()
+    seen = [i for i, name in enumerate(lin.output_names) if result.L[:, i].any()]
     assert len(seen) == 3  # the attitude, and neither position nor the wheels' speeds
-    loop = np.linalg.eigvals((lin.A - found.L @ lin.C)[np.ix_(at, at)])
+    loop = np.linalg.eigvals((lin.A - result.L @ lin.C)[np.ix_(at, at)])
     assert np.sort(np.abs(loop)) == pytest.approx(
-        np.sort(np.abs(found.poles)), abs=1e-9
+        np.sort(np.abs(result.poles)), abs=1e-9
     )
-    compensator = fflin.lqg(gain, found)
+    compensator = fflin.lqg(gain, result)
     assert compensator.state_names == gain.regulated and compensator.A.shape == (6, 6)
     q0 = fflin.configuration(
         robot, base=pin.SE3(pin.rpy.rpyToMatrix(0.3, 0.1, 0), np.ones(3))

@@ -39,11 +39,11 @@ def test_a_base_at_the_reference_has_the_values_of_every_expression(shape):
 def test_derivative_of_the_quaternion_kinematics_by_complex_step():
     rng = np.random.default_rng(1)
     q_b, w = np.array([0.3, -0.5, 0.2]), rng.normal(size=3)
-    found = tilted(q_b).rate_over_q_b(w, skew(w))
+    result = tilted(q_b).rate_over_q_b(w, skew(w))
     for k in range(3):
         eps = q_b + 1e-30j * np.eye(3)[k]
         rate = 0.5 * (np.sqrt(1.0 - eps @ eps) * w + np.cross(eps, w))
-        assert found[:, k] == pytest.approx(rate.imag / 1e-30, rel=1e-14)
+        assert result[:, k] == pytest.approx(rate.imag / 1e-30, rel=1e-14)
 
 
 def test_rows_are_rotated_in_place_and_back():

@@ -205,8 +205,8 @@ def test_mimic_joints_leave_one_degree_of_freedom(types, parent, tmp_path):
     for frame in ("hybrid", "local", "world"):
         v = S @ rng.normal(size=7)
         moving = fflin.linearize(robot, q, v, rng.normal(size=7), frame=frame)
-        found = fflin.check(robot, moving)
-        assert found.ok, found
+        result = fflin.check(robot, moving)
+        assert result.ok, result
         # Kinetic energy of the independent velocities is that of all.
         nu = moving.x0[7:]
         energy = pin.computeKineticEnergy(robot.model, robot.model.createData(), q, v)

@@ -178,13 +178,13 @@ def assert_derivatives(robot, q, v, a, *, gravity=GRAVITY, tolerance=1e-9):
         differences(lambda d: y(q, v + d, a), robot.nv),
         differences(lambda d: y(q, v, a + d), robot.nv),
     )
-    here = y(q, v, a)
-    for rows in np.arange(len(here)).reshape(-1, 3):
-        scale = max(np.abs(here[rows]).max(), 1.0)
+    value = y(q, v, a)
+    for rows in np.arange(len(value)).reshape(-1, 3):
+        scale = max(np.abs(value[rows]).max(), 1.0)
         if sensing.names[rows[0]] == "momentum.angular.x":
             # Summed in the world it is the difference of two that hold the linear momentum.
             scale += robot.mass * np.linalg.norm(v[:3])
-        assert np.abs(sensed.y[rows] - here[rows]).max() < 1e-12 * scale
+        assert np.abs(sensed.y[rows] - value[rows]).max() < 1e-12 * scale
         for got, difference in zip(sensed[1:], expected, strict=True):
             size = max(np.abs(difference[rows]).max(), scale)
             worst = np.abs(got[rows] - difference[rows]).max() / size
@@ -379,7 +379,7 @@ def test_orbit_loses_no_accuracy(name):
     sensing = Sensing(state, all_measured(robot))
     q, v, a = point(robot, rng)
     v[:3] = 0.0
-    here = sensing.evaluate(robot.create_data(), q, v, a)
+    value = sensing.evaluate(robot.create_data(), q, v, a)
     away, speed = rng.normal(size=(2, 3))
     away *= ORBIT / np.linalg.norm(away)
     speed *= SPEED / np.linalg.norm(speed)
@@ -398,9 +398,9 @@ def test_orbit_loses_no_accuracy(name):
     for row in range(0, len(sensing.names), 3):
         rows, kind = slice(row, row + 3), sensing.names[row].split(".")[-2]
         y, by_q, by_v = (
-            here.y[rows].copy(),
-            here.by_q[rows].copy(),
-            here.by_v[rows].copy(),
+            value.y[rows].copy(),
+            value.by_q[rows].copy(),
+            value.by_v[rows].copy(),
         )
         scale = 1.0
         relative = "/" in sensing.names[row]
@@ -412,7 +412,7 @@ def test_orbit_loses_no_accuracy(name):
             by_q[:, 3:6] -= drift[kind] * R @ skew(speed)
             scale = drift[kind] * SPEED
         elif kind == "acceleration":
-            by_v[:, 3:6] -= here.by_a[rows, :3] @ skew(speed)
+            by_v[:, 3:6] -= value.by_a[rows, :3] @ skew(speed)
             scale = SPEED
         assert (
             np.abs(far.y[rows] - y).max() < 1e-15 * scale * 4 + 1e-14 * np.abs(y).max()
@@ -426,18 +426,18 @@ def test_orbit_loses_no_accuracy(name):
             < 1e-15 * scale * 8 + tolerance
         )
         assert np.abs(far.by_v[rows, :6] - by_v[:, :6]).max() < 1e-15 * scale * 8
-        assert (far.by_a[rows] == here.by_a[rows]).all()
+        assert (far.by_a[rows] == value.by_a[rows]).all()
 
 
 def test_own_reference_is_the_base():
     robot = ROBOTS["dual_arm"]().replace(gravity=GRAVITY)
     q, v, a = point(robot, np.random.default_rng(8))
     base = pin.XYZQUATToSE3(q[:7])
-    own = Sensing(StateMap(robot), all_measured(robot), own_reference=True)
-    told = Sensing(StateMap(robot, reference=base), all_measured(robot))
+    default = Sensing(StateMap(robot), all_measured(robot), own_reference=True)
+    messages = Sensing(StateMap(robot, reference=base), all_measured(robot))
     pairs = zip(
-        own.evaluate(robot.create_data(), q, v, a),
-        told.evaluate(robot.create_data(), q, v, a),
+        default.evaluate(robot.create_data(), q, v, a),
+        messages.evaluate(robot.create_data(), q, v, a),
         strict=True,
     )
     for got, expected in pairs:

@@ -76,8 +76,8 @@ def test_rates_tell_the_turns_between_rows():
         for a in angles
     ]
     v = np.hstack((np.zeros((5, 6)), rates))
-    found = state_history(state, np.array(q), v, t=t)[:, state.groups.q_m]
-    np.testing.assert_allclose(found, angles, atol=1e-12)
+    result = state_history(state, np.array(q), v, t=t)[:, state.groups.q_m]
+    np.testing.assert_allclose(result, angles, atol=1e-12)
 
 
 def test_cf4_is_the_published_scheme():

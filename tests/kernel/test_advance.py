@@ -95,25 +95,25 @@ def advanced(plan, about=None, every=1, cuts=()):
 def both(plan, tolerance=1e-10):
     """Compare the kernel's loop with the loop in Python, whose mechanics are Pinocchio's."""
     plan = plan.replace(times=plan.times._replace(every=1))
-    expected, found = go(plan), advanced(plan)
+    expected, result = go(plan), advanced(plan)
     if expected.stopped.startswith("diverged"):
         # the end of a diverged run is not recorded
-        found = [rows[:-1] for rows in found]
+        result = [rows[:-1] for rows in result]
     names = ("q", "v", "u", "momentum", "center")
-    for name, value in zip(names, found, strict=True):
+    for name, value in zip(names, result, strict=True):
         other = getattr(expected, name)
         assert value.shape == other.shape, name
         size = np.maximum(1.0, np.abs(other).max(axis=0))
         # Thrusters with the same effect differ only in rows of 1e-7, which amplify rounding errors.
         limit = 1e-8 if name == "u" and tolerance > 1e-10 else tolerance
         assert (np.abs(value - other) <= limit * size).all(), name
-    return found, expected.stopped
+    return result, expected.stopped
 
 
 @pytest.mark.parametrize(
     "make",
     [
-        *(each for each in POLICIES if each is not followed_outputs),
+        *(item for item in POLICIES if item is not followed_outputs),
         *exhaustive(followed_outputs),
     ],
     ids=lambda make: make.__name__,
@@ -339,8 +339,8 @@ def diverged(lin):
 ENDS = [(left, "left the chart", 1e-10), (diverged, "diverged", 1e-6)]
 
 
-@pytest.mark.parametrize(("how", "said", "tolerance"), ENDS)
-def test_a_run_ends_at_the_same_step_as_in_the_python_engine(how, said, tolerance):
+@pytest.mark.parametrize(("how", "message", "tolerance"), ENDS)
+def test_a_run_ends_at_the_same_step_as_in_the_python_engine(how, message, tolerance):
     robot = plain(fflin.load("planar_detumble"))
     lin = fflin.linearize(robot)
     x0, gain = how(lin)
@@ -349,7 +349,7 @@ def test_a_run_ends_at_the_same_step_as_in_the_python_engine(how, said, toleranc
         within_chart=True
     )
     (q, *_), stopped = both(plan, tolerance)
-    assert stopped.startswith(said) and 3 < len(q) < 400
+    assert stopped.startswith(message) and 3 < len(q) < 400
 
 
 @pytest.mark.parametrize("sign", [1.0, *exhaustive(-1.0)])

@@ -330,11 +330,11 @@ def test_loops_that_are_compiled_agree_with_the_functions_of_numpy_that_they_rep
     }
     for function, arguments in given.items():
         ends = []
-        for each in (function, vec.IN_PLACE[function]):
+        for item in (function, vec.IN_PLACE[function]):
             copies = [
                 np.array(value) if np.ndim(value) else value for value in arguments
             ]
-            result = each(*copies)
+            result = item(*copies)
             ends.append(np.hstack([*copies, 0.0 if result is None else result]))
         assert ends[0] == pytest.approx(ends[1], abs=1e-14)
         assert (ends[0] != np.hstack([*arguments, 0.0])).any()

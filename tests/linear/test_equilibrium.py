@@ -29,11 +29,11 @@ def sprung(name, rng, **fields):
 def test_a_balanced_robot_is_at_a_fixed_point(name):
     rng = np.random.default_rng(1)
     robot, q = sprung(name, rng)
-    found = fflin.equilibrium(robot, q)
-    lin = fflin.linearize(robot, q, u=found.u)
+    result = fflin.equilibrium(robot, q)
+    lin = fflin.linearize(robot, q, u=result.u)
     assert not fflin.linearize(robot, q).is_equilibrium()
     # Balanced to the rounding of M^-1 times the forces.
-    assert np.abs(lin.f0).max() < 1e-11 * np.abs(np.linalg.solve(lin.M, found.u)).max()
+    assert np.abs(lin.f0).max() < 1e-11 * np.abs(np.linalg.solve(lin.M, result.u)).max()
     assert lin.is_equilibrium(1e-8)
     # With one force for each coordinate it is their negative: of a spring, K (q - rest).
     floating = robot.replace(gravity=(0, 0, 0))
@@ -151,11 +151,11 @@ def test_the_error_names_the_remaining_modes():
 
 def test_required_inputs_are_shown_with_units():
     robot = fflin.load("servicer_7dof", gravity=(0.0, 0.0, -9.81))
-    found = fflin.equilibrium(robot)
-    lines = str(found).splitlines()
+    result = fflin.equilibrium(robot)
+    lines = str(result).splitlines()
     assert lines[0].startswith("u: ") and max(map(len, lines)) <= 80
-    assert f"F_b.z = {9.81 * robot.mass:.6g} N" in str(found) and "tau_b.x" not in str(
-        found
+    assert f"F_b.z = {9.81 * robot.mass:.6g} N" in str(result) and "tau_b.x" not in str(
+        result
     )
     assert str(fflin.equilibrium(fflin.load("cubesat"))) == "u: all zero"
 
@@ -163,8 +163,8 @@ def test_required_inputs_are_shown_with_units():
 def test_nothing_to_balance_takes_nothing():
     """Exactly zero, also where no input could do anything, or rounding asks for something."""
     robot = fflin.load("ets_vii", inputs=[fflin.JointTorque("joint_1")])
-    found = fflin.equilibrium(robot)
-    assert found.u.shape == (1,) and not found.u.any() and not found.residual.any()
+    result = fflin.equilibrium(robot)
+    assert result.u.shape == (1,) and not result.u.any() and not result.residual.any()
     rest = dict.fromkeys(robot.joint_names, 0.3)
     sprung = robot.replace(stiffness=1e3, rest=rest)
     slightly = {joint: 0.1 + 0.2 for joint in rest}  # 0.30000000000000004
@@ -233,8 +233,8 @@ def test_passive_joints_sag_under_gravity(seed):
         robot.model.gravity.linear = np.zeros(3)
         soft = [robot.joint_names.index(name) for name in names]
         spring = 50.0 * tree.mass * at[soft]
-        there = [robot.joint(name).idx_v for name in names]
-        assert -spring == pytest.approx(pull[there], abs=1e-11 * np.abs(pull).max())
+        indices = [robot.joint(name).idx_v for name in names]
+        assert -spring == pytest.approx(pull[indices], abs=1e-11 * np.abs(pull).max())
         assert held.sag[soft] == pytest.approx(
             at[soft] - [joints[name] for name in names]
         )
@@ -311,9 +311,9 @@ def test_invalid_input_is_reported():
         fflin.equilibrium("cubesat")
     with pytest.raises(fflin.InputError, match="hybrid"):
         fflin.equilibrium(robot, frame="body")
-    found = fflin.equilibrium(robot)
-    assert found.force_names[:4] == ("tau_b.x", "tau_b.y", "tau_b.z", "F_b.x")
+    result = fflin.equilibrium(robot)
+    assert result.force_names[:4] == ("tau_b.x", "tau_b.y", "tau_b.z", "F_b.x")
     with pytest.raises(FrozenInstanceError):
-        found.u = 0
+        result.u = 0
     with pytest.raises(ValueError, match="read-only"):
-        found.u[0] = 1.0
+        result.u[0] = 1.0

@@ -70,7 +70,7 @@ def test_round_trip_is_the_identity(name, case):
         # velocities changes by M's condition.
         least = max(1e-13, 0.1 * np.finfo(float).eps * scaled_condition(lin.M))
         # Other matrices than fflin's, by T alone; inputs are held, so that those of B count in A.
-        X, Y = (rng.normal(size=each.shape) for each in (lin.A, lin.B))
+        X, Y = (rng.normal(size=item.shape) for item in (lin.A, lin.B))
         still = fflin.linearize(robot, q, v, **how)
         m = still.to(tool)
         A, B = m.A + m.T @ X @ m.T_left, m.B + m.T @ Y @ np.linalg.inv(m.T_u)
@@ -354,8 +354,8 @@ def test_inputs_and_joints_stand_in_the_tools_order():
     # Siblings as the file has them, panels first; by name in Pinocchio.
     order = ("panel_left", "panel_right", *robot.joint_names[:7])
     for tool in TOOLS:
-        m, own = lin.to(tool), robot.joint_names
-        names = own if tool[:3] in ("pin", "cro", "eul") else order
+        m, joint_names = lin.to(tool), robot.joint_names
+        names = joint_names if tool[:3] in ("pin", "cro", "eul") else order
         assert tuple(m.input_names[6:]) == tuple(f"tau_m.{name}" for name in names)
         joints = [name[4:] for name in m.state_names if name.startswith("q_m.")]
         assert (

@@ -83,11 +83,11 @@ def test_wheels_gain_the_reported_momentum():
     across = 2.0 * np.hypot(torque[0], torque[2]) / n
     assert abs(gained[1, -1]) == pytest.approx(abs(torque[1]) * period, rel=2e-2)
     assert np.hypot(gained[0], gained[2]).max() == pytest.approx(across, rel=2e-2)
-    said = [
+    message = [
         f"gain {abs(torque[1]) * period:.3g} N m s per orbit",
         f"up to {across:.3g} N m s",
     ]
-    assert says(" ".join(motion.notes), *said) and says(str(gain), *said)
+    assert says(" ".join(motion.notes), *message) and says(str(gain), *message)
 
 
 def test_an_equilibrium_needs_no_other_inputs():
@@ -146,6 +146,6 @@ def test_forces_below_the_tolerance_of_an_equilibrium_are_no_reason_to_refuse():
     for number in (0, 5, 13):
         place = fflin.relative_equilibria(robot)[number]
         reference = pin.XYZQUATToSE3(place.q[:7])
-        found = fflin.equilibrium(robot, place.q, reference=reference)
-        lin = fflin.linearize(robot, found.q, u=found.u, reference=reference)
+        result = fflin.equilibrium(robot, place.q, reference=reference)
+        lin = fflin.linearize(robot, result.q, u=result.u, reference=reference)
         assert lin.is_equilibrium()

@@ -180,9 +180,9 @@ def test_check_holds_at_random_points(robots, name, frame):
         for reference in (None, pin.SE3.Identity()):
             q, v, u = random_point(robot, rng, degrees=degrees)
             lin = fflin.linearize(robot, q, v, u, frame=frame, reference=reference)
-            found = fflin.check(robot, lin)
-            assert found.ok, found
-            aba = [row for row in found.rows if row.test == "ABA derivatives"]
+            result = fflin.check(robot, lin)
+            assert result.ok, result
+            aba = [row for row in result.rows if row.test == "ABA derivatives"]
             assert len(aba) == 54 - 6 * (robot.n == 0)
             assert max(row.error for row in aba) < 1e-9
 
@@ -198,8 +198,8 @@ def test_check_holds_on_random_trees(frame):
             frame=frame,
             reference=random_pose(rng, 20.0),
         )
-        found = fflin.check(robot, lin)
-        assert found.ok, found
+        result = fflin.check(robot, lin)
+        assert result.ok, result
 
 
 def test_armature_is_part_of_the_inertia():
@@ -263,10 +263,10 @@ def test_linearizer_is_shared_copied_and_pickled():
     sys.setswitchinterval(1e-6)
     try:
         with ThreadPoolExecutor(4) as pool:
-            found = list(pool.map(lambda point: linearizer(*point), points * 5))
+            result = list(pool.map(lambda point: linearizer(*point), points * 5))
     finally:
         sys.setswitchinterval(interval)
-    for lin, right in zip(found, expected * 5, strict=True):
+    for lin, right in zip(result, expected * 5, strict=True):
         assert (lin.A == right.A).all() and (lin.B == right.B).all()
 
 

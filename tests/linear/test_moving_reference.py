@@ -18,8 +18,8 @@ def test_check_holds_at_random_points(name):
         flying = robot.replace(gravity=gravity)
         lin = fflin.linearize(flying, q, v, u, moving=True)
         assert lin.moving and lin.frame == "local" and not lin.f0.any()
-        found = fflin.check(flying, lin)
-        assert found.ok, found
+        result = fflin.check(flying, lin)
+        assert result.ok, result
 
 
 def test_kinematics_match_a_turning_reference():

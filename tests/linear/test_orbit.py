@@ -84,8 +84,8 @@ def test_every_route_agrees_at_any_point(name, frame):
         lin = fflin.linearize(
             robot, *moved(robot, rng, speed), frame=frame, reference=reference
         )
-        found = fflin.check(robot, lin)
-        assert found.ok, found
+        result = fflin.check(robot, lin)
+        assert result.ok, result
 
 
 def test_and_with_springs_wheels_thrusters_and_sensors():
@@ -109,8 +109,8 @@ def test_and_with_springs_wheels_thrusters_and_sensors():
     )
     for frame in ("hill", "lvlh"):
         lin = fflin.linearize(robot, *moved(robot, rng), frame=frame)
-        found = fflin.check(robot, lin)
-        assert found.ok, found
+        result = fflin.check(robot, lin)
+        assert result.ok, result
     # A gyroscope tells absolute rates; velocities of frames are relative.
     still = fflin.linearize(
         robot.replace(outputs=[fflin.Gyroscope("base"), fflin.FrameVelocity("base")])
@@ -148,8 +148,8 @@ def test_a_root_that_stands_askew_in_the_world_changes_nothing():
 def test_a_base_that_flies_fast_is_seen_from_the_frame_that_turns():
     robot = in_orbit(fflin.load("cubesat"))
     v = fflin.velocity(robot, {"v_b.x": 150.0, "omega_b.y": 0.1})
-    found = fflin.check(robot, fflin.linearize(robot, v=v))
-    assert found.ok, found
+    result = fflin.check(robot, fflin.linearize(robot, v=v))
+    assert result.ok, result
 
 
 def test_a_weak_field_is_one_too():

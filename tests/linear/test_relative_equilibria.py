@@ -20,9 +20,9 @@ BODIES = (
 )
 
 
-def matched(found, expected):
+def matched(result, expected):
     """The largest distance of poles to those that are expected, one to one."""
-    left, worst = list(found), 0.0
+    left, worst = list(result), 0.0
     assert len(left) == len(expected)
     for pole in expected:
         nearest = min(left, key=lambda other: abs(other - pole))
@@ -42,9 +42,9 @@ def matched(found, expected):
 def test_libration_has_the_poles_of_textbooks(n, frame):
     for moments in BODIES:
         robot = in_orbit(free_body(moments), n)
-        found = fflin.relative_equilibria(robot, frame=frame)
-        assert len(found) == 24
-        for one in found:
+        result = fflin.relative_equilibria(robot, frame=frame)
+        assert len(result) == 24
+        for one in result:
             radial, along, normal = one.moments
             pitch = n * np.emath.sqrt(3.0 * (radial - along) / normal)
             k_a, k_r = (normal - radial) / along, (normal - along) / radial

@@ -63,8 +63,8 @@ def frequencies(lin):
 )
 def test_a_clamped_beam_on_a_hub_has_the_frequencies_of_the_free_beam(hub, expected):
     robot = hub_with_rod(*hub, 1.0, 1.0).replace(appendages=[beam(1.0, 1.0, 1.0, 8)])
-    found = np.sqrt(frequencies(fflin.linearize(robot)))
-    assert found[:2] == pytest.approx(expected, abs=6e-5 if hub[0] < 1.0 else 6e-6)
+    result = np.sqrt(frequencies(fflin.linearize(robot)))
+    assert result[:2] == pytest.approx(expected, abs=6e-5 if hub[0] < 1.0 else 6e-6)
 
 
 def test_effective_masses_of_a_beam_are_the_published_fractions():
@@ -128,7 +128,7 @@ def postures(robot, rigid, seed):
     rng = np.random.default_rng(seed)
     joints = dict(zip(rigid.joint_names, rng.uniform(-1.0, 1.0, rigid.n), strict=True))
     turn = pin.SE3(pin.rpy.rpyToMatrix(*rng.normal(size=3)), rng.normal(size=3))
-    return [fflin.configuration(each, joints, turn) for each in (robot, rigid)]
+    return [fflin.configuration(item, joints, turn) for item in (robot, rigid)]
 
 
 def participation(rigid, appendage, q):
@@ -156,8 +156,8 @@ def test_the_mass_matrix_is_the_rigid_one_bordered_by_the_participation(seed):
         new = [6 + robot.joint_names.index(name) for name in appendage.modes]
         expected[np.ix_(old, new)] = participation(rigid, appendage, q_rigid)
         expected[np.ix_(new, old)] = expected[np.ix_(old, new)].T
-    found = symmetric(robot, q)
-    assert np.abs(found - expected).max() < 1e-12 * np.abs(expected).max()
+    result = symmetric(robot, q)
+    assert np.abs(result - expected).max() < 1e-12 * np.abs(expected).max()
     assert robot.mass == pytest.approx(rigid.mass, rel=1e-14)
 
 
@@ -268,8 +268,8 @@ def test_pendulum_under_thrust_swings_with_the_reduced_mass():
     )
     lin = fflin.linearize(robot, u=fflin.effort(robot, {"F_b.z": thrust}), moving=True)
     expected = math.sqrt(thrust / (m0 + m1) / length * (m0 + m1) / m0)
-    found = frequencies(lin)
-    assert found == pytest.approx([expected], rel=1e-6)
+    result = frequencies(lin)
+    assert result == pytest.approx([expected], rel=1e-6)
 
 
 def test_springs_of_a_tank_match_its_frequency():

@@ -40,8 +40,10 @@ CHANGES = [
 ]
 
 
-@pytest.mark.parametrize(("change", "said"), CHANGES)
-def test_a_changed_model_is_refused_wherever_results_are_made(change, said, tmp_path):
+@pytest.mark.parametrize(("change", "message"), CHANGES)
+def test_a_changed_model_is_refused_wherever_results_are_made(
+    change, message, tmp_path
+):
     robot = fflin.load("ets_vii")
     linearizer = fflin.Linearizer(robot)
     before = linearizer()
@@ -61,7 +63,7 @@ def test_a_changed_model_is_refused_wherever_results_are_made(change, said, tmp_
         lambda: fflin.validity(robot, before, gain, samples=1),
         lambda: robot.replace(damping=1.0),
     ):
-        with pytest.raises(fflin.ModelError, match=f"{said}.*from_model"):
+        with pytest.raises(fflin.ModelError, match=f"{message}.*from_model"):
             result()
     assert not list(tmp_path.iterdir())
 
@@ -96,9 +98,9 @@ def test_objects_made_from_a_model_keep_the_robot():
         replace(lin, u0=lin.u0 + 1.0),
     ]
     heavier(robot.model)
-    for each in made:
+    for item in made:
         with pytest.raises(fflin.ModelError, match=r"inertia .*'joint_1'"):
-            each.to_scipy()
+            item.to_scipy()
 
 
 def test_a_replaced_robot_keeps_its_cached_results():

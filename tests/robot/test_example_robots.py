@@ -38,13 +38,13 @@ def test_check_holds(name):
         return
     robot = fflin.load(name)
     assert robot.n == robot.model.nv - 6 - len(robot.followers)
-    found = fflin.check(robot, fflin.linearize(robot))
-    assert found.ok, found
+    result = fflin.check(robot, fflin.linearize(robot))
+    assert result.ok, result
     rng = np.random.default_rng(1)
     for frame in FRAMES:
         point = random_point(robot, rng, degrees=160.0)
-        found = fflin.check(robot, fflin.linearize(robot, *point, frame=frame))
-        assert found.ok, found
+        result = fflin.check(robot, fflin.linearize(robot, *point, frame=frame))
+        assert result.ok, result
 
 
 def test_an_inertia_that_is_negative_only_by_rounding_is_accepted():
@@ -52,7 +52,7 @@ def test_an_inertia_that_is_negative_only_by_rounding_is_accepted():
     link = robot.links["r_hip_2"]
     assert -1e-18 < np.linalg.eigvalsh(link.inertia)[0] < 0.0 < link.mass
     assert sum(
-        each.mass for each in robot.pieces.values() if not each.whole
+        item.mass for item in robot.pieces.values() if not item.whole
     ) == pytest.approx(robot.mass)
     model = fflin.uncertain(robot, {"base.mass": 0.1})
     assert model.names == ("base.mass",)

@@ -119,8 +119,8 @@ def test_thrusters_of_cubesat_push_and_turn_every_way():
         (*least, *least), (*np.eye(6), *-np.eye(6)), strict=True
     ):
         # thrusts of 0 or more
-        found = linprog(np.ones(12), A_eq=wrenches, b_eq=direction)
-        assert found.success and found.fun == pytest.approx(total, rel=1e-9)
+        result = linprog(np.ones(12), A_eq=wrenches, b_eq=direction)
+        assert result.success and result.fun == pytest.approx(total, rel=1e-9)
     # All at once cancel, so that every thrust can be raised by the same amount.
     np.testing.assert_allclose(wrenches @ np.ones(12), 0.0, atol=1e-15)
 

@@ -121,7 +121,7 @@ def test_perturbed_bodies_are_rigid_bodies_within_the_spread(name):
                 continue
             assert abs(after.mass / before.mass - 1.0) <= 0.3
             was, now = (
-                np.linalg.eigvalsh(pseudo_inertia(each)) for each in (before, after)
+                np.linalg.eigvalsh(pseudo_inertia(item)) for item in (before, after)
             )
             # Consistent where it was, beyond rounding.
             if was[0] >= -1e-12 * was[-1]:
@@ -220,7 +220,7 @@ def test_results_of_the_one_are_not_taken_for_the_others(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("given", "said"),
+    ("given", "message"),
     [
         ({"joint_9": {"mass": 1.0}}, "'joint_9'"),
         ({"base": {"mass": 0.0}}, "mass .*0 kg"),
@@ -243,14 +243,14 @@ def test_results_of_the_one_are_not_taken_for_the_others(tmp_path):
         (3, "bodies"),
     ],
 )
-def test_an_invalid_body_is_refused_in_one_line(given, said):
-    with pytest.raises(fflin.FflinError, match=said) as caught:
+def test_an_invalid_body_is_refused_in_one_line(given, message):
+    with pytest.raises(fflin.FflinError, match=message) as caught:
         fflin.load("ets_vii").with_mass_properties(given)
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
-    ("given", "said"),
+    ("given", "message"),
     [
         ({"mass": 1.0}, "mass"),
         ({"com": -0.1}, "-0.1"),
@@ -258,8 +258,8 @@ def test_an_invalid_body_is_refused_in_one_line(given, said):
         ({"seed": 0.5}, "seed"),
     ],
 )
-def test_invalid_spreads_are_refused(given, said):
-    with pytest.raises(fflin.InputError, match=said):
+def test_invalid_spreads_are_refused(given, message):
+    with pytest.raises(fflin.InputError, match=message):
         fflin.load("ets_vii").perturbed(**given)
 
 

@@ -77,7 +77,7 @@ def written(tmp_path):
 
 def test_a_robot_file_is_equivalent_to_the_arguments_of_load(written):
     robot = fflin.load(written(WHOLE))
-    told = fflin.load(
+    messages = fflin.load(
         "servicer_7dof",
         lock={"joint_7": 0.5},
         passive=["panel_left", "panel_right"],
@@ -102,7 +102,7 @@ def test_a_robot_file_is_equivalent_to_the_arguments_of_load(written):
             "bryson": {"tau_b": 2.0, "qdot_m.rw": 10.0},
         },
     )
-    assert robot.name == "sat" and robot.urdf == told.urdf
+    assert robot.name == "sat" and robot.urdf == messages.urdf
     for key in (
         *(
             "urdf_sha256",
@@ -116,8 +116,8 @@ def test_a_robot_file_is_equivalent_to_the_arguments_of_load(written):
         ),
         *("gravity", "weights", "passive", "wheels"),
     ):
-        assert getattr(robot, key) == getattr(told, key), key
-    assert robot.model == told.model
+        assert getattr(robot, key) == getattr(messages, key), key
+    assert robot.model == messages.model
     assert robot.passive == ("panel_left", "panel_right")
     assert robot.start == {
         "joints": {"joint_2": 0.4, "panel_left": 0.05, "panel_right": 0.05},
@@ -405,4 +405,4 @@ def test_the_draft_and_the_guide_have_every_key():
     assert sorted(described) == sorted(KEYS)
     for name in KEYS:
         written = (f"[[{name}]]", f"[{name}]", f"{name} = ", f"${name}")
-        assert any(each in draft for each in written), name
+        assert any(item in draft for item in written), name

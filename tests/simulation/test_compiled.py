@@ -52,10 +52,10 @@ def both(robot, policy=None, tolerance=1e-10, rounding=2e-14, **options):
     assert (python.engine, motion.engine) == ENGINES
     assert motion.stopped == python.stopped
     for name in ("t", "q", "v", "x", "u", "energy", "momentum"):
-        expected, found = getattr(python, name), getattr(motion, name)
-        assert found.shape == expected.shape, name
+        expected, result = getattr(python, name), getattr(motion, name)
+        assert result.shape == expected.shape, name
         size = np.maximum(1.0, np.abs(expected).max(axis=0))
-        assert (np.abs(found - expected) <= tolerance * size).all(), name
+        assert (np.abs(result - expected) <= tolerance * size).all(), name
     if options.get("project", True):
         assert (
             motion.momentum_drift.max() <= rounding + 2.0 * python.momentum_drift.max()
@@ -294,11 +294,11 @@ def test_recorded_rows_do_not_depend_on_the_slices(robots, monkeypatch, every, m
     counted = lambda *names: lambda *a: [calls.append(a), kernel(*names)(*a)]  # noqa: E731
     monkeypatch.setattr(lanes, "kernel", counted)
     monkeypatch.setattr(lanes, "_MEMORY", memory)
-    found = fflin.simulate(robot, policy, **options, every=every, engine="compiled")
+    result = fflin.simulate(robot, policy, **options, every=every, engine="compiled")
     chosen = np.append(np.arange(0, 100, every), 100)
     for name in ("t", "q", "v", "u"):
         np.testing.assert_array_equal(
-            getattr(found, name), getattr(motion, name)[chosen]
+            getattr(result, name), getattr(motion, name)[chosen]
         )
     # Each call fills its memory: one row, or all rows of the run.
     assert len(calls) == (-(-100 // every) if memory == 1 else 1)
@@ -374,19 +374,19 @@ def test_eight_lanes_are_eight_runs(robots):
             model.inertias[joint] = pin.Inertia.FromDynamicParameters(
                 mass * model.inertias[joint].toDynamicParameters()
             )
-        own = fflin.from_model(model, inputs=robot.inputs)
+        copy = fflin.from_model(model, inputs=robot.inputs)
         options = {
             "x0": share * displaced(lin),
             "duration": 2.0,
             "dt": 0.01,
             "linear": False,
         }
-        plan = Plan(SimulationOptions(robot=own, policy=policy, **options))
+        plan = Plan(SimulationOptions(robot=copy, policy=policy, **options))
         plant = plan.plant
         faults = plant.faults._replace(gain=np.full(len(plant.faults.gain), gain))
         plans.append(plan.replace(plant=Plant(plant.state, faults=faults)))
         start = {"q": plan.q, "nu": plant.state.velocities(plan.v)}
-        runs.append(start | {"bodies": batch_tree(own).bodies} | faults._asdict())
+        runs.append(start | {"bodies": batch_tree(copy).bodies} | faults._asdict())
     together, kept = lanes.LaneLoop(plans[0]), Kept()
     out = {"end": np.empty(8)}
     together.fly(
@@ -436,13 +436,13 @@ def test_a_command_that_is_not_a_number_is_refused(robots):
     policy = fflin.StateFeedback(lin, np.full(lin.B.shape[::-1], 1e308))
     x0 = displaced(lin, offset=100.0)
     options = {"x0": x0, "sample": 0.01, "duration": 0.1, "linear": False}
-    said = []
+    message = []
     for engine in ENGINES:
         with np.errstate(over="ignore"), pytest.raises(fflin.InputError) as caught:
             fflin.simulate(robot, policy, **options, engine=engine)
-        said.append(str(caught.value))
-    assert said[0] == said[1]
-    assert "tau_b.x" in said[0]
+        message.append(str(caught.value))
+    assert message[0] == message[1]
+    assert "tau_b.x" in message[0]
 
 
 def test_a_long_run_in_python_estimates_the_duration_of_the_compiled_loop(

@@ -163,9 +163,9 @@ def test_the_line_is_kept_where_everything_acts_and_the_order_too(frame, options
     # An independent reference: the bare method at a step fine enough.
     exact = motion(0.0025, False)
 
-    def error(found):
-        apart = pin.difference(robot.model, exact.q[-1], found.q[-1])
-        return np.linalg.norm(np.r_[apart, found.v[-1] - exact.v[-1]])
+    def error(result):
+        apart = pin.difference(robot.model, exact.q[-1], result.q[-1])
+        return np.linalg.norm(np.r_[apart, result.v[-1] - exact.v[-1]])
 
     assert math.log2(error(kept) / error(motion(0.0125))) == pytest.approx(4.0, abs=0.4)
     assert error(kept) < 2.0 * error(motion(0.025, False))

@@ -40,7 +40,7 @@ def test_a_robot_that_nothing_drives_is_predicted():
 def test_a_feedback_of_a_part_is_predicted_by_the_whole_model():
     robot = fflin.load("servicer_7dof")
     robot = robot.replace(
-        inputs=[each for each in robot.inputs if hasattr(each, "joint")]
+        inputs=[item for item in robot.inputs if hasattr(item, "joint")]
     )
     lin = fflin.linearize(robot)
     part = fflin.momentum_reduction(lin)
@@ -60,10 +60,10 @@ def test_a_model_about_another_point_predicts_with_the_policys_law():
     q = fflin.configuration(robot, {"joint_1": 1e-3})
     beside = fflin.linearize(robot, q)
     policy, x0 = fflin.StateFeedback(lin, gain.K), displaced(lin, 0.05, 1e-3, 1e-3)
-    here = fflin.simulate(robot, policy, x0=x0, duration=10.0)
-    there = fflin.simulate(robot, policy, x0=x0, duration=10.0, linear=beside)
-    assert np.abs(there.linear - there.x).max() < 1e-5
-    np.testing.assert_allclose(there.linear[-1], here.linear[-1], atol=1e-5)
+    point = fflin.simulate(robot, policy, x0=x0, duration=10.0)
+    motion = fflin.simulate(robot, policy, x0=x0, duration=10.0, linear=beside)
+    assert np.abs(motion.linear - motion.x).max() < 1e-5
+    np.testing.assert_allclose(motion.linear[-1], point.linear[-1], atol=1e-5)
 
 
 def test_where_nothing_can_be_predicted_the_reason_is_reported():
@@ -137,9 +137,9 @@ def test_the_motion_of_a_linear_loop_matches_its_single_steps(steps, every):
     for _ in range(steps):
         expected.append(A @ expected[-1] + f0)
     rows = [*expected[:-1:every], expected[-1]]
-    found = _affine_motion(A, f0, e, steps, every)
+    result = _affine_motion(A, f0, e, steps, every)
     # Each of 100 steps adds a rounding error of a few EPS, and none grows.
-    assert np.abs(found - rows).max() < 1e-12 * np.abs(rows).max()
+    assert np.abs(result - rows).max() < 1e-12 * np.abs(rows).max()
 
 
 def test_a_prediction_survives_powers_that_overflow():

@@ -163,8 +163,8 @@ def pushed_by(*inputs, policy=True):
 @pytest.mark.exhaustive
 def test_where_no_input_pushes_the_base_its_position_is_not_judged():
     motion = pushed_by(fflin.BaseTorque())
-    said = " ".join(motion_report(motion).split("cubesat:")[0].split())
-    assert said.startswith("settled") and says(said, "position")
+    message = " ".join(motion_report(motion).split("cubesat:")[0].split())
+    assert message.startswith("settled") and says(message, "position")
     # In the headline, and in the rows of position and v_b.
     assert " ".join(motion_report(motion).split()).count("not controlled") == 3
     # Nor is it judged if the law does not feed it back, whatever pushes the base.
@@ -195,9 +195,9 @@ def test_a_base_that_no_force_pushes_is_off_its_target_by_a_figure():
     x0 = np.zeros(len(lin.x0))
     x0[3] = 1.0
     policy = fflin.StateFeedback(lin, fflin.lqr(lin).K)
-    said = motion_report(fflin.simulate(robot, policy, x0=x0, duration=1.0))
+    message = motion_report(fflin.simulate(robot, policy, x0=x0, duration=1.0))
     assert says(
-        said, "settled: attitude at the target", "not controlled: position 1 m;"
+        message, "settled: attitude at the target", "not controlled: position 1 m;"
     )
 
 
@@ -221,9 +221,9 @@ def test_states_that_no_policy_controls_are_distinguished():
     motion = course(lambda t: np.exp(-t), steered=steered)
     x = motion.x.copy()
     x[:, 0] = np.sin(np.radians(15.0))
-    said = first(replace(motion, x=x))
-    assert said.startswith("settled") and says(
-        said, "3.92 s", "not controlled: attitude 30 deg"
+    message = first(replace(motion, x=x))
+    assert message.startswith("settled") and says(
+        message, "3.92 s", "not controlled: attitude 30 deg"
     )
 
 
@@ -243,11 +243,11 @@ def test_inputs_at_their_limits_all_along_are_named():
     names = motion.input_names[:5]
     limits = np.array([[-3.0, 3.0], [-3.0, 3.0], [-3.0, 3.0], [0.0, 3.0], [0.0, 0.0]])
     motion = replace(motion, u=u, limit_names=names, limits=limits)
-    said = motion_report(motion)
-    assert says(said, "3.92 s", "tau_b.x (100 %), tau_b.y (100 %), tau_b.z (80 %)")
-    assert says(said, "tau_b.y", "-3 N m", "100 %")
-    assert says(said, "tau_b.z", "3 N m", "80 %")
-    assert "F_b" not in said
+    message = motion_report(motion)
+    assert says(message, "3.92 s", "tau_b.x (100 %), tau_b.y (100 %), tau_b.z (80 %)")
+    assert says(message, "tau_b.y", "-3 N m", "100 %")
+    assert says(message, "tau_b.z", "3 N m", "80 %")
+    assert "F_b" not in message
 
 
 def test_an_input_that_goes_from_limit_to_limit_is_at_its_limit_all_along():
@@ -256,8 +256,8 @@ def test_an_input_that_goes_from_limit_to_limit_is_at_its_limit_all_along():
     u[:, 0], u[:1000, 1] = -3.0, 2.0  # all of the run, and half of it
     u[:1000, 0] = 3.0  # at the one limit or at the other
     names, limits = ("tau_b.x", "tau_b.y"), np.array([[-3.0, 3.0], [-2.0, 2.0]])
-    said = first(replace(motion, u=u, limit_names=names, limits=limits))
-    assert says(said, "not settled", "2.7 deg", "tau_b.x")
+    message = first(replace(motion, u=u, limit_names=names, limits=limits))
+    assert says(message, "not settled", "2.7 deg", "tau_b.x")
 
 
 @pytest.mark.parametrize(
@@ -276,8 +276,8 @@ def test_an_input_that_goes_from_limit_to_limit_is_at_its_limit_all_along():
 def test_the_command_says_it_first_and_unsettled_is_not_a_failure(
     options, code, begins
 ):
-    found, out, _ = run("simulate", "planar_detumble", "--duration", 2, *options)
-    assert found == code
+    result, out, _ = run("simulate", "planar_detumble", "--duration", 2, *options)
+    assert result == code
     assert out.splitlines()[0].startswith(begins)
     assert max(map(len, out.splitlines())) <= 80
 
@@ -314,7 +314,7 @@ def test_a_wheel_at_its_largest_speed_is_reported_and_its_angle_is_not_a_differe
     motion = fflin.simulate(
         robot, policy, q0=q0, duration=60.0, limits="urdf", linear=lin
     )
-    (full,) = [each for each in motion.saturated if each.name == "qdot_m.a"]
+    (full,) = [item for item in motion.saturated if item.name == "qdot_m.a"]
     speed = np.abs(motion.x[:, motion.state_names.index("qdot_m.a")])
     share = (
         np.diff(motion.t, append=motion.t[-1:])[speed >= 60.0 * (1.0 - 1e-3)].sum()
@@ -414,7 +414,7 @@ def test_thrusters_without_pulses_saturate():
     motion = fflin.simulate(
         robot, lambda t, q, v: [0, 0, 0, 9.0], duration=1.0, limits="urdf"
     )
-    assert [each.name for each in motion.saturated] == ["jet"]
+    assert [item.name for item in motion.saturated] == ["jet"]
     assert says(
         motion_report(motion), "impulse 1 N s"
     ) and "pulses" not in motion_report(motion)

@@ -41,8 +41,8 @@ def test_sampled_loops_settle_when_their_continuous_ones_do():
     sampled = lin.discretize(0.25)
     q = fflin.configuration(robot, {"joint_2": 0.3})
     one, two = (
-        time_to_settle(robot, fflin.StateFeedback(each, fflin.lqr(each).K), q, None)
-        for each in (lin, sampled)
+        time_to_settle(robot, fflin.StateFeedback(item, fflin.lqr(item).K), q, None)
+        for item in (lin, sampled)
     )
     assert abs(one - two) <= 20.0
 
@@ -69,9 +69,9 @@ def test_which_thrusters_give_every_wrench():
     )
     assert not thrusters_give_every_wrench(fflin.load("cubesat"))
     fewer = [
-        each
-        for each in inspector.inputs
-        if getattr(each, "name", "") != "top_left_front"
+        item
+        for item in inspector.inputs
+        if getattr(item, "name", "") != "top_left_front"
     ]
     assert not thrusters_give_every_wrench(inspector.replace(inputs=fewer))
     helped = [*fewer, fflin.BaseTorque(), fflin.BaseForce()]

@@ -433,7 +433,7 @@ def test_csv_has_names_and_rows(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "message"),
     [
         ({"duration": -1.0}, "duration"),
         ({"duration": 1.0, "dt": 0.0}, "dt"),
@@ -455,11 +455,11 @@ def test_csv_has_names_and_rows(tmp_path):
         ({"duration": 1.0, "frame": "base"}, "frame"),
     ],
 )
-def test_invalid_input_is_one_clear_line(options, said):
+def test_invalid_input_is_one_clear_line(options, message):
     robot = fflin.load("ets_vii")
     with pytest.raises(fflin.FflinError, match=r"\w") as caught:
         fflin.simulate(robot, **options)
-    assert said in str(caught.value)
+    assert message in str(caught.value)
     assert "\n" not in str(caught.value)
 
 

@@ -40,7 +40,7 @@ def after_half_a_second(value):
 
 @pytest.mark.parametrize("sample", [None, 0.1])
 @pytest.mark.parametrize(
-    ("policy", "said"),
+    ("policy", "message"),
     [
         (after_half_a_second(math.nan), "tau_b.x"),
         (after_half_a_second(math.inf), "tau_b.x"),
@@ -51,11 +51,11 @@ def after_half_a_second(value):
         (lambda t, q, v: np.zeros((6, 1)), "(6, 1)"),
     ],
 )
-def test_a_policy_that_gives_no_inputs_is_refused(policy, said, sample):
+def test_a_policy_that_gives_no_inputs_is_refused(policy, message, sample):
     robot = free_body((20.0, 30.0, 40.0))
     with pytest.raises(fflin.InputError) as caught:
         fflin.simulate(robot, policy, duration=1.0, sample=sample)
-    assert said in str(caught.value)
+    assert message in str(caught.value)
 
 
 def test_an_infinite_command_within_limits_is_the_limit():
@@ -177,7 +177,7 @@ def test_the_default_step_divides_samples_delay_and_duration():
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "message"),
     [
         ({"sample": 0.0}, "sample"),
         ({"sample": "often"}, "'often'"),
@@ -194,10 +194,10 @@ def test_the_default_step_divides_samples_delay_and_duration():
         ({"linear": 3}, "fflin.LinearModel"),
     ],
 )
-def test_invalid_input_is_one_line(options, said):
+def test_invalid_input_is_one_line(options, message):
     with pytest.raises(fflin.FflinError) as caught:
         fflin.simulate(free_body((20.0, 30.0, 40.0)), **{"duration": 1.0, **options})
-    assert said in str(caught.value)
+    assert message in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
@@ -287,10 +287,10 @@ def test_feedback_along_a_trajectory_does_not_see_the_quaternions_sign():
     lin = fflin.linearize(robot)
     Q, R = unit_weights(lin)
     policy = fflin.TrajectoryFeedback(traj, fflin.tvlqr(traj, Q, R, Q)).bind(robot)
-    here, speed = fflin.StateMap(robot).to_pinocchio(displaced(lin))
-    other = here.copy()
+    point, speed = fflin.StateMap(robot).to_pinocchio(displaced(lin))
+    other = point.copy()
     other[3:7] *= -1.0
-    asked = policy(0.5, here, speed)
+    asked = policy(0.5, point, speed)
     assert np.abs(asked).max() > 1.0
     np.testing.assert_array_equal(policy(0.5, other, speed), asked)
     with pytest.raises(fflin.InputError, match="Trajectory"):
@@ -309,14 +309,14 @@ def test_an_allocation_is_sampled_as_its_policy_is_and_refuses_an_invalid_comman
     )
     changes = np.flatnonzero(np.diff(motion.u, axis=0).any(axis=1)) + 1
     np.testing.assert_array_equal(changes, np.arange(2, 20, 2))
-    for asked, said in (
+    for asked, message in (
         (lambda t, q, v: np.zeros(3), "(3,)"),
         (lambda t, q, v: "push", "real"),
         (lambda t, q, v: np.full(6, math.nan), "tau_b.x"),
     ):
         with pytest.raises(fflin.InputError) as caught:
             fflin.simulate(robot, fflin.Allocation(asked, design), duration=1.0)
-        assert said in str(caught.value)
+        assert message in str(caught.value)
     with pytest.raises(fflin.InputError, match=r"fflin\.Robot"):
         fflin.simulate(robot, fflin.Allocation(inner, 3), duration=1.0)
 
@@ -378,14 +378,16 @@ def test_a_step_that_a_fast_gain_makes_short_is_reported_once():
     def at_once(t, q, v):
         return -1.0
 
-    with pytest.warns(fflin.FflinWarning) as told:
+    with pytest.warns(fflin.FflinWarning) as messages:
         fflin.simulate(
             robot, fflin.StateFeedback(lin, 1e6 * K), duration=2.0, events=[at_once]
         )
-    (said,) = [str(each.message) for each in told]
+    (message,) = [str(item.message) for item in messages]
     poles = np.abs(np.linalg.eigvals(lin.A - lin.B @ (1e6 * K)))
-    assert says(said, f"{poles.max():.3g} 1/s", "dt=")
-    steps = max(int(each.replace(",", "")) for each in re.findall(r"\d[\d,]{4,}", said))
+    assert says(message, f"{poles.max():.3g} 1/s", "dt=")
+    steps = max(
+        int(item.replace(",", "")) for item in re.findall(r"\d[\d,]{4,}", message)
+    )
     assert 1e5 < steps <= 2.0 * 2.0 * poles.max() + 1.0
     # Neither where the step is given, nor where it is not the pole that asks for so many.
     for gain, times in ((1e6, {"dt": 1e-5}), (1.0, {"duration": 2000.0})):

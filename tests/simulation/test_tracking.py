@@ -28,12 +28,12 @@ def test_errors_of_rows_match_errors_of_points_and_are_inverted(frame):
     turns[:, 3:6] *= 4.0  # across half turns
     q = [pin.integrate(robot.model, robot.neutral(), turn) for turn in turns]
     v = rng.standard_normal((20, robot.nv))
-    x = np.array([state.to_state(*each) for each in zip(q, v, strict=True)])
+    x = np.array([state.to_state(*item) for item in zip(q, v, strict=True)])
     e = moving_errors(frame, x[1:], x[:-1])
     for k, row in enumerate(e):
-        here = moving_error(state, q[k], v[k], q[k + 1], v[k + 1])
-        here[6 : 6 + robot.n] = x[k + 1, 6 : 6 + robot.n] - x[k, 6 : 6 + robot.n]
-        np.testing.assert_allclose(row, here, atol=1e-13)
+        error = moving_error(state, q[k], v[k], q[k + 1], v[k + 1])
+        error[6 : 6 + robot.n] = x[k + 1, 6 : 6 + robot.n] - x[k, 6 : 6 + robot.n]
+        np.testing.assert_allclose(row, error, atol=1e-13)
     np.testing.assert_allclose(moved_by(frame, x[:-1], e), x[1:], atol=1e-13)
 
 
@@ -117,8 +117,8 @@ def test_a_clock_that_does_not_begin_at_zero_is_counted_from_the_first_knot(case
     moved = fflin.tvlqr(fflin.linearize_trajectory(robot, late))
     q0, v0 = beside(robot, traj, 0.02)
     runs = [
-        fflin.simulate(robot, each, q0=q0, v0=v0, linear=False)
-        for each in (schedule, moved)
+        fflin.simulate(robot, item, q0=q0, v0=v0, linear=False)
+        for item in (schedule, moved)
     ]
     np.testing.assert_allclose(runs[1].x, runs[0].x, atol=1e-9)
 
@@ -152,15 +152,15 @@ def test_limits_that_the_trajectory_itself_breaks_are_reported(case):
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "message"),
     [
         ({"frame": "hybrid"}, "'hybrid'"),
         ({"linear": True}, "TrajectoryFeedback"),
     ],
 )
-def test_options_that_exclude_a_trajectory_are_refused(case, options, said):
+def test_options_that_exclude_a_trajectory_are_refused(case, options, message):
     robot, schedule, _ = case
-    with pytest.raises(fflin.InputError, match=said):
+    with pytest.raises(fflin.InputError, match=message):
         fflin.simulate(robot, schedule, **options)
 
 
@@ -231,8 +231,8 @@ def test_after_the_end_the_regulator_about_rest_acts_whatever_the_weight_at_the_
     heavy = fflin.tvlqr(along, 10.0, 0.05, 1e4, sample=sample)
     steady = fflin.tvlqr(along, 10.0, 0.05, "steady", sample=sample)
     ends = [
-        fflin.TrajectoryFeedback(along, each).gain(traj.t[-1] + 1.0)
-        for each in (heavy, steady)
+        fflin.TrajectoryFeedback(along, item).gain(traj.t[-1] + 1.0)
+        for item in (heavy, steady)
     ]
     np.testing.assert_array_equal(*ends)
     if sample is None:

@@ -172,8 +172,8 @@ def test_too_deeply_nested_data_close_only_their_connection(opening, live, caplo
         await other.write_message(json.dumps({"joints": {"joint_2": 10**400}}))
         await other.write_message(json.dumps({"joints": {"joint_2": 0.5}}))
         after = await state(other)
-        for each in (connection, other):
-            each.close()
+        for item in (connection, other):
+            item.close()
         while await received(other) is not None:
             pass
         return connection.close_code, connection.close_reason, after

@@ -15,9 +15,9 @@ def pages(tmp_path_factory):
     """A page in each frame, and one of the same robot without an orbit."""
     folder, robot = tmp_path_factory.mktemp("orbit"), fflin.load("cubesat")
     for frame in ("lvlh", "hill", "hybrid"):
-        own = robot if frame == "hybrid" else robot.replace(orbit=700e3)
-        motion = fflin.simulate(own, duration=40.0, dt=0.5, frame=frame)
-        fflin.visualize(own, motion, html=folder / f"{frame}.html", open=False)
+        flown = robot if frame == "hybrid" else robot.replace(orbit=700e3)
+        motion = fflin.simulate(flown, duration=40.0, dt=0.5, frame=frame)
+        fflin.visualize(flown, motion, html=folder / f"{frame}.html", open=False)
     return folder
 
 

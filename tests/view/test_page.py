@@ -462,8 +462,8 @@ def test_on_a_long_way_the_camera_follows_unless_switched_off(robots, tmp_path):
     v0 = fflin.velocity(robot, {"v_b.x": 1000.0})
     motion = fflin.simulate(robot, None, v0=v0, duration=10.0, dt=0.1)
     path = tmp_path / "away.html"
-    for told, expected in ((None, True), (False, False), (True, True)):
-        fflin.visualize(robot, motion, html=path, follow=told)
+    for messages, expected in ((None, True), (False, False), (True, True)):
+        fflin.visualize(robot, motion, html=path, follow=messages)
         shown = page_data(path)
         assert shown["follow"] is expected
         assert (np.ptp(shown["points"], axis=0).max() > 5e3) is not expected
@@ -551,8 +551,8 @@ def test_the_paths_of_the_reference_are_dashed_next_to_those_flown(led_page):
 
     def course(q):
         ends = []
-        for each in q:
-            pin.framesForwardKinematics(robot.model, data, each)
+        for item in q:
+            pin.framesForwardKinematics(robot.model, data, item)
             ends.append(data.oMf[tool].translation.copy())
         return {"base": q[:, :3], "tool": np.array(ends)}
 
@@ -561,12 +561,12 @@ def test_the_paths_of_the_reference_are_dashed_next_to_those_flown(led_page):
     for k, name in enumerate(("base", "tool")):
         reference, share = middle_of(watched, "target", f"path {k}", mesh=0)
         assert 0.2 < share < 0.9  # gaps between
-        own, whole = middle_of(watched, "trails", name, mesh=1)
+        middle, whole = middle_of(watched, "trails", name, mesh=1)
         assert whole == 1.0
-        for points, expected in ((reference, followed[name]), (own, flown[name])):
+        for points, expected in ((reference, followed[name]), (middle, flown[name])):
             away = np.linalg.norm(points[:, None] - expected, axis=2)
             assert away.min(axis=1).max() < 4e-3
-            assert away[0, 0] < EXACT < 4e-3 < np.linalg.norm(reference[0] - own[0])
+            assert away[0, 0] < EXACT < 4e-3 < np.linalg.norm(reference[0] - middle[0])
             assert away[-1, -1] < 4e-3
     # They are named, and the reference's go with its ghost.
     named = watched.page.locator("#legend label").all_text_contents()
@@ -584,7 +584,7 @@ def test_a_reference_adds_little_to_the_page(led_page):
     _, motion, _, shown = led_page
     rows = len(shown["t"]) * 3 / 16
     assert rows < 130 < len(motion.t)
-    added = sum(len(each["points"]) for each in shown["followed"])
+    added = sum(len(item["points"]) for item in shown["followed"])
     added += sum(
         len(line["reference"]) for plot in shown["plots"] for line in plot["lines"]
     )

@@ -106,9 +106,9 @@ H = math.sqrt(0.5)
 def test_two_ways_to_say_the_same(document, meaning):
     if b"${" in (document if isinstance(document, bytes) else document.encode()):
         pytest.importorskip("xacrodoc")
-    for found, expected in zip(hinge(document), hinge(meaning), strict=True):
+    for result, expected in zip(hinge(document), hinge(meaning), strict=True):
         # Six digits of mass and inertia of order one, in double precision.
-        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-15)
+        np.testing.assert_allclose(result, expected, rtol=0, atol=1e-15)
 
 
 def test_the_inertia_is_turned_by_the_quaternion():
@@ -232,9 +232,9 @@ def test_turns_of_a_continuous_leader_count(tmp_path, kind, multiplier, counted)
 
 
 def test_damping_and_friction_are_recorded_and_noted():
-    found = read(arm(inside=AXIS + '<dynamics damping="0.25" friction="0.5"/>'))
-    assert found.joints["hinge"].damping == 0.25
-    texts = [note for _, _, note in ignored(found.joints, "arm")]
+    result = read(arm(inside=AXIS + '<dynamics damping="0.25" friction="0.5"/>'))
+    assert result.joints["hinge"].damping == 0.25
+    texts = [note for _, _, note in ignored(result.joints, "arm")]
     assert ["damping" in text for text in texts] == [True, False]
     assert all("'hinge'" in text for text in texts)
     assert read(arm()).notes == (*ignored(read(arm()).joints, "arm"),) == ()
@@ -418,7 +418,7 @@ def test_arguments_of_xacro_are_given_in_python_and_in_robot_files(tmp_path):
     }
     for mass, loaded in cases.items():
         assert loaded.model.inertias[2].mass == mass
-    assert len({each.urdf_sha256 for each in cases.values()}) == 4
+    assert len({item.urdf_sha256 for item in cases.values()}) == 4
     with pytest.raises(fflin.UnknownNameError, match="arn"):
         fflin.load(path, xacro={"arn": 4})
     assert main(["info", str(path), "--xacro", "arm=4"]) == 0
