@@ -9,7 +9,7 @@ import pytest
 import fflin
 from fflin import BaseForce, BaseTorque, JointTorque, ReactionWheel, Thruster
 from fflin.analysis.controllability import require_detectable, require_stabilizable
-from fflin.analysis.reduction import regulated_part, without
+from fflin.analysis.reduction import outputs_of, regulated_part, without
 from tests.support.marks import exhaustive
 from tests.support.robots import FRAMES, mostly, random_pose, random_tree
 from tests.support.wheels import AXES, carrier_alone, unit, wheels
@@ -272,3 +272,22 @@ def test_rounding_errors_of_a_spin_are_not_springs(name, J, speed, net):
         result = fflin.momentum_reduction(spun)
         assert result.state_names == expected.state_names
         assert len(result.momenta) == len(expected.momenta) == 3 and not result.notes
+
+
+@pytest.mark.parametrize("unit", [1e-9, 1.0, 1e9])
+def test_the_outputs_of_a_reduced_model_do_not_depend_on_their_units(unit):
+    """An output is kept if its other entries of C are rounding errors of its largest entry."""
+    lin = fflin.linearize(fflin.load("cubesat"))
+    C = np.zeros((2, len(lin.A)))
+    C[:, 0] = unit
+    C[:, -1] = unit * np.array([1e-14, 1e-9])
+    model = replace(
+        lin,
+        C=C,
+        D=np.zeros((2, lin.B.shape[1])),
+        output_names=("kept", "removed"),
+        output_units=("1", "1"),
+        y0=np.zeros(2),
+    )
+    S = np.eye(len(lin.A))[:-1]
+    assert outputs_of(model, S).tolist() == [[1.0, 0.0]]

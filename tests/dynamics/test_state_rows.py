@@ -245,3 +245,17 @@ def test_loop_about_a_bent_point_comes_to_it_and_differs_in_second_order(sample)
     end = run(0.02, 60.0)
     assert np.abs(end.error[-1]).max() < 1e-6
     np.testing.assert_allclose(end.u[-1], lin.u0, atol=1e-3)
+
+
+def test_the_error_from_a_moving_reference_has_the_difference_of_the_velocities():
+    """The reference itself has no error, and an error of the velocities is read back."""
+    robot = fflin.load("servicer_7dof")
+    state = fflin.StateMap(robot, frame="local")
+    rng = np.random.default_rng(2)
+    q = fflin.configuration(robot, {"joint_1": 0.4})
+    v_star, change = rng.normal(size=(2, robot.nv))
+    assert not moving_error(state, q, v_star, q, v_star).any()
+    error = moving_error(state, q, v_star, q, v_star + change)
+    expected = state.velocities(change)
+    np.testing.assert_allclose(error[-len(expected) :], expected, atol=1e-14)
+    assert not error[: -len(expected)].any()
