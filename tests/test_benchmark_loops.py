@@ -80,7 +80,7 @@ def test_wheels_are_counted_in_the_body():
     assert welded(loop).mass == plain.mass
 
 
-def test_another_inertia_is_found_out():
+def test_a_different_inertia_is_detected():
     loop = made("ets_vii")
     M = fflin.linearize(loop.robot, loop.point.q).M.copy()
     loop.require_same_inertia("peer", M)
@@ -100,7 +100,7 @@ def test_contender_with_another_end_is_not_timed(wrong):
 
 def test_held_and_at_all_times_are_not_the_same_loop():
     contenders = loops.fflin_contenders(made("servicer_7dof"))
-    assert [each.name for each in contenders] == [
+    assert [item.name for item in contenders] == [
         "fflin",
         "fflin, 25,000 steps",
         "fflin, 25,000 steps, all rows",
@@ -108,17 +108,17 @@ def test_held_and_at_all_times_are_not_the_same_loop():
         "fflin, in Python",
     ]
     first, _, _, held, in_python = contenders
-    for each in (first, held, in_python):
-        each.run()
+    for item in (first, held, in_python):
+        item.run()
     assert first.end() == pytest.approx(in_python.end(), abs=1e-12)
     assert np.abs(first.end() - held.end()).max() > 1e-5
 
 
 def test_rows_have_the_floor_and_every_contender():
-    found = loops.fflin_contenders(made("cubesat"))
-    floor, *rows = loops.measured("cubesat", found)
+    result = loops.fflin_contenders(made("cubesat"))
+    floor, *rows = loops.measured("cubesat", result)
     assert floor[:2] == ("cubesat", loops.FLOOR) and floor[3:6] == ("1.00",) * 3
-    assert [row[1] for row in rows] == [each.name for each in found]
+    assert [row[1] for row in rows] == [item.name for item in result]
     for row in rows:
         least, median, most = (float(cell.replace(",", "")) for cell in row[3:6])
         assert 0.0 < least <= median <= most and float(row[6]) < loops.WORST
@@ -133,16 +133,16 @@ def test_the_long_run_is_one_that_is_compiled_by_default_and_is_timed_by_its_own
 
 
 def without_peers(monkeypatch):
-    there = builtins.__import__
+    original_import = builtins.__import__
 
     def without(name, *rest):
         if name.partition(".")[0] in ("mujoco", "pydrake", "Basilisk"):
             raise ImportError(f"No module named '{name}'")
-        return there(name, *rest)
+        return original_import(name, *rest)
 
     monkeypatch.setattr(builtins, "__import__", without)
     for module in [
-        each for each in sys.modules if each.startswith("benchmarks.peers.")
+        item for item in sys.modules if item.startswith("benchmarks.peers.")
     ]:
         monkeypatch.delitem(sys.modules, module)
 
@@ -150,8 +150,8 @@ def without_peers(monkeypatch):
 @pytest.mark.parametrize("find", [loops.contenders, campaigns.peers_of])
 def test_peers_that_are_not_there_are_named(find, monkeypatch):
     without_peers(monkeypatch)
-    found, notes = find(made("cubesat"))
-    assert len(found) == (5 if find is loops.contenders else 0)
+    result, notes = find(made("cubesat"))
+    assert len(result) == (5 if find is loops.contenders else 0)
     assert [note.partition(":")[0] for note in notes] == ["MuJoCo", "Drake", "Basilisk"]
     assert all("not installed" in note for note in notes)
 
@@ -218,7 +218,7 @@ def test_floor_is_timed_before_and_after(monkeypatch):
         return call
 
     monkeypatch.setattr(timing.time, "perf_counter", lambda: clock[0])
-    found = timing.beside(costs(1.0), {"a": costs(2.0), "b": costs(2.0)}, rounds=2)
+    result = timing.beside(costs(1.0), {"a": costs(2.0), "b": costs(2.0)}, rounds=2)
     expected = 2.0 * 1.5 / ((1.0 + 1.5**2) / 2.0)
-    for own, floor in found.values():
-        assert own.ratios(floor) == pytest.approx([expected] * 3)
+    for default, floor in result.values():
+        assert default.ratios(floor) == pytest.approx([expected] * 3)

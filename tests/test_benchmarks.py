@@ -67,7 +67,7 @@ def test_peer_with_another_result_is_not_timed(what, at_rest):
                 )
 
 
-def test_peer_in_another_frame_is_found_out():
+def test_peer_in_another_frame_is_detected():
     point = random_point(load("servicer_7dof"))
     (method,) = pinocchio_peer.at_point(point)
     for frame in ("hybrid", "world"):
@@ -77,20 +77,20 @@ def test_peer_in_another_frame_is_found_out():
 
 def test_peers_that_are_not_there_are_named(monkeypatch):
     missing = ("mujoco", "crocoddyl", "pydrake", "casadi")
-    there = builtins.__import__
+    original_import = builtins.__import__
 
     def without(name, *rest):
         if name.partition(".")[0] in missing:
             raise ImportError(f"No module named '{name}'")
-        return there(name, *rest)
+        return original_import(name, *rest)
 
     monkeypatch.setattr(builtins, "__import__", without)
     for name in peers.MODULES[1:]:
         monkeypatch.delitem(
             peers.importlib.sys.modules, f"benchmarks.peers.{name}", raising=False
         )
-    found, notes = methods("at_rest", random_point(load("cubesat")))
-    assert [method.name for method in found] == [pinocchio_peer.FLOOR]
+    result, notes = methods("at_rest", random_point(load("cubesat")))
+    assert [method.name for method in result] == [pinocchio_peer.FLOOR]
     assert len(notes) == 4 and all("not installed" in note for note in notes)
 
 
@@ -110,11 +110,11 @@ def test_urdf_for_all_peers_is_the_same_robot(robot, tmp_path):
     )
 
 
-def test_inertias_that_no_rigid_body_has_are_told():
+def test_inertias_that_no_rigid_body_has_are_reported():
     assert not is_rigid(load("ets_vii")) and is_rigid(load("servicer_7dof"))
 
 
-def test_what_else_the_machine_does_is_not_counted(monkeypatch):
+def test_other_load_of_the_machine_is_not_counted(monkeypatch):
     """Two functions that cost 2 and 3 ms, each disturbed in every third of its calls."""
     clock, calls = [0.0], itertools.count()
 

@@ -8,7 +8,7 @@ from tests.support.browser import Watched
 pytestmark = pytest.mark.browser
 
 
-def test_what_does_not_come_is_named_with_what_the_page_said(browser, monkeypatch):
+def test_a_missing_message_is_named_with_the_messages_of_the_page(browser, monkeypatch):
     monkeypatch.setattr(support, "FRAMES", 3)
     page = "data:text/html,<script>console.log('nothing here')</script>"
     with (

@@ -96,12 +96,12 @@ def test_an_error_of_the_table_reads_as_it_stands_there(
     exec(BEFORE, known)
     with pytest.raises(getattr(fflin, row[0]), match=re.escape(keyword)) as caught:
         exec(code, known)
-    said = type(caught.value).__name__, str(caught.value)
+    message = type(caught.value).__name__, str(caught.value)
     if not (
-        errors_page.agrees(row, *said) or request.config.getoption("write_messages")
+        errors_page.agrees(row, *message) or request.config.getoption("write_messages")
     ):
         pytest.fail(
-            f"`{COMMAND}` writes to docs/errors.md: {': '.join(said)}", pytrace=False
+            f"`{COMMAND}` writes to docs/errors.md: {': '.join(message)}", pytrace=False
         )
 
 

@@ -47,9 +47,11 @@ def test_the_example_of_a_public_name_runs(name, tmp_path, monkeypatch):
     )
     # Nothing may be skipped, and an example that begins nowhere shows nothing.
     assert example.examples and not any(
-        "doctest:" in each.source for each in example.examples
+        "doctest:" in item.source for item in example.examples
     )
-    assert any("fflin" in each.source for each in example.examples)
-    said = []
-    failed, _ = doctest.DocTestRunner(optionflags=FLAGS).run(example, out=said.append)
-    assert not failed, "".join(said)
+    assert any("fflin" in item.source for item in example.examples)
+    message = []
+    failed, _ = doctest.DocTestRunner(optionflags=FLAGS).run(
+        example, out=message.append
+    )
+    assert not failed, "".join(message)

@@ -44,7 +44,7 @@ def build(source, site):
 
 def written(site):
     """Return {address: text} of what pages wrote, having seen that each is shown by its page."""
-    found = {
+    result = {
         str(path.relative_to(site)): path.read_text()
         for path in site.glob("pages/**/*.html")
     }
@@ -53,9 +53,9 @@ def written(site):
     )
     assert all(
         f'src="{address}"' in shown or f'src="../{address}"' in shown
-        for address in found
+        for address in result
     )
-    return found
+    return result
 
 
 def test_a_second_build_is_as_whole_as_the_first(tmp_path):

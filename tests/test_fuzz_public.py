@@ -107,9 +107,9 @@ def fault(name, arguments):
             warnings.simplefilter("error", RuntimeWarning)
             call(name, arguments)
     except fflin.FflinError as error:
-        said = str(error)
-        printable = said.encode("utf-8", "ignore").decode() == said
-        return "" if said and "\n" not in said and printable else repr(said)
+        message = str(error)
+        printable = message.encode("utf-8", "ignore").decode() == message
+        return "" if message and "\n" not in message and printable else repr(message)
     except Exception as error:
         return repr(error)
     return ""
@@ -131,8 +131,8 @@ def test_each_light_function_refuses_one_odd_value_or_accepts_it(monkeypatch, tm
         argument = taken[turn % len(taken)]
         key, value = odd[turn * 7 % len(odd)]
         turn += 1
-        if said := fault(name, made[name] | {argument: value}):
-            wrong.append((name, argument, key, said))
+        if message := fault(name, made[name] | {argument: value}):
+            wrong.append((name, argument, key, message))
     assert turn > 60
     assert not wrong
 
@@ -212,8 +212,8 @@ def test_odd_arguments_are_refused_in_one_line_or_accepted(
         and not (name in SLOW and odd[0] in WEIGHTS)
     ]
     for name, argument, (key, value) in every:
-        if said := fault(name, calls[name] | {argument: value}):
-            wrong.append((name, argument, key, said))
+        if message := fault(name, calls[name] | {argument: value}):
+            wrong.append((name, argument, key, message))
     assert not wrong
     assert not [path for path in tmp_path.iterdir() if path.stat().st_size == 0]
 
@@ -289,17 +289,17 @@ def test_odd_options_end_in_one_line(
         except Exception as error:
             wrong.append((value, repr(error)))
             continue
-        said = capsys.readouterr().err.splitlines()
-        errors = [line for line in said if not line.startswith("fflin: warning: ")]
+        message = capsys.readouterr().err.splitlines()
+        errors = [line for line in message if not line.startswith("fflin: warning: ")]
         one = len(errors) == 1 and errors[0].startswith("fflin: error: ")
         if code not in (0, 1, 2) or (one if code != 2 else not one):
-            wrong.append((value, code, said))
+            wrong.append((value, code, message))
     assert not wrong
     assert not [item for item in recwarn if issubclass(item.category, RuntimeWarning)]
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "message"),
     [
         (["--samples", "9" * 20], "samples.*1,000,000"),
         (["--offset", "1e300"], "1e.300 m"),
@@ -307,11 +307,11 @@ def test_odd_options_end_in_one_line(
         (["--attitude", "1e300"], "175 deg"),
     ],
 )
-def test_validity_refuses_what_would_never_end(options, said, capsys):
+def test_validity_refuses_loops_that_never_settle(options, message, capsys):
     import re
 
     assert main(["validity", "planar_detumble", *options]) == 2
-    assert re.search(said, hear_lines(capsys.readouterr().err))
+    assert re.search(message, hear_lines(capsys.readouterr().err))
 
 
 def test_a_run_without_end_is_refused_whatever_asks_for_it():
@@ -383,12 +383,12 @@ def test_rows_of_a_sweep_are_refused_as_those_of_one_point():
     q = [robot.neutral()]
     for name, size in (("v", robot.nv), ("u", 6 + robot.n)):
         masked = np.ma.masked_array(np.zeros(size), mask=[True] * size)
-        for rows, said in (
+        for rows, message in (
             ([[1.0, 2.0], [3.0]], "rows"),
             (masked, "masked"),
             (masked[None], "masked"),
             (np.full((1, size), "x"), "real"),
             (np.zeros((1, 1, size)), "shape"),
         ):
-            with pytest.raises(fflin.InputError, match=f"{name} .*{said}"):
+            with pytest.raises(fflin.InputError, match=f"{name} .*{message}"):
                 fflin.sweep(robot, q, **{name: rows})

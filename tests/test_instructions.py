@@ -19,11 +19,11 @@ pytestmark = [pytest.mark.process, pytest.mark.exhaustive]
     reason="the baseline is of CPython on x86-64",
 )
 def test_hot_paths_take_no_more_instructions():
-    found = ratios()
-    assert found.keys() == BASELINE.keys()
+    result = ratios()
+    assert result.keys() == BASELINE.keys()
     worse = {
         path: f"{ratio:.2f}, was {BASELINE[path]:.2f}"
-        for path, ratio in found.items()
+        for path, ratio in result.items()
         if ratio > BASELINE[path] * (1.0 + TOLERANCE)
     }
     assert not worse, f"more instructions: {worse}; see benchmarks/instructions.py"

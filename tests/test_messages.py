@@ -86,7 +86,7 @@ def test_a_row_of_the_page_takes_the_new_sentence(tmp_path, monkeypatch):
 
 
 @pytest.mark.process
-def test_a_command_writes_what_the_tests_hear_on_all_workers(tmp_path):
+def test_a_command_writes_the_messages_of_all_workers(tmp_path):
     def run(*options):
         root = Path(__file__).parents[1]
         command = [sys.executable, "-m", "pytest", "-q", "-p", "tests.support.messages"]
@@ -102,11 +102,11 @@ def test_a_command_writes_what_the_tests_hear_on_all_workers(tmp_path):
         return done.returncode, done.stdout + done.stderr
 
     def tests(**sentences):
-        each = [
-            f"def test_{name}():\n    hear({said!r})\n"
-            for name, said in sentences.items()
+        item = [
+            f"def test_{name}():\n    hear({message!r})\n"
+            for name, message in sentences.items()
         ]
-        (tmp_path / "tests" / "test_it.py").write_text(HEAR + "".join(each))
+        (tmp_path / "tests" / "test_it.py").write_text(HEAR + "".join(item))
 
     def noted():
         return json.loads((tmp_path / "tests" / "messages.json").read_text())

@@ -34,8 +34,8 @@ def test_the_conda_recipe_has_the_version_and_the_dependencies():
     recipe = read("conda/recipe.yaml")
     assert recipe["context"]["version"] == PROJECT["version"]
     wanted = set()
-    for each in PROJECT["dependencies"]:
-        name, bounds = re.match(r"([\w-]+)([^;]*)", each).groups()
+    for item in PROJECT["dependencies"]:
+        name, bounds = re.match(r"([\w-]+)([^;]*)", item).groups()
         wanted.add(f"{CONDA.get(name, name)} {bounds.strip()}")
     python, *others = recipe["requirements"]["run"]
     assert python == f"python {PROJECT['requires-python']}"
@@ -45,7 +45,7 @@ def test_the_conda_recipe_has_the_version_and_the_dependencies():
 def test_the_workflows_run_parts_that_exist_on_the_pythons_of_the_package():
     jobs = read(".github/workflows/ci.yml")["jobs"]
     pythons = [
-        each.rpartition(" ")[2] for each in PROJECT["classifiers"] if ":: 3." in each
+        item.rpartition(" ")[2] for item in PROJECT["classifiers"] if ":: 3." in item
     ]
     assert jobs["tests"]["strategy"]["matrix"]["python"] == pythons
     parts = re.search(r'^known="(.*)"$', (ROOT / ".ci/run").read_text(), re.MULTILINE)[

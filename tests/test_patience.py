@@ -31,22 +31,22 @@ def reasons(family, looks):
     return [patience.out() for _ in range(looks)]
 
 
-def test_what_computes_is_waited_for_whatever_the_time():
+def test_a_busy_process_is_awaited():
     """On a processor shared by fifty a minute has a second, on one shared by more none at all."""
     assert not any(reasons(Scripted(0.2), 1000))
     assert not any(reasons(Scripted(0.0, state=True), 1000))
 
 
-def test_what_does_nothing_is_given_up_after_a_minute():
-    said = reasons(Scripted(0.001), 8)
-    assert said[:6] == [""] * 6
-    assert "the moon" in said[6]
+def test_an_idle_process_is_stopped_after_a_minute():
+    message = reasons(Scripted(0.001), 8)
+    assert message[:6] == [""] * 6
+    assert "the moon" in message[6]
 
 
-def test_what_computes_without_end_is_given_up_too():
-    said = reasons(Scripted(10.0), 62)
-    assert said[:60] == [""] * 60
-    assert "the moon" in said[61]
+def test_an_endless_computation_is_stopped():
+    message = reasons(Scripted(10.0), 62)
+    assert message[:60] == [""] * 60
+    assert "the moon" in message[61]
 
 
 def test_a_condition_that_never_holds_is_named():
@@ -67,7 +67,7 @@ def test_a_process_that_never_ends_is_killed_and_named(code, watch):
         finished(command, watch=watch)
 
 
-def test_what_reads_from_a_process_that_hangs_comes_to_an_end():
+def test_reading_from_a_hanging_process_ends():
     command = [sys.executable, "-S", "-c", "import time; time.sleep(9999)"]
     with (
         pytest.raises(AssertionError, match="its first line"),
@@ -77,7 +77,7 @@ def test_what_reads_from_a_process_that_hangs_comes_to_an_end():
         assert not process.stdout.readline()
 
 
-def test_what_a_command_says_and_takes_comes_as_from_subprocess():
+def test_a_command_in_process_agrees_with_a_subprocess():
     code = "import sys; print(input()); sys.exit('no')"
     done = finished(
         [sys.executable, "-S", "-c", code],

@@ -64,8 +64,8 @@ def test_import_pays_for_nothing_heavy():
 
 
 def test_help_begins_with_the_public_names_each_under_one_title():
-    said = pydoc.plain(pydoc.render_doc(fflin))
-    first = said.partition("PACKAGE CONTENTS")[0]
+    message = pydoc.plain(pydoc.render_doc(fflin))
+    first = message.partition("PACKAGE CONTENTS")[0]
     assert max(map(len, first.splitlines())) <= 100
     listed = [name for line in first.splitlines() for name in line.strip().split(", ")]
     for name in fflin.__all__:
@@ -86,7 +86,7 @@ def test_completion_offers_public_names_alone():
 
 
 def test_help_of_linearize_fits_a_screen():
-    said = pydoc.plain(pydoc.render_doc(fflin.linearize)).splitlines()[2:]
-    assert len(said) <= 50
-    assert max(map(len, said)) <= 88
-    assert ":" not in said[0] and "->" not in said[0]  # the types stand below
+    message = pydoc.plain(pydoc.render_doc(fflin.linearize)).splitlines()[2:]
+    assert len(message) <= 50
+    assert max(map(len, message)) <= 88
+    assert ":" not in message[0] and "->" not in message[0]  # the types stand below

@@ -34,8 +34,10 @@ def site(tmp_path_factory):
         pytest.importorskip(package, reason="the extra docs is not installed")
     from filelock import FileLock
 
-    own = tmp_path_factory.getbasetemp()
-    folder = (own.parent if "PYTEST_XDIST_WORKER" in os.environ else own) / "site"
+    default = tmp_path_factory.getbasetemp()
+    folder = (
+        default.parent if "PYTEST_XDIST_WORKER" in os.environ else default
+    ) / "site"
     with FileLock(f"{folder}.lock"):
         if not (folder / "index.html").exists():
             _build(folder)
@@ -85,8 +87,8 @@ class Page(HTMLParser):
 
 @pytest.fixture(scope="module")
 def pages(site):
-    own = [path for path in site.rglob("*.html") if "_static" not in path.parts]
-    return {path: Page(path) for path in own}
+    default = [path for path in site.rglob("*.html") if "_static" not in path.parts]
+    return {path: Page(path) for path in default}
 
 
 @pytest.mark.process
@@ -149,8 +151,8 @@ def test_formulas_search_and_pages_that_play_work_from_disk(site, browser):
     many = "document.querySelectorAll('mjx-container svg').length > 100"
     with opened("derivation.html", many) as watched:
         assert not watched.page.query_selector_all("[data-mml-node=merror]")
-    found = "document.querySelectorAll('ul.search li').length > 5"
-    with opened("search.html?q=momentum", found) as watched:
+    result = "document.querySelectorAll('ul.search li').length > 5"
+    with opened("search.html?q=momentum", result) as watched:
         assert "momentum_reduction" in watched.page.inner_text("ul.search")
     framed = "document.querySelector('iframe.fflin-page')"
     with opened("tutorials/first_loop.html", framed) as watched:
@@ -220,7 +222,7 @@ def test_the_search_finds_the_page_of_a_task_first_and_shows_an_excerpt(
             watched.page.wait_for_selector("p.search-summary:has-text('finished')")
             watched.page.wait_for_selector("ul.search p.context")
             hits = watched.page.query_selector_all("ul.search li")[:3]
-            found = [hit.query_selector("a").get_attribute("href") for hit in hits]
-            if not pages & {address.partition(".html")[0] for address in found}:
-                missed[word] = found
+            result = [hit.query_selector("a").get_attribute("href") for hit in hits]
+            if not pages & {address.partition(".html")[0] for address in result}:
+                missed[word] = result
     assert not missed

@@ -166,10 +166,8 @@ def effective_masses(lin: LinearModel) -> EffectiveMasses:
     order[:6] = np.r_[order[LINEAR], order[ANGULAR]]
     M = M[np.ix_(order, order)]
     stiffness = robot.springs.stiffness
-    springs, others = (
-        6 + np.flatnonzero(stiffness),
-        6 + np.flatnonzero(stiffness == 0.0),
-    )
+    springs = 6 + np.flatnonzero(stiffness)
+    others = 6 + np.flatnonzero(stiffness == 0.0)
     kept = np.r_[:6, springs]
     floating = floating_inertia(M, kept, others)
     base, joints = np.arange(6), np.arange(6, len(kept))

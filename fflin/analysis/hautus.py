@@ -229,10 +229,8 @@ def unobservable(
         ranks.Noisy.exact(np.zeros_like(m)) for m in (system.M, position.values)
     )
     rows = [[system.K, none], [none, system.K], [none, system.D], [empty, position]]
-    fast, slow = (
-        np.abs(velocity.values).max(initial=0.0),
-        np.abs(position.values).max(initial=0.0),
-    )
+    fast = np.abs(velocity.values).max(initial=0.0)
+    slow = np.abs(position.values).max(initial=0.0)
     unit = 1.0
     if fast and slow:
         unit = slow / fast

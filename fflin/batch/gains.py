@@ -194,11 +194,9 @@ def lqr_batch(batch: LinearBatch, Q: Weight, R: Weight) -> GainBatch:
         if solution is None:
             with located(f"point {index}"):
                 solution = regulator(batch[index], Q, R)
-        K[index], residual[index], margin[index] = (
-            solution.K,
-            solution.residual,
-            solution.margin,
-        )
+        K[index] = solution.K
+        residual[index] = solution.residual
+        margin[index] = solution.margin
     return GainBatch._of(batch, K=K, residual=residual, margin=margin)
 
 

@@ -330,7 +330,9 @@ class LinearBatch(ModelHeader):
                 "_inertia": partial(_refuse, "inertia M", values["robot"]),
                 "_ignorable": partial(given, ignorable),
                 "_wheels": wheels,
-                **{"weights": {}, "mean_motion": n, "dt": 0.0},
+                "weights": {},
+                "mean_motion": n,
+                "dt": 0.0,
             }
             return LinearBatch(**values, _asked=asked, verified=verified)
         identity = (

@@ -48,8 +48,18 @@ _TURN = Lock()
 
 # Attributes that identify a robot, in addition to its Pinocchio model.
 _OF_THE_ROBOT = (
-    *("name", "urdf_sha256", "locked", "joints", "followers"),
-    *("inputs", "outputs", "stiffness", "damping", "rest", "gravity", "orbit"),
+    "name",
+    "urdf_sha256",
+    "locked",
+    "joints",
+    "followers",
+    "inputs",
+    "outputs",
+    "stiffness",
+    "damping",
+    "rest",
+    "gravity",
+    "orbit",
 )
 
 

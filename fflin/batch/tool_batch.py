@@ -152,10 +152,12 @@ def tool_batch(
                 for matrices in zip(A, B, rate, strict=True)
             ]
             A, B, rate = (np.array(matrices) for matrices in zip(*stepped, strict=True))
+        if batch.moving:
+            rate = np.zeros_like(rate)
         converted = {
             "A": A,
             "B": B,
-            "f0": rate * (not batch.moving),
+            "f0": rate,
             "u0": batch.u0[rows] @ change.T_u.T,
             "T": change.T[None],
             "T_left": change.T_left[None],

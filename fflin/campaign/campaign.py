@@ -273,10 +273,8 @@ class Campaign(FrozenArrays):
             return np.where(self.stopped, np.inf, errors.max(axis=1)), self.state_units[
                 at[0]
             ]
-        states, inputs = (
-            (self.state_names, self.state_units),
-            (self.input_names, self.input_units),
-        )
+        states = (self.state_names, self.state_units)
+        inputs = (self.input_names, self.input_units)
         kinds = tuple(KINDS), tuple(KINDS.values())
         groups: list[tuple[tuple[str, ...], tuple[str, ...], Array]] = {
             "final": [(*kinds, self.errors), (*states, self.x), (*inputs, self.u)],

@@ -387,10 +387,8 @@ class Dispersions:
         if not self._kinds & {*_OF_INPUTS, "misalignment"}:
             return None
         gain, bias = self._of("gain", drawn), self._of("bias", drawn)
-        until, angles = (
-            self._of("fails", drawn, np.inf),
-            self._of("misalignment", drawn),
-        )
+        until = self._of("fails", drawn, np.inf)
+        angles = self._of("misalignment", drawn)
         # the actual axes of tau_b and F_b
         turn: list[Array] = [np.empty((len(drawn), 0))]
         for first in self._plant.triads:

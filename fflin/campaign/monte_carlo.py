@@ -35,17 +35,15 @@ from fflin.simulation.report import pushed
 _STAGE, _GROWTH = 256, 1.25
 
 _OPTIONS = {option.name for option in fields(SimulationOptions)} - {
-    *(
-        "robot",
-        "policy",
-        "duration",
-        "events",
-        "callback",
-        "linear",
-        "every",
-        "progress",
-        "engine",
-    )
+    "robot",
+    "policy",
+    "duration",
+    "events",
+    "callback",
+    "linear",
+    "every",
+    "progress",
+    "engine",
 }
 
 

@@ -236,10 +236,8 @@ class CampaignJob:
         outcomes = MemoryStore(len(drawn), 1, self.outcome_shapes).arrays
         if self.engine == "compiled":
             runs = self.dispersions.in_lanes(drawn)
-            eight_runs, statistics = (
-                lanes.LaneLoop(self.plan, runs),
-                RunStatistics(self),
-            )
+            eight_runs = lanes.LaneLoop(self.plan, runs)
+            statistics = RunStatistics(self)
             for first in range(0, len(drawn), LANES):
                 part = slice(first, first + LANES)
                 eight = {key: values[part] for key, values in runs.items()}

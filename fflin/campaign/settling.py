@@ -251,10 +251,8 @@ class Loop:
         run leaves the chart or diverges.
         """
         e, stop = runs["state_errors"][..., self.model_states], runs["stop"]
-        last, first = (
-            self.size(runs["x"][:, self.model_states] - self.lin.x0),
-            self.size(e[:, 0]),
-        )
+        last = self.size(runs["x"][:, self.model_states] - self.lin.x0)
+        first = self.size(e[:, 0])
         turned = (stop == STOPS.index("left the chart")) | (
             runs["largest"][:, 0] > EDGE
         )

@@ -39,7 +39,6 @@ if TYPE_CHECKING:
     from fflin.batch.configurations import Configurations
 
 _ROWS = 240  # number of instants per run at which --plot shows errors and inputs
-_RUNS = ("dt", "knots", "samples", "seed", "confidence", "threads")
 
 _ALLOCATED = (
     "allocation: tau_b and F_b are realised by the thrusters, in `fflin simulate --gain` too; "
@@ -293,7 +292,12 @@ def funnel(arguments: Namespace) -> Report:
             within=once("--within", arguments.within),
             limits=limits_of_options(arguments),
             progress=bar,
-            **{name: getattr(arguments, name) for name in _RUNS},
+            dt=arguments.dt,
+            knots=arguments.knots,
+            samples=arguments.samples,
+            seed=arguments.seed,
+            confidence=arguments.confidence,
+            threads=arguments.threads,
         )
     files = {
         arguments.plot: lambda path: fflin.plot_funnel(result, path),
@@ -313,10 +317,8 @@ def sweep(arguments: Namespace) -> Report:
     path = arguments.output_file
     robot = load_robot(arguments)
     settings = {"frame": arguments.frame, "reference": reference_of(arguments)}
-    linearizer, (q, v, u) = (
-        fflin.Linearizer(robot, **settings),
-        _points(robot, arguments),
-    )
+    linearizer = fflin.Linearizer(robot, **settings)
+    q, v, u = _points(robot, arguments)
     size = len(q) * ChunkJob(linearizer, at_rest=v is None and u is None).row_bytes
     part = part_of(path)
     needs = f"{size / 1e9:,.1f} GB" if size >= 1e9 else f"{size / 1e3:,.1f} kB"

@@ -315,11 +315,9 @@ def analyze(arguments: Namespace) -> Report:
     example: fflin analyze servicer_7dof --stiffness panel_left=100 --output joints
     """
     _, lin = linear_model(arguments)
-    moved, shown, lin_modes = (
-        fflin.controllability(lin),
-        fflin.observability(lin),
-        fflin.modes(lin),
-    )
+    moved = fflin.controllability(lin)
+    shown = fflin.observability(lin)
+    lin_modes = fflin.modes(lin)
     parts = {
         "inputs": moved,
         "momentum": _momentum(lin),

@@ -8,11 +8,9 @@ _OTHER_METHODS = [name for name in METHODS if name != DEFAULT_METHOD]
 _METHODS = " or ".join((f"{DEFAULT_METHOD} (default)", *_OTHER_METHODS))
 
 # Titles of the groups of options in the help.
-POINT, ROBOT, OUTPUT = (
-    "operating point",
-    "robot (these options override robot.toml)",
-    "output",
-)
+POINT = "operating point"
+ROBOT = "robot (these options override robot.toml)"
+OUTPUT = "output"
 TRAJECTORY, CONTROLLER, SIMULATION = "trajectory", "controller", "simulation"
 
 _POSE = "joint rpy position velocity"

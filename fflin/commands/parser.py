@@ -201,10 +201,8 @@ _PAIRS = many(assignment, "NAME=VALUE")
 _WEIGHTS = many(assignment, "NAME=W")
 _OF_JOINT = many(joint_or_all, "[NAME=]VALUE")
 _NAMES = many(str, "NAME")
-_ANGLES, _AXES = (
-    one(number, ("R", "P", "Y"), nargs=3),
-    one(number, ("X", "Y", "Z"), nargs=3),
-)
+_ANGLES = one(number, ("R", "P", "Y"), nargs=3)
+_AXES = one(number, ("X", "Y", "Z"), nargs=3)
 _TIME, _FILE, _COUNT = one(number, "H"), one(input_file, "FILE"), one(count_of, "N")
 _YES_OR_NO: Form = {"action": argparse.BooleanOptionalAction}
 _FORMER: Form = {**_TIME, "dest": "former_dt"}

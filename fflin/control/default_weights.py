@@ -259,10 +259,8 @@ def _on_velocities(
     values, directions = np.linalg.eigh((S / cost) @ S.T / np.outer(size, size))
     root = size[:, None] * directions * np.sqrt(values.clip(_LEAST_REACH))
     L = np.linalg.solve(lin.M, root)
-    F, H = (
-        np.linalg.solve(L, X[m:, :m] @ X[:m, m:] @ L),
-        np.linalg.solve(L, X[m:, m:] @ L),
-    )
+    F = np.linalg.solve(L, X[m:, :m] @ X[:m, m:] @ L)
+    H = np.linalg.solve(L, X[m:, m:] @ L)
     _, stiffness, modes = np.linalg.svd(F)
     damping_term = H.T @ H * damped
     back = np.linalg.inv(L)

@@ -251,21 +251,17 @@ class Gain(ModelDesign):
         # Steinbuch, Systems and Control Letters 14(4), 1990.
         S = selection(self.regulated or self.state_names, self.state_names)
         scale = np.sqrt(self.R.diagonal())
-        F, G, H = (
-            S @ self.closed_loop @ S.T,
-            S @ self.B / scale,
-            -scale[:, None] * self.K @ S.T,
-        )
+        F = S @ self.closed_loop @ S.T
+        G = S @ self.B / scale
+        H = -scale[:, None] * self.K @ S.T
         D = 0.5 * np.eye(len(H))
         if self.dt:
             # The bilinear map s = (z - 1)/(z + 1) preserves the H-infinity norm.
             inverse, unit = np.linalg.inv(F + np.eye(len(F))), np.eye(len(F))
             D = D - H @ inverse @ G
-            F, G, H = (
-                inverse @ (F - unit),
-                2.0**0.5 * inverse @ G,
-                2.0**0.5 * H @ inverse,
-            )
+            F = inverse @ (F - unit)
+            G = 2.0**0.5 * inverse @ G
+            H = 2.0**0.5 * H @ inverse
         disk = min(1.0 / largest_gain(F, G, H, D)[0], 2.0)
         most = math.inf
         if disk < 2.0:

@@ -500,11 +500,9 @@ def tvkalman(
             P = kalman(lin.discretize(dt), held_cost(lin.A.T, early, dt), V).P
     else:
         P = weight("P0", P0, traj.state_names)
-    held, at_samples, nx = (
-        list(transitions(traj, dt)),
-        along(traj.resampled(dt)),
-        len(P),
-    )
+    held = list(transitions(traj, dt))
+    at_samples = along(traj.resampled(dt))
+    nx = len(P)
     maps = np.array([whole for _, whole in held])
     # covariance that the disturbance adds per sample
     disturbed = np.zeros((len(held), nx, nx))

@@ -328,10 +328,8 @@ def _along(traj: LinearTrajectory, ahead: Horizon, cost: Cost) -> TrajectoryMpc:
     """Design the controller along a trajectory; `ahead` is its horizon, which has no stages yet."""
     (Q, R, Qf, weights), dt = cost, ahead.dt
     schedule = tvlqr(traj, Q, R, Qf, dt, weights=weights)
-    follows, state = (
-        TrajectoryFeedback(traj, schedule),
-        StateMap(traj.robot, frame="local"),
-    )
+    follows = TrajectoryFeedback(traj, schedule)
+    state = StateMap(traj.robot, frame="local")
     models, stages = along(traj.resampled(dt)), list[Stage]()
     rest = rest_or_fall(traj)
     end = rest.of_trajectory(traj.robot)
@@ -486,7 +484,8 @@ class Horizon:
     def bounds(self, stages: Sequence[Stage]) -> tuple[Array, Array, Mask]:
         """Return the lower limits, the upper limits and a mask of the soft limits of all stages."""
         soft = np.tile(self.at >= len(self.inputs), len(stages))
-        low, high = (np.concatenate([stage[i] for stage in stages]) for i in (-2, -1))
+        low = np.concatenate([stage.low for stage in stages])
+        high = np.concatenate([stage.high for stage in stages])
         return low, high, soft
 
 
@@ -552,10 +551,8 @@ class Receding(BoundLaw):
             # Check the soft limits at the end of the last sample. The robot may exceed a limit even
             # if the plan does not, because the robot differs from the model.
             previous, last = self._due
-            reached, width = (
-                previous.E @ e + previous.D @ last,
-                previous.high - previous.low,
-            )
+            reached = previous.E @ e + previous.D @ last
+            width = previous.high - previous.low
             excess = np.maximum(previous.low - reached, reached - previous.high)
             width = np.where(np.isfinite(width) & (width > 0.0), width, 1.0)
             self._record(_OF_ROBOT, t - self.of.dt, excess, 1.0 / width, _OVER)
@@ -595,10 +592,8 @@ class Receding(BoundLaw):
         entries are ordered by sample, and the first sample starts at time t [s].
         """
         fractions = np.where(self._soft[: len(excess)], excess * unit, 0.0)
-        row, (count, most, description) = (
-            int(fractions.argmax()),
-            self._violations[event],
-        )
+        row = int(fractions.argmax())
+        count, most, description = self._violations[event]
         if fractions[row] > max(most, least):
             sample, at = divmod(row, len(self.of.limited))
             most = float(fractions[row])
@@ -618,10 +613,8 @@ class Receding(BoundLaw):
         self._G, self._free = rows[:, :size], rows[:, size:]
         length = np.linalg.norm(self._G, axis=1)
         moved = length > 1e-12 * length.max()  # False for limits that no input affects
-        self._low, self._high = (
-            np.where(moved, low, -np.inf),
-            np.where(moved, high, np.inf),
-        )
+        self._low = np.where(moved, low, -np.inf)
+        self._high = np.where(moved, high, np.inf)
         self._unit = 1.0 / np.where(moved, length, 1.0)
         width = (self._high - self._low) * self._unit
         width = width[np.isfinite(width)]

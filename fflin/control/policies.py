@@ -371,10 +371,8 @@ class AllocatedPolicy(BoundLaw):
         self._command = Law(inner, names, (-free, free), np.inf)
         self._inner = inner if isinstance(inner, BoundLaw) else None
         self.advance = self._inner.advance if self._inner else None
-        self._data, self._design_data = (
-            robot.create_data(),
-            allocation.design.create_data(),
-        )
+        self._data = robot.create_data()
+        self._design_data = allocation.design.create_data()
         self._limits = input_limits(robot, limits_of(robot))
 
     @property

@@ -248,10 +248,8 @@ class TrajectoryFeedback(Feedback):
     def state_map(self, robot: Robot) -> StateMap:
         """Return the robot's states in base axes; `InputError` if the robot does not fit."""
         origin = self.trajectory.robot
-        state, design_state = (
-            StateMap(robot, frame="local"),
-            StateMap(origin, frame="local"),
-        )
+        state = StateMap(robot, frame="local")
+        design_state = StateMap(origin, frame="local")
         made = f"the trajectory was made for '{origin.name}'"
         for kind in ("input", "state"):
             require_same(made, state, kind, *signals_of(design_state, kind))

@@ -180,10 +180,8 @@ def struck(
         M[at : at + robot.nv, at : at + robot.nv] = inertia_at(robot, own_q)
         for name in list(robot.model.names)[ROOT + 1 :]:
             if whole.model.existJointName(start + name):
-                part_joint, whole_joint = (
-                    joint_called(robot, name),
-                    joint_called(whole, start + name),
-                )
+                part_joint = joint_called(robot, name)
+                whole_joint = joint_called(whole, start + name)
                 q[whole_joint.idx_q : whole_joint.idx_q + whole_joint.nq] = own_q[
                     part_joint.idx_q :
                 ][: part_joint.nq]

@@ -243,11 +243,9 @@ class Accelerations:
         # are for the position of the base, and are always zero.
         rows = np.zeros((2 * self._nv, self._nv))
         self._force_slopes = rows.T
-        self._by_turn, self._by_q_m, self._by_nu = (
-            rows[:3],
-            rows[6 : self._nv],
-            rows[self._nv :],
-        )
+        self._by_turn = rows[:3]
+        self._by_q_m = rows[6 : self._nv]
+        self._by_nu = rows[self._nv :]
         self._by_linear = self._by_nu[LINEAR]
         # These are views of the diagonals to which stiffness and damping are added.
         self._of_stiffness = np.einsum("ii->i", self._by_q_m[:, 6:])
@@ -267,12 +265,10 @@ class Accelerations:
         u is in base axes too, and `nu` is v in state order. The derivatives are written to the
         C-contiguous arrays `slopes` and `by_u`, and the result refers to these arrays.
         """
-        model, data, state, actuation = (
-            self._model,
-            self._data,
-            self._state,
-            self._actuation,
-        )
+        model = self._model
+        data = self._data
+        state = self._state
+        actuation = self._actuation
         tide = self._field and GravityGradient.at(self._field, q)
         # Here, the base is in its neutral pose and has no linear velocity, because large values
         # would make Pinocchio's derivatives less accurate. Without an orbit, c does not depend on

@@ -36,6 +36,7 @@ from fflin.robot.robot import Robot
 _DOUBLE = {"sqrt": "sqrt", "largest": "DBL_MAX", "two_pi": "6.283185307179586477"}
 _FLOAT = {"sqrt": "sqrtf", "largest": "FLT_MAX", "two_pi": "6.283185307179586477F"}
 
+_INVALID = 2  # status of a call, as in templates/header.h
 _LARGEST = 2**26  # [bytes] largest size of each file of a law
 
 # Valid names, without those of headers that the code or the C library includes.
@@ -343,10 +344,8 @@ class CLaw(Policy):
         """
         u = np.array(self._about["u0"])
         for _ in range(2):
-            memory, out = (
-                np.append(z, 0.0).astype(self._real),
-                np.zeros(len(u), self._real),
-            )
+            memory = np.append(z, 0.0).astype(self._real)
+            out = np.zeros(len(u), self._real)
             y = measure(u).astype(self._real)
             self._call(t, memory.ctypes, y.ctypes, out.ctypes)
             u = out.astype(float)
@@ -354,7 +353,7 @@ class CLaw(Policy):
 
     def _call(self, t: float, *arguments: object) -> None:
         """Call the C code at time t [s], or raise `InputError` if an argument is invalid."""
-        if self._step(*arguments) == 2:  # the status INVALID
+        if self._step(*arguments) == _INVALID:
             raise InputError(
                 f"the C code of '{self.name}' returned INVALID at t = {t:g} s: an argument was not "
                 "finite or too large"
@@ -424,24 +423,29 @@ def _texts(law: Law, name: str, real: str) -> tuple[str, dict[str, str]]:
     words: dict[str, object] = {
         **of_type,
         **{key: array(table) for key, table in tables.items()},
-        **{"name": name, "NAME": name.upper(), "real": real, "count": CASES},
-        **{
-            "law": law.title,
-            "frame": frame or "not known",
-            "robot": _plain(robot.name),
-        },
+        "name": name,
+        "NAME": name.upper(),
+        "real": real,
+        "count": CASES,
+        "law": law.title,
+        "frame": frame or "not known",
+        "robot": _plain(robot.name),
         "sha256": robot.urdf_sha256 or "not known",
         "world": ", the orbital frame" if robot.orbit else "",
-        **{"fflin_version": __version__, "pinocchio_version": pin.__version__},
+        "fflin_version": __version__,
+        "pinocchio_version": pin.__version__,
         "sample_time": f"{law.dt!r} s"
         if law.dt
         else "none, the law is continuous in time",
         "error": f"{error:.2g}",
         "tolerances": _listed("u", names, sizes),
-        **{"inputs": len(names), "input_list": _listed("u", names, units), "row": "0"},
+        "inputs": len(names),
+        "input_list": _listed("u", names, units),
+        "row": "0",
         f"{kind}_list": _listed(signal, *law.signals),
         "vectors": "{\n" + ",\n".join(vectors) + "}",
-        **{"ins": len(case.given), "outs": len(outs)},
+        "ins": len(case.given),
+        "outs": len(outs),
         "out_names": ",\n".join(f'    "{out_name}"' for out_name in outs),
     }
     if state:
@@ -457,7 +461,10 @@ def _texts(law: Law, name: str, real: str) -> tuple[str, dict[str, str]]:
     words["run"] = _filled(f"{kind}_run.c", words)
     header, source = _filled("header.h", words), _filled(f"{kind}_law.c", words)
     about: dict[str, object] = {
-        **{"title": title, "real": real, "frame": frame, "dt": law.dt},
+        "title": title,
+        "real": real,
+        "frame": frame,
+        "dt": law.dt,
         "kind": "samples" if len(tables["u0"]) > 1 else kind,
         "signals": {"input": law.inputs, kind: law.signals},
         "nq": robot.nq,
@@ -481,11 +488,15 @@ def _state_words(law: Law, state: StateMap) -> dict[str, object]:
     rows = len(law.tables["u0"])
     points = law.tables.get("axis_points")
     words: dict[str, object] = {
-        **{"joints": n, "joints_max": max(n, 1), "states": state.nx},
-        **{"rows": rows, "gains": len(law.tables["K"])},
+        "joints": n,
+        "joints_max": max(n, 1),
+        "states": state.nx,
+        "rows": rows,
+        "gains": len(law.tables["K"]),
         "joint_list": _listed("joints", state.names[6 : 6 + n], state.units[6 : 6 + n]),
         **dict.fromkeys(("gains_between", "sample_argument", "sample_given"), ""),
-        **{"sample_comment": "", "feedback": "feed_back(0, 1, x, u);"},
+        "sample_comment": "",
+        "feedback": "feed_back(0, 1, x, u);",
     }
     if rows > 1:
         words |= {
@@ -501,7 +512,9 @@ def _state_words(law: Law, state: StateMap) -> dict[str, object]:
             _plain(state.robot.joint_names[i]) for i in law.tables["axis_joint"]
         )
         words |= {
-            **{"axis_count": axes, "axis_room": room, "corners": 2**axes},
+            "axis_count": axes,
+            "axis_room": room,
+            "corners": 2**axes,
             "feedback": "feed_back_between(measured, x, u);",
             "gains_between": f", K interpolated linearly over {joints}, constant outside",
         }

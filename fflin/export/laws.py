@@ -73,10 +73,8 @@ def measured(world: StateMap, q: Array, v: Array) -> Array:
 
     `world` is a state map of the robot whose reference is the world. q and v are not checked.
     """
-    attitude, nu = (
-        quaternion_product(world.origin_quaternion, q[3:7]),
-        world.velocities(v),
-    )
+    attitude = quaternion_product(world.origin_quaternion, q[3:7])
+    nu = world.velocities(v)
     pose = attitude, world.positions(q), world.joint_positions(q)
     return np.concatenate((*pose, nu[:3], world.rotation(q) @ nu[3:6], nu[6:]))
 

@@ -206,7 +206,7 @@ def allocate(allocation, point, commanded):
     for column in range(count + 1):
         solve_inwards(work, tree, columns, column * size)
         for k in range(size):
-            pivot = load(work, tree.scaled + tree.row[k] + tree.depth[k])
+            pivot = load(work, tree.offsets.scaled + tree.row[k] + tree.depth[k])
             at = column * size + k
             store(columns, at, load(columns, at) * root(pivot))
     for lane in range(vec.lane_count(point.u)):
@@ -223,19 +223,17 @@ def _write_force(work, robot, point, columns, at):
     """
     turn_held(robot, point)
     push(work, robot.tree, point.pushing)
-    vec.copy(work, robot.tree.c, columns, at, len(robot.tree.row))
+    vec.copy(work, robot.tree.offsets.c, columns, at, len(robot.tree.row))
 
 
 @called
 def solve(problem, size, lane):
     """Write the solution x for one lane to `problem.x`; x is NaN if the given force is NaN."""
-    x, A, low, high, wanted = (
-        problem.x,
-        problem.A,
-        problem.low,
-        problem.high,
-        problem.wanted,
-    )
+    x = problem.x
+    A = problem.A
+    low = problem.low
+    high = problem.high
+    wanted = problem.wanted
     least = problem.least
     most = problem.most
     count = len(problem.least)

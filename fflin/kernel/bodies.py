@@ -63,7 +63,8 @@ def spatial_inertia_times(work, at, motion):
 
 def outwards(work, tree, q):
     """Write the poses and the inertias of all bodies at q, from the base to the tips."""
-    places, body_inertias = tree.places, tree.own
+    offsets = tree.offsets
+    places, body_inertias = offsets.places, offsets.body_inertias
     vec.put6(work, places, ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
     vec.put3(work, places + 6, (0.0, 0.0, 1.0))
     _inertia(work, body_inertias, places, tree.bodies, 0)
@@ -94,10 +95,12 @@ def outwards(work, tree, q):
 
 def inwards(work, tree):
     """Write the packed M, its diagonal and the composite inertias, from the tips to the base."""
+    offsets = tree.offsets
     bodies = len(tree.parent)
-    places, inertias, packed = tree.places, tree.inertias, tree.packed
+    places, packed = offsets.places, offsets.packed
+    inertias = offsets.subtree_inertias
     vec.clear(work, packed, len(tree.path))
-    vec.copy(work, tree.own, work, inertias, bodies * INERTIA)
+    vec.copy(work, offsets.body_inertias, work, inertias, bodies * INERTIA)
     pair = 0
     for body in range(bodies - 1, 0, -1):
         at = inertias + body * INERTIA
@@ -146,7 +149,7 @@ def inwards(work, tree):
     for index in range(len(tree.row)):
         at = packed + (tree.row[index] + tree.depth[index])
         vec.add(work, at, tree.armature[index])
-        store(work, tree.diagonal + index, load(work, at))
+        store(work, offsets.diagonal + index, load(work, at))
 
 
 def factorise(work, tree):
@@ -154,7 +157,8 @@ def factorise(work, tree):
 
     In the array at `scaled`, which is packed in the same way, 1 / D is written to the diagonal.
     """
-    packed, scaled = tree.packed, tree.scaled
+    offsets = tree.offsets
+    packed, scaled = offsets.packed, offsets.scaled
     for k in range(len(tree.row) - 1, -1, -1):
         row = packed + tree.row[k]
         depth = tree.depth[k]
@@ -175,12 +179,13 @@ def solve_inwards(work, tree, x, first):
 
     L is the factor of M, which `factorise` must have written.
     """
+    packed = tree.offsets.packed
     for k in range(len(tree.row) - 1, -1, -1):
         value = load(x, first + k)
         row = tree.row[k]
         for t in range(tree.depth[k]):
             at = first + tree.path[row + t]
-            store(x, at, load(x, at) - load(work, tree.packed + row + t) * value)
+            store(x, at, load(x, at) - load(work, packed + row + t) * value)
 
 
 def solve(work, tree, x):
@@ -188,11 +193,11 @@ def solve(work, tree, x):
 
     `factorise` must have written the factor of M.
     """
-    packed = tree.packed
+    packed, scaled = tree.offsets.packed, tree.offsets.scaled
     solve_inwards(work, tree, work, x)
     for k in range(len(tree.row)):
         row = tree.row[k]
-        value = load(work, x + k) * load(work, tree.scaled + row + tree.depth[k])
+        value = load(work, x + k) * load(work, scaled + row + tree.depth[k])
         for t in range(tree.depth[k]):
             value = value - load(work, packed + row + t) * load(
                 work, x + tree.path[row + t]
@@ -202,7 +207,8 @@ def solve(work, tree, x):
 
 def invert_factor(work, tree):
     """Replace the factor L of `factorise` by U = L^-1, and write V = L^-1 D^-1 at `scaled`."""
-    packed, scaled = tree.packed, tree.scaled
+    offsets = tree.offsets
+    packed, scaled = offsets.packed, offsets.scaled
     for k in range(len(tree.row)):
         row = packed + tree.row[k]
         depth = tree.depth[k]
@@ -222,7 +228,8 @@ def multiply(work, tree, judged):
 
     `invert_factor` must have written U = L^-1 and V = L^-1 D^-1.
     """
-    packed, scaled, square = tree.packed, tree.scaled, tree.square
+    offsets = tree.offsets
+    packed, scaled, square = offsets.packed, offsets.scaled, offsets.square
     size = len(tree.row)
     coupling = 0.0
     for i in range(size):
@@ -235,13 +242,13 @@ def multiply(work, tree, judged):
             store(work, square + (i * size + j), total)
             store(work, square + (j * size + i), total)
             if i == j:
-                coupling = coupling + total * load(work, tree.diagonal + i)
+                coupling = coupling + total * load(work, offsets.diagonal + i)
     store(work, judged, coupling)
 
 
 def joint_axis(work, tree, body):
     """Return the motion (angular, linear) of a joint per unit rate of its coordinate."""
-    z = vec.get3(work, tree.places + (body * PLACE + 6))
+    z = vec.get3(work, tree.offsets.places + (body * PLACE + 6))
     share = tree.factor[body]
     return vec.times(z, share * tree.turns[body]), vec.times(
         z, share * tree.slides[body]
@@ -278,12 +285,13 @@ def move_bodies(work, tree, nu):
 
     The velocities are for v_b = 0, and the accelerations are for c = 0.
     """
-    vec.clear(work, tree.motion, MOTION)
-    vec.put3(work, tree.motion, vec.get3(nu, 0))
+    offsets = tree.offsets
+    vec.clear(work, offsets.motion, MOTION)
+    vec.put3(work, offsets.motion, vec.get3(nu, 0))
     for body in range(1, len(tree.parent)):
-        at = tree.motion + body * MOTION
-        above = tree.motion + tree.parent[body] * MOTION
-        place = tree.places + body * PLACE
+        at = offsets.motion + body * MOTION
+        above = offsets.motion + tree.parent[body] * MOTION
+        place = offsets.places + body * PLACE
         rate = load(nu, tree.coordinate[body])
         axis = joint_axis(work, tree, body)
         velocity = at_joint(work, above + VELOCITY, place)
@@ -299,10 +307,11 @@ def load_bodies(work, tree):
 
     The moment includes the gyroscopic torque of stored momentum.
     """
+    offsets = tree.offsets
     for body in range(len(tree.parent)):
-        at = tree.load + body * LOAD + FORCE
-        moving = tree.motion + body * MOTION
-        inertia = tree.own + body * INERTIA
+        at = offsets.load + body * LOAD + FORCE
+        moving = offsets.motion + body * MOTION
+        inertia = offsets.body_inertias + body * INERTIA
         w, v = vec.get6(work, moving + VELOCITY)
         turning, p = spatial_inertia_times(work, inertia, (w, v))
         moment, force = spatial_inertia_times(
@@ -312,11 +321,9 @@ def load_bodies(work, tree):
         vec.put6(work, at, (moment, vec.plus(force, vec.cross(w, p))))
     for index in range(len(tree.stored_body)):
         body = tree.stored_body[index]
-        w, h = (
-            vec.get3(work, tree.motion + body * MOTION),
-            stored_momentum(work, tree, index),
-        )
-        vec.add3(work, tree.load + body * LOAD + FORCE, vec.cross(w, h))
+        w = vec.get3(work, offsets.motion + body * MOTION)
+        h = stored_momentum(work, tree, index)
+        vec.add3(work, offsets.load + body * LOAD + FORCE, vec.cross(w, h))
 
 
 def load_carried(work, tree, u):
@@ -325,7 +332,7 @@ def load_carried(work, tree, u):
         push = vec.times6(
             carried_wrench(work, tree, index), -load(u, tree.input[index])
         )
-        vec.add6(work, tree.load + tree.wrench_body[index] * LOAD + FORCE, push)
+        vec.add6(work, tree.offsets.load + tree.wrench_body[index] * LOAD + FORCE, push)
 
 
 def collect_momenta(work, tree):
@@ -333,10 +340,11 @@ def collect_momenta(work, tree):
 
     They are defined in `kernel.derivatives`. CARRIED is set to zero.
     """
+    offsets = tree.offsets
     for body in range(len(tree.parent)):
-        at = tree.load + body * LOAD
-        inertia = tree.own + body * INERTIA
-        w, v = vec.get6(work, tree.motion + body * MOTION + VELOCITY)
+        at = offsets.load + body * LOAD
+        inertia = offsets.body_inertias + body * INERTIA
+        w, v = vec.get6(work, offsets.motion + body * MOTION + VELOCITY)
         h = vec.get3(work, inertia + 1)
         vec.put3(work, at + MOMENTUM, spatial_inertia_times(work, inertia, (w, v))[1])
         # The second moments of mass, the sum of m r r^T, are tr(I) / 2 times the identity, minus I.
@@ -349,12 +357,12 @@ def collect_momenta(work, tree):
         vec.clear(work, at + STORED, 3)
         vec.clear(work, at + CARRIED, 6)
     for index in range(len(tree.stored_body)):
-        at = tree.load + tree.stored_body[index] * LOAD + STORED
+        at = offsets.load + tree.stored_body[index] * LOAD + STORED
         vec.add3(work, at, stored_momentum(work, tree, index))
     for body in range(len(tree.parent) - 1, 0, -1):
-        at = tree.load + body * LOAD
-        above = tree.load + tree.parent[body] * LOAD
-        d = vec.get3(work, tree.places + body * PLACE + 9)
+        at = offsets.load + body * LOAD
+        above = offsets.load + tree.parent[body] * LOAD
+        d = vec.get3(work, offsets.places + body * PLACE + 9)
         p = vec.get3(work, at + MOMENTUM)
         vec.add3(work, above + MOMENTUM, p)
         vec.add3(work, above + STORED, vec.get3(work, at + STORED))
@@ -366,13 +374,13 @@ def collect_momenta(work, tree):
 
 def stored_momentum(work, tree, index):
     """Return the stored momentum number `index`, in base axes."""
-    axes = vec.get_columns(work, tree.places + tree.stored_body[index] * PLACE)
+    axes = vec.get_columns(work, tree.offsets.places + tree.stored_body[index] * PLACE)
     return vec.product(axes, vec.get3(tree.stored, 3 * index))
 
 
 def carried_wrench(work, tree, index):
     """Return the wrench of a body-fixed unit input, in base axes and about its body's joint."""
-    axes = vec.get_columns(work, tree.places + tree.wrench_body[index] * PLACE)
+    axes = vec.get_columns(work, tree.offsets.places + tree.wrench_body[index] * PLACE)
     moment, force = vec.get6(tree.wrench, 6 * index)
     return vec.product(axes, moment), vec.product(axes, force)
 
@@ -386,17 +394,19 @@ def add_column(work, at, width, force):
 
 def write_columns(work, tree):
     """Write the generalised forces of body-fixed unit inputs, as columns of B_u."""
+    offsets = tree.offsets
     count = len(tree.wrench_body)
-    vec.clear(work, tree.columns, len(tree.row) * count)
+    vec.clear(work, offsets.columns, len(tree.row) * count)
     for index in range(count):
         body = tree.wrench_body[index]
         wrench = carried_wrench(work, tree, index)
         while body > 0:
             value = vec.dot6(joint_axis(work, tree, body), wrench)
-            vec.add(work, tree.columns + tree.coordinate[body] * count + index, value)
-            wrench = at_parent(work, tree.places + body * PLACE, wrench)
+            at = offsets.columns + tree.coordinate[body] * count + index
+            vec.add(work, at, value)
+            wrench = at_parent(work, offsets.places + body * PLACE, wrench)
             body = tree.parent[body]
-        add_column(work, tree.columns + index, count, wrench)
+        add_column(work, offsets.columns + index, count, wrench)
 
 
 def collect(work, tree):
@@ -404,28 +414,30 @@ def collect(work, tree):
 
     The sums start at the tips.
     """
-    vec.clear(work, tree.bias, len(tree.row))
+    offsets = tree.offsets
+    vec.clear(work, offsets.bias, len(tree.row))
     for body in range(len(tree.parent) - 1, 0, -1):
-        force = vec.get6(work, tree.load + body * LOAD + FORCE)
+        force = vec.get6(work, offsets.load + body * LOAD + FORCE)
         value = vec.dot6(joint_axis(work, tree, body), force)
-        vec.add(work, tree.bias + tree.coordinate[body], value)
-        to = tree.load + tree.parent[body] * LOAD + FORCE
-        vec.add6(work, to, at_parent(work, tree.places + body * PLACE, force))
-    vec.add6(work, tree.bias, vec.get6(work, tree.load + FORCE))
+        vec.add(work, offsets.bias + tree.coordinate[body], value)
+        to = offsets.load + tree.parent[body] * LOAD + FORCE
+        vec.add6(work, to, at_parent(work, offsets.places + body * PLACE, force))
+    vec.add6(work, offsets.bias, vec.get6(work, offsets.load + FORCE))
 
 
 def accelerate_bodies(work, tree):
     """Write Psi'' and the accelerations that c adds, and add the forces that c requires to FORCE.
 
-    c begins at work[tree.c]. `collect_momenta` must have set CARRIED to zero. The accelerations are
-    computed from the base to the tips, the forces from the tips to the base.
+    c begins at work[tree.offsets.c]. `collect_momenta` must have set CARRIED to zero. The
+    accelerations are computed from the base to the tips, the forces from the tips to the base.
     """
-    vec.put6(work, tree.motion + ADDED, vec.get6(work, tree.c))
+    offsets = tree.offsets
+    vec.put6(work, offsets.motion + ADDED, vec.get6(work, offsets.c))
     for body in range(1, len(tree.parent)):
-        at = tree.motion + body * MOTION
-        above = tree.motion + tree.parent[body] * MOTION
-        place = tree.places + body * PLACE
-        rate = load(work, tree.c + tree.coordinate[body])
+        at = offsets.motion + body * MOTION
+        above = offsets.motion + tree.parent[body] * MOTION
+        place = offsets.places + body * PLACE
+        rate = load(work, offsets.c + tree.coordinate[body])
         axis = joint_axis(work, tree, body)
         added = at_joint(work, above + ADDED, place)
         acceleration = vec.plus6(added, at_joint(work, above + BIAS, place))
@@ -434,10 +446,11 @@ def accelerate_bodies(work, tree):
         vec.put6(work, at + PSI2, vec.plus6(motion_cross(acceleration, axis), turned))
         vec.put6(work, at + ADDED, vec.plus6(added, vec.times6(axis, rate)))
     for body in range(len(tree.parent) - 1, 0, -1):
-        at = tree.load + body * LOAD
-        added = vec.get6(work, tree.motion + body * MOTION + ADDED)
-        inertial_force = spatial_inertia_times(work, tree.own + body * INERTIA, added)
+        at = offsets.load + body * LOAD
+        added = vec.get6(work, offsets.motion + body * MOTION + ADDED)
+        inertia = offsets.body_inertias + body * INERTIA
+        inertial_force = spatial_inertia_times(work, inertia, added)
         carried = vec.plus6(vec.get6(work, at + CARRIED), inertial_force)
         vec.add6(work, at + FORCE, carried)
-        to = tree.load + tree.parent[body] * LOAD + CARRIED
-        vec.add6(work, to, at_parent(work, tree.places + body * PLACE, carried))
+        to = offsets.load + tree.parent[body] * LOAD + CARRIED
+        vec.add6(work, to, at_parent(work, offsets.places + body * PLACE, carried))

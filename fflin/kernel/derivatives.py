@@ -79,10 +79,11 @@ def _coriolis_transposed(work, at, along):
 
 def _write_springs(work, tree, width):
     """Write the derivatives of the forces of springs and dampers; all other entries are zero."""
+    offsets = tree.offsets
     n = len(tree.row) - 6
-    vec.clear(work, tree.lower, len(tree.row) * width)
+    vec.clear(work, offsets.lower, len(tree.row) * width)
     for index in range(n):
-        row = tree.lower + (6 + index) * width
+        row = offsets.lower + (6 + index) * width
         store(work, row + (6 + index), load(tree.stiffness, index))
         store(work, row + (12 + n + index), load(tree.damping, index))
 
@@ -94,20 +95,21 @@ def differentiate(work, tree):
     (6 + n, 12 + 2 n). Each column is the derivative with respect to one coordinate of a
     displacement of the state, in base axes.
     """
+    offsets = tree.offsets
     n = len(tree.row) - 6
     width = 2 * len(tree.row)
     zero = 0.0
     one = 1.0
-    spin = vec.get3(work, tree.motion)
+    spin = vec.get3(work, offsets.motion)
     _write_springs(work, tree, width)
     # The path of a joint i is the base, the joints before joint i, and joint i itself. For each
     # joint i, write the derivatives of the forces of its path with respect to the position and rate
     # of joint i. Also write the derivatives of the force of joint i with respect to the positions
     # and rates of the joints before it, and with respect to omega_b.
     for body in range(len(tree.parent) - 1, 0, -1):
-        at = tree.load + body * LOAD
-        moving = tree.motion + body * MOTION
-        inertia = tree.inertias + body * INERTIA
+        at = offsets.load + body * LOAD
+        moving = offsets.motion + body * MOTION
+        inertia = offsets.subtree_inertias + body * INERTIA
         column = tree.coordinate[body]
         axis = joint_axis(work, tree, body)
         psi, psi2 = vec.get6(work, moving + PSI), vec.get6(work, moving + PSI2)
@@ -121,17 +123,17 @@ def differentiate(work, tree):
         by_q = vec.plus6(by_q, (turned, vec.cross(axis[0], force)))
         weight = inertia_times(work, inertia, psi)
         by_v = vec.plus6(_coriolis(work, at, axis[0]), vec.plus6(weight, weight))
-        joint_row = tree.lower + column * width
+        joint_row = offsets.lower + column * width
         above = body
         while above > 0:
-            place = tree.places + above * PLACE
+            place = offsets.places + above * PLACE
             other = tree.coordinate[above]
             axis = joint_axis(work, tree, above)
-            row = tree.lower + other * width
+            row = offsets.lower + other * width
             vec.add(work, row + column, vec.dot6(axis, by_q))
             vec.add(work, row + (column + 6 + n), vec.dot6(axis, by_v))
             if above != body:
-                moving = tree.motion + above * MOTION
+                moving = offsets.motion + above * MOTION
                 psi, psi2 = vec.get6(work, moving + PSI), vec.get6(work, moving + PSI2)
                 vec.add(
                     work,
@@ -147,15 +149,15 @@ def differentiate(work, tree):
         vec.add3(
             work, joint_row + (6 + n), vec.plus(coriolis, vec.cross(momentum[0], spin))
         )
-        bodies.add_column(work, tree.lower + column, width, by_q)
-        bodies.add_column(work, tree.lower + (column + 6 + n), width, by_v)
+        bodies.add_column(work, offsets.lower + column, width, by_q)
+        bodies.add_column(work, offsets.lower + (column + 6 + n), width, by_v)
     # Write the derivatives of the base's moment and force with respect to omega_b.
     axes = (one, zero, zero), (zero, one, zero), (zero, zero, one)
     for index in range(3):
         turning = vec.cross(spin, axes[index]), (zero, zero, zero)
-        weight = inertia_times(work, tree.inertias, turning)
-        total = vec.plus6(_coriolis(work, tree.load, axes[index]), weight)
-        bodies.add_column(work, tree.lower + (6 + n + index), width, total)
+        weight = inertia_times(work, offsets.subtree_inertias, turning)
+        total = vec.plus6(_coriolis(work, offsets.load, axes[index]), weight)
+        bodies.add_column(work, offsets.lower + (6 + n + index), width, total)
 
 
 def _push(work, tree, by_u):
@@ -164,17 +166,18 @@ def _push(work, tree, by_u):
     The column of a body-fixed input is M^-1 times the input's column of B_u. The column of any
     other input is a column of M^-1.
     """
+    offsets = tree.offsets
     size, count, carried = len(tree.row), len(tree.driven), len(tree.input)
     for row in range(size):
         for index in range(count):
             if tree.driven[index] >= 0:
-                value = load(work, tree.square + row * size + tree.driven[index])
+                value = load(work, offsets.square + row * size + tree.driven[index])
                 store(work, by_u + row * count + index, value)
         for index in range(carried):
             total = 0.0
             for k in range(size):
-                column = load(work, tree.columns + k * carried + index)
-                total = total + load(work, tree.square + row * size + k) * column
+                column = load(work, offsets.columns + k * carried + index)
+                total = total + load(work, offsets.square + row * size + k) * column
             store(work, by_u + row * count + tree.input[index], total)
 
 
@@ -183,6 +186,7 @@ def _solve(work, tree, slopes):
 
     Six columns are computed at a time.
     """
+    offsets = tree.offsets
     size = len(tree.row)
     width = 2 * len(tree.row)
     none = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
@@ -192,15 +196,14 @@ def _solve(work, tree, slopes):
         vec.clear(work, slopes + row * width, 6)
     for column in range(width % 6 or 6, width, 6):
         for k in range(size):
-            vec.put6(
-                work, tree.held + k * 6, vec.get6(work, tree.lower + column + k * width)
-            )
+            entries = vec.get6(work, offsets.lower + column + k * width)
+            vec.put6(work, offsets.block + k * 6, entries)
         for row in range(size):
             total = none
             for k in range(size):
-                entry = load(work, tree.square + (row * size + k))
-                held = vec.get6(work, tree.held + k * 6)
-                total = vec.minus6(total, vec.times6(held, entry))
+                entry = load(work, offsets.square + (row * size + k))
+                entries = vec.get6(work, offsets.block + k * 6)
+                total = vec.minus6(total, vec.times6(entries, entry))
             vec.put6(work, slopes + column + row * width, total)
 
 
@@ -235,10 +238,11 @@ def derive(tree, points, out, lanes, work):
       receives the sum of the couplings M_ii (M^-1)_ii.
     - `lanes`, which is a `Packed`, and `work` are work space.
     """
+    offsets = tree.offsets
     q, nu, force, u = points
     c, A, by_u, judged = out
     size = len(tree.row)
-    slopes = tree.size
+    slopes = offsets.size
     moves = len(nu) > 0
     inputs = slopes + size * 2 * size
     coupling = inputs + size * len(tree.driven)
@@ -262,9 +266,9 @@ def derive(tree, points, out, lanes, work):
             bodies.collect(work, tree)
             bodies.collect_momenta(work, tree)
             for index in range(size):
-                value = load(lanes.force, index) - load(work, tree.bias + index)
-                store(work, tree.c + index, value)
-            bodies.solve(work, tree, tree.c)
+                value = load(lanes.force, index) - load(work, offsets.bias + index)
+                store(work, offsets.c + index, value)
+            bodies.solve(work, tree, offsets.c)
         bodies.invert_factor(work, tree)
         bodies.multiply(work, tree, coupling)
         _push(work, tree, inputs)
@@ -274,7 +278,7 @@ def derive(tree, points, out, lanes, work):
             bodies.accelerate_bodies(work, tree)
             differentiate(work, tree)
             _solve(work, tree, slopes)
-            _unpack(work, tree.c, size, c, first, 0)
+            _unpack(work, offsets.c, size, c, first, 0)
             lower = size * 2 * size
             _unpack(work, slopes, lower, A, first, A.shape[1] - lower)
 
@@ -301,7 +305,7 @@ class RowAccelerations:
         nu = len(actuation.names)
         self.state, self._actuation, self._tree = state, actuation, tree
         self._sizes = state.robot.nq, nv, nv, nu
-        self._work = tree.size + nv * state.nx + nv * nu + 1
+        self._work = tree.offsets.size + nv * state.nx + nv * nu + 1
         self._least_coupling = 0.999 * nv
 
     def write_inverse(self, q: Array, by_u: Array) -> Mask:

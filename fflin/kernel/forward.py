@@ -132,22 +132,23 @@ def turn_held(robot, point):
 
 
 def push(work, tree, pushing):
-    """Write the generalised force of the inputs `pushing` to `work`, from the index `tree.c` on.
+    """Write the generalised force of the inputs `pushing` to `work`.
 
-    In `pushing`, torques and forces on the base are in base axes. `bodies.write_columns` must be
-    called before `push`, which reads the columns of body-fixed inputs.
+    The force begins at work[tree.offsets.c]. In `pushing`, torques and forces on the base are in
+    base axes. `bodies.write_columns` must be called before `push`, which reads the columns of
+    body-fixed inputs.
     """
+    offsets = tree.offsets
     size, count = len(tree.row), len(tree.wrench_body)
-    vec.clear(work, tree.c, size)
+    vec.clear(work, offsets.c, size)
     for index in range(len(tree.driven)):
         if tree.driven[index] >= 0:
-            vec.add(work, tree.c + tree.driven[index], load(pushing, index))
+            vec.add(work, offsets.c + tree.driven[index], load(pushing, index))
     for index in range(count):
         u = load(pushing, tree.input[index])
         for row in range(size):
-            vec.add(
-                work, tree.c + row, load(work, tree.columns + row * count + index) * u
-            )
+            force = load(work, offsets.columns + row * count + index) * u
+            vec.add(work, offsets.c + row, force)
 
 
 @called
@@ -157,7 +158,7 @@ def accelerate(work, robot, point, rates, to):
     `configure` must be called before this function. The factorisation of M overwrites M.
     """
     tree, nu = robot.tree, point.nu
-    force = tree.c
+    force = tree.offsets.c
     size = len(tree.row)
     bodies.write_columns(work, tree)
     push(work, tree, point.pushing)
@@ -166,7 +167,7 @@ def accelerate(work, robot, point, rates, to):
     bodies.load_bodies(work, tree)
     bodies.collect(work, tree)
     for index in range(size):
-        vec.add(work, force + index, -load(work, tree.bias + index))
+        vec.add(work, force + index, -load(work, tree.offsets.bias + index))
     for joint in range(len(robot.index)):
         if robot.springy[joint]:
             stretch = joint_position(robot, point.q, joint) - load(robot.rest, joint)
@@ -214,7 +215,7 @@ def add_wrench(work, robot, reference, point, weight, moment):
     axes = vec.axes_of(point.q)
     moments, force = vec.get6(point.wrench, 0)
     position = vec.minus(vec.get3(point.q, 0), vec.get3(reference.start, 9))
-    lever = vec.product(axes, vec.get3(work, robot.tree.inertias + 1))
+    lever = vec.product(axes, vec.get3(work, robot.tree.offsets.subtree_inertias + 1))
     force, falls = vec.product(axes, force), vec.get3(reference.weight, 0)
     # The weight m g acts at the centre of mass. Its moment about the base's origin is `lever` x g,
     # where `lever` is m times the position of the centre of mass from the base's origin.
@@ -264,7 +265,7 @@ def start_at(work, robot, reference, point):
     """
     axes = vec.axes_of(point.q)
     tree = robot.tree
-    lever = vec.get3(work, tree.inertias + 1)
+    lever = vec.get3(work, tree.offsets.subtree_inertias + 1)
     nothing = vec.minus(lever, lever)
     angular, linear = _momentum_error(work, robot, point.nu, (nothing, nothing))
     position = vec.minus(vec.get3(point.q, 0), vec.get3(reference.start, 9))
@@ -281,13 +282,15 @@ def _momentum_error(work, robot, nu, momentum):
     Both momenta are (angular, linear) in base axes, about the base's origin.
     """
     tree = robot.tree
+    offsets = tree.offsets
     # The momentum of the bodies is the product of nu with the six base rows of M. By symmetry, the
     # six entries of a joint in the base rows are the first six entries of the joint's row.
     error = vec.minus6(
-        momentum, spatial_inertia_times(work, tree.inertias, vec.get6(nu, 0))
+        momentum,
+        spatial_inertia_times(work, offsets.subtree_inertias, vec.get6(nu, 0)),
     )
     for index in range(6, len(tree.row)):
-        row = vec.get6(work, tree.packed + tree.row[index])
+        row = vec.get6(work, offsets.packed + tree.row[index])
         error = vec.minus6(error, vec.times6(row, load(nu, index)))
     angular, linear = error
     for index in range(len(tree.stored_body)):
@@ -303,8 +306,10 @@ def impose(work, robot, reference, point, t):
     the correction is small and has small rounding errors.
     """
     tree, nu = robot.tree, point.nu
+    offsets = tree.offsets
     axes = vec.axes_of(point.q)
-    m, lever = load(work, tree.inertias), vec.get3(work, tree.inertias + 1)
+    m = load(work, offsets.subtree_inertias)
+    lever = vec.get3(work, offsets.subtree_inertias + 1)
     per_mass = 1.0 / m
     (linear, angular), center = kept_at(reference, t)
     position = vec.minus(center, vec.times(vec.product(axes, lever), per_mass))
@@ -314,7 +319,7 @@ def impose(work, robot, reference, point, t):
     angular, linear = _momentum_error(work, robot, nu, (angular, linear))
     # Compute the correction w of omega_b with the robot's inertia about the robot's centre of mass.
     # Compute the correction of v_b from w and the error of the linear momentum.
-    (xx, xy, xz), (yy, yz, zz) = vec.get6(work, tree.inertias + 4)
+    (xx, xy, xz), (yy, yz, zz) = vec.get6(work, offsets.subtree_inertias + 4)
     d = vec.times(lever, per_mass)
     about = vec.minus(angular, vec.cross(d, linear))
     p, q, r = lever[0] * d[0], lever[1] * d[1], lever[2] * d[2]

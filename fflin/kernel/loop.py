@@ -302,16 +302,14 @@ def advance(words, clock, last, every, rows, work):
 
     If `every` is not 0, the function writes a row into `rows` at every step that is a multiple of
     `every`. A row consists of q, nu, u, the reference momentum (6,) and the reference centre of
-    mass (3,). `work` has `Tree.size` entries.
+    mass (3,). `work` has `WorkOffsets.size` entries.
     """
     arguments = ARGUMENTS(words)
-    robot, method, law, channel, kept = (
-        arguments.robot,
-        arguments.method,
-        arguments.law,
-        arguments.channel,
-        arguments.reference,
-    )
+    robot = arguments.robot
+    method = arguments.method
+    law = arguments.law
+    channel = arguments.channel
+    kept = arguments.reference
     # `at` is the index of the next entry in `rows`
     point = arguments.point
     h = method.h

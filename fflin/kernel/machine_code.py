@@ -88,7 +88,8 @@ def _spread(
 def _alike(*kinds: Type) -> Signature:
     """Return the signature of an operation: on lanes if any operand has lanes, else on doubles."""
     kind = lanes if lanes in kinds else float64
-    return kind(*[kind] * len(kinds))
+    operands = [kind] * len(kinds)
+    return kind(*operands)
 
 
 def _arithmetic(
@@ -101,7 +102,8 @@ def _arithmetic(
     ) -> ir.Value:
         return generate(builder, *values, flags=["contract"])
 
-    signature = lanes(*[lanes] * operands)
+    kinds = [lanes] * operands
+    signature = lanes(*kinds)
     infer_global(python)(make_concrete_template(python.__name__, python, [signature]))
     extending.lower_builtin(python, *signature.args)(lowered)
 

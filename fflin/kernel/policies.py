@@ -301,11 +301,12 @@ def command(work, robot, law, point, t, count, stage):
     outputs = len(law.measured)
     gyros = law.gyros
     tree = robot.tree
+    offsets = tree.offsets
     if len(gyros) > 0:
         move_bodies(work, tree, point.nu)
     for index in range(len(gyros)):
-        rate = vec.get3(work, tree.motion + gyros[index] * MOTION)
-        axes = vec.get_columns(work, tree.places + gyros[index] * PLACE)
+        rate = vec.get3(work, offsets.motion + gyros[index] * MOTION)
+        axes = vec.get_columns(work, offsets.places + gyros[index] * PLACE)
         rate = vec.across(
             vec.get_columns(law.gyro_axes, 9 * index), vec.across(axes, rate)
         )

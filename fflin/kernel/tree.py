@@ -11,7 +11,7 @@ change during a call.
 from __future__ import annotations
 
 from collections import namedtuple
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache, lru_cache
 from typing import Generic, NamedTuple, TypeVar
 
@@ -164,13 +164,33 @@ PLACE, INERTIA = 12, 10
 MOTION, LOAD = 30, 27
 
 
+class WorkOffsets(
+    namedtuple(
+        "WorkOffsets",
+        "places body_inertias subtree_inertias packed scaled diagonal square motion load bias "
+        "c columns lower block size",
+    )
+):
+    """Offsets of the arrays in the work space of a tree. `size` is the size of the work space.
+
+    - `places`, `body_inertias`, `subtree_inertias`: pose of each body, inertia of each body, and
+      inertia of the subtree of each body.
+    - `motion`, `load`: motion vectors of each body, and forces and momenta of its subtree.
+    - `packed`, `scaled`: M and its factors, packed as in `kernel.bodies`.
+    - `diagonal` (6 + n,): the diagonal of M. `square` (6 + n, 6 + n): the inverse of M.
+    - `bias`, `c` (6 + n,): the bias forces and the accelerations.
+    - `columns` (6 + n, number of body-fixed inputs): the columns of B_u of body-fixed inputs.
+    - `lower` (6 + n, 12 + 2 n): the matrix of `kernel.derivatives.differentiate`. `block` (6 + n,
+      6): a copy of six of its columns.
+    """
+
+
 class Tree(
     namedtuple(
         "Tree",
         "parent fixed index unbounded turns slides bodies axes coordinate factor armature "
         "target share row depth path common driven wrench_body wrench input stored_body stored "
-        "stiffness damping places own inertias packed scaled diagonal square motion load "
-        "bias c columns lower held size",
+        "stiffness damping offsets",
     )
 ):
     """Kinematic tree of a robot, with inputs, stored momenta, springs and dampers.
@@ -219,18 +239,25 @@ class Tree(
     - `stored_body`: the bodies with a stored momentum. `stored`: the stored momenta in joint axes.
     - `stiffness`, `damping` (n,): the springs and dampers of the joints.
 
-    `size` is the size of the work space. The other fields are offsets in the work space.
+    `offsets` are the `WorkOffsets` of the tree.
     """
 
 
 _OF_TREE = {
     INDICES: "parent index coordinate target row depth path driven wrench_body input stored_body",
-    WHOLE: "places own inertias packed scaled diagonal square motion load bias c columns "
-    "lower held size",
     LANED: "fixed bodies wrench stored stiffness damping",
 }
 _AXES, _COMMON = Kind(np.float64, 3), Kind(np.intp, 2)
-TREE = Struct(Tree, REALS, _OF_TREE, unbounded=FLAGS, axes=_AXES, common=_COMMON)
+WORK_OFFSETS = Struct(WorkOffsets, WHOLE)
+TREE = Struct(
+    Tree,
+    REALS,
+    _OF_TREE,
+    unbounded=FLAGS,
+    axes=_AXES,
+    common=_COMMON,
+    offsets=WORK_OFFSETS,
+)
 
 
 @lru_cache(maxsize=16)  # robots do not change
@@ -249,20 +276,9 @@ def batch_tree(robot: Robot) -> Tree | None:
         return None
     places, turns, slides = zip((pin.SE3.Identity(), 0.0, 0.0), *screws, strict=True)
     bodies = len(joints)
-    parent = np.array(
-        [max(0, model.parents[ROOT + body] - ROOT) for body in range(bodies)]
-    )
-    fixed, inertias = np.zeros((bodies, 12)), np.zeros((bodies, 10))
-    for body, place in enumerate(places):
-        placement = (
-            places[parent[body]].inverse() * model.jointPlacements[ROOT + body] * place
-        )
-        fixed[body] = np.concatenate(
-            (placement.rotation.ravel("F"), placement.translation)
-        )
-        # Pinocchio's order is m, m c, and I as xx xy yy xz yz zz.
-        dynamic = place.actInv(model.inertias[ROOT + body]).toDynamicParameters()
-        inertias[body] = dynamic[[0, 1, 2, 3, 4, 5, 7, 6, 8, 9]]
+    parent = [max(0, model.parents[ROOT + body] - ROOT) for body in range(bodies)]
+    fixed, inertias = _body_parameters(model, parent, places)
+    axes = np.array([place.rotation for place in places])
     state = StateMap(robot)
     size = 6 + robot.n
     # In v = S nu, the row of S for a joint has one nonzero entry: the joint motion per unit of the
@@ -273,8 +289,76 @@ def batch_tree(robot: Robot) -> Tree | None:
     factor = S[of_v, coordinate].tolist()
     paths = _paths(size, parent, coordinate)
     row = np.cumsum([0, *map(len, paths[:-1])])
-    target, share = [], []
-    for body in range(bodies - 1, 0, -1):
+    target, share = _contributions(parent, coordinate, factor, paths, row)
+    # For each pair of paths, count the coordinates that both paths contain.
+    common = np.array([[len({*one} & {*other}) for other in paths] for one in paths])
+    actuation = Actuation(state)
+    driven = np.abs(actuation.fixed).argmax(axis=0)
+    driven = np.where(actuation.fixed.any(axis=0), driven, -1)
+    wrench_body, inputs, wrench = _wrenches(actuation, axes)
+    stored_body = [joint - ROOT for joint, _ in robot.stored_momentum]
+    stored = [axes[joint - ROOT].T @ h for joint, h in robot.stored_momentum]
+    return Tree(
+        parent=np.array(parent),
+        fixed=fixed.ravel(),
+        index=np.array([joint.idx_q for joint in joints]),
+        unbounded=np.array([joint.nq == 2 for joint in joints]),
+        turns=np.array(turns),
+        slides=np.array(slides),
+        bodies=inertias.ravel(),
+        axes=axes,
+        coordinate=np.array(coordinate),
+        factor=np.array(factor),
+        armature=S.T**2 @ model.armature,
+        target=np.array(target, dtype=np.intp),
+        share=np.array(share, dtype=float),
+        row=row,
+        depth=np.array([len(path) - 1 for path in paths]),
+        path=np.array([index for path in paths for index in path]),
+        common=common,
+        driven=driven,
+        wrench_body=np.array(wrench_body, dtype=np.intp),
+        wrench=np.array(wrench).ravel(),
+        input=np.array(inputs, dtype=np.intp),
+        stored_body=np.array(stored_body, dtype=np.intp),
+        stored=np.array(stored).ravel(),
+        stiffness=np.array(robot.springs.stiffness),
+        damping=np.array(robot.springs.damping),
+        offsets=_work_offsets(bodies, size, sum(map(len, paths)), len(inputs)),
+    )
+
+
+def _body_parameters(
+    model: pin.Model, parent: list[int], places: Sequence[pin.SE3]
+) -> tuple[Array, Array]:
+    """Return the fields `fixed` (number of bodies, 12) and `bodies` (number of bodies, 10).
+
+    `places` are the poses of the joint frames of the tree relative to Pinocchio's joint frames.
+    """
+    fixed = np.zeros((len(places), PLACE))
+    inertias = np.zeros((len(places), INERTIA))
+    for body, place in enumerate(places):
+        placement = model.jointPlacements[ROOT + body] * place
+        placement = places[parent[body]].inverse() * placement
+        fixed[body, :9] = placement.rotation.ravel("F")
+        fixed[body, 9:] = placement.translation
+        # Pinocchio's order is m, m c, and I as xx xy yy xz yz zz.
+        dynamic = place.actInv(model.inertias[ROOT + body]).toDynamicParameters()
+        inertias[body] = dynamic[[0, 1, 2, 3, 4, 5, 7, 6, 8, 9]]
+    return fixed, inertias
+
+
+def _contributions(
+    parent: list[int],
+    coordinate: list[int],
+    factor: list[float],
+    paths: list[list[int]],
+    row: NDArray[np.intp],
+) -> tuple[list[int], list[float]]:
+    """Return the fields `target` and `share`: the contributions of the bodies to M."""
+    target: list[int] = []
+    share: list[float] = []
+    for body in range(len(parent) - 1, 0, -1):
         above = body
         while above > 0:
             low, high = sorted((coordinate[body], coordinate[above]))
@@ -284,58 +368,67 @@ def batch_tree(robot: Robot) -> Tree | None:
             above = parent[above]
         target.append(row[coordinate[body]])
         share.append(factor[body])
-    # For each pair of paths, count the coordinates that both paths contain.
-    common = np.array([[len({*one} & {*other}) for other in paths] for one in paths])
-    axes, actuation = np.array([place.rotation for place in places]), Actuation(state)
+    return target, share
+
+
+def _wrenches(
+    actuation: Actuation, axes: Array
+) -> tuple[list[int], list[int], list[Array]]:
+    """Return, for each body-fixed input, its body, its index and its wrench per unit (6,)."""
     wrench_body: list[int] = []
     inputs: list[int] = []
     wrenches: list[Array] = []
     for joint, numbers, columns in actuation.wrench_columns:
-        turned = axes[joint - ROOT].T
-        wrench_body += [joint - ROOT] * len(numbers)
-        inputs += numbers.tolist()
-        wrenches += [
-            np.r_[turned @ w[PIN_ANGULAR], turned @ w[PIN_LINEAR]] for w in columns.T
-        ]
-    entries, count = sum(map(len, paths)), len(inputs)
-    sizes = [bodies * PLACE, bodies * INERTIA, bodies * INERTIA, entries, entries, size]
-    sizes += [size * size, bodies * MOTION, bodies * LOAD, size, size, size * count]
-    sizes += [size * 2 * size, size * 6]
-    return Tree(
-        parent,
-        fixed.ravel(),
-        np.array([joint.idx_q for joint in joints]),
-        np.array([joint.nq == 2 for joint in joints]),
-        np.array(turns),
-        np.array(slides),
-        inertias.ravel(),
-        axes,
-        np.array(coordinate),
-        np.array(factor),
-        S.T**2 @ model.armature,
-        np.array(target, dtype=np.intp),
-        np.array(share, dtype=float),
-        row,
-        np.array([len(path) - 1 for path in paths]),
-        np.array([index for path in paths for index in path]),
-        common,
-        np.where(
-            actuation.fixed.any(axis=0), np.abs(actuation.fixed).argmax(axis=0), -1
-        ),
-        np.array(wrench_body, dtype=np.intp),
-        np.array(wrenches).ravel(),
-        np.array(inputs, dtype=np.intp),
-        np.array([joint - ROOT for joint, _ in robot.stored_momentum], dtype=np.intp),
-        np.array(
-            [axes[joint - ROOT].T @ h for joint, h in robot.stored_momentum]
-        ).ravel(),
-        np.array(robot.springs.stiffness),
-        np.array(robot.springs.damping),
-        *np.cumsum([0, *sizes]).tolist(),
+        body = joint - ROOT
+        to_joint = axes[body].T
+        for number, wrench in zip(numbers.tolist(), columns.T, strict=True):
+            moment = to_joint @ wrench[PIN_ANGULAR]
+            force = to_joint @ wrench[PIN_LINEAR]
+            wrench_body.append(body)
+            inputs.append(number)
+            wrenches.append(np.concatenate((moment, force)))
+    return wrench_body, inputs, wrenches
+
+
+def _work_offsets(bodies: int, size: int, entries: int, fixed: int) -> WorkOffsets:
+    """Return the offsets in the work space, whose arrays follow one another.
+
+    M has `size` rows and `entries` packed entries. `fixed` is the number of body-fixed inputs.
+    """
+    places = 0
+    body_inertias = places + bodies * PLACE
+    subtree_inertias = body_inertias + bodies * INERTIA
+    packed = subtree_inertias + bodies * INERTIA
+    scaled = packed + entries
+    diagonal = scaled + entries
+    square = diagonal + size
+    motion = square + size * size
+    load = motion + bodies * MOTION
+    bias = load + bodies * LOAD
+    c = bias + size
+    columns = c + size
+    lower = columns + size * fixed
+    block = lower + size * 2 * size
+    return WorkOffsets(
+        places=places,
+        body_inertias=body_inertias,
+        subtree_inertias=subtree_inertias,
+        packed=packed,
+        scaled=scaled,
+        diagonal=diagonal,
+        square=square,
+        motion=motion,
+        load=load,
+        bias=bias,
+        c=c,
+        columns=columns,
+        lower=lower,
+        block=block,
+        size=block + size * 6,
     )
 
 
-def _paths(size: int, parent: Array, coordinate: list[int]) -> list[list[int]]:
+def _paths(size: int, parent: list[int], coordinate: list[int]) -> list[list[int]]:
     """Return, for each coordinate, its path from the base in the elimination tree of M = L^T D L.
 
     Row i of L and row i of L^-1 can be nonzero only in the columns of path i. Path i ends with i.

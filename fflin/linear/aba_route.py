@@ -108,10 +108,8 @@ class Route:
     def __init__(self, robot: Robot, lin: LinearModel) -> None:
         self.state = state = StateMap(robot, reference=lin.reference, frame=lin.frame)
         self.aba = Aba(state)
-        self.q, self.v = (
-            robot.checked_configuration(lin.q),
-            robot.checked_velocity(lin.v),
-        )
+        self.q = robot.checked_configuration(lin.q)
+        self.v = robot.checked_velocity(lin.v)
         self.nu = state.velocities(self.v)
         self._u = self.aba.actuation.in_base_axes(state.chart(self.q), lin.u0)
         self._own = ToolCoordinates(state, moving=lin.moving)
@@ -209,10 +207,8 @@ class Route:
         A[:nv, nv:] = np.eye(nv)
         A[ANGULAR, ANGULAR] = A[LINEAR, LINEAR] = _norm(self.nu[ANGULAR])
         A[LINEAR, ANGULAR] = _norm(self.nu[LINEAR])
-        A[nv:], B[nv:] = (
-            np.hstack((np.abs(dynamics.by_q), np.abs(dynamics.by_v))),
-            np.abs(dynamics.by_u),
-        )
+        A[nv:] = np.hstack((np.abs(dynamics.by_q), np.abs(dynamics.by_v)))
+        B[nv:] = np.abs(dynamics.by_u)
         P = self.frame_size
         left = _whole(at.left, nv)
         A = (P @ (A + B @ np.abs(at.H)) + _whole(at.rate, nv)) @ left

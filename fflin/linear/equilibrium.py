@@ -474,10 +474,8 @@ def _require_steady(lin: LinearModel, drift: Array) -> None:
         )
         if rate and name.startswith("q_m.") and name not in lin.ignorable
     ]
-    orbiting, (turns, moves) = (
-        lin.frame in ORBITAL,
-        np.abs(drift[:6]).reshape(2, 3).max(axis=1),
-    )
+    orbiting = lin.frame in ORBITAL
+    turns, moves = np.abs(drift[:6]).reshape(2, 3).max(axis=1)
     if moving:
         reason = (
             f"joints move ({listed(moving)}), but only rotors may move, which are joints whose "

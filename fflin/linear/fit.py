@@ -230,14 +230,10 @@ def line_up(gain: Gain | GainBatch, lin: LinearModel) -> Array:
             )
     selections = []
     for kind in ("input", "state"):
-        gain_names, model_names = (
-            getattr(gain, f"{kind}_names"),
-            getattr(lin, f"{kind}_names"),
-        )
-        lacking, beside = (
-            [n for n in gain_names if n not in model_names],
-            [n for n in model_names if n not in gain_names],
-        )
+        gain_names = getattr(gain, f"{kind}_names")
+        model_names = getattr(lin, f"{kind}_names")
+        lacking = [n for n in gain_names if n not in model_names]
+        beside = [n for n in model_names if n not in gain_names]
         if lacking and beside:
             raise InputError(
                 f"the model of '{lin.robot}' lacks the {kind} {lacking[0]} of the gain of "

@@ -95,7 +95,14 @@ class Prepared:
         nx = state.nx
         nv = state.nx // 2
         nu = len(self.actuation.names)
+        outputs = self.sensing or state
         self.common: dict[str, Any] = {
+            "state_names": state.names,
+            "state_units": state.units,
+            "input_names": self.actuation.names,
+            "input_units": self.actuation.units,
+            "output_names": outputs.names,
+            "output_units": outputs.units,
             "C": frozen(np.eye(nx)),
             "D": frozen(np.zeros((nx, nu))),
             "dt": 0.0,
@@ -117,16 +124,6 @@ class Prepared:
         }
         if not self.own_reference:
             self.common["placement"] = frozen(pin.SE3ToXYZQUAT(state.reference))
-        signals = (
-            ("state", state),
-            ("input", self.actuation),
-            ("output", self.sensing or state),
-        )
-        for signal, source in signals:
-            self.common[f"{signal}_names"], self.common[f"{signal}_units"] = (
-                source.names,
-                source.units,
-            )
         A = np.zeros((nx, nx))
         A[:nv, nv:] = np.diag([0.5] * 3 + [1.0] * (nv - 3))  # N (2.1)
         self.rest: dict[str, Array] = {
@@ -375,10 +372,8 @@ class Linearizer:
         state, actuation, sensing = ready.map, ready.actuation, ready.sensing
         chart, nu = Standing(count), state.velocities(v)
         x0 = state.compose(chart, chart.q_b, state.joint_positions(q), nu)
-        A, B = (
-            np.tile(ready.rest["A"], (count, 1, 1)),
-            np.zeros((count, *self._shape_B)),
-        )
+        A = np.tile(ready.rest["A"], (count, 1, 1))
+        B = np.zeros((count, *self._shape_B))
         c = np.empty_like(nu)
         gravity = np.empty((count, 3))
         seen = []

@@ -138,10 +138,8 @@ class ToolCoordinates:
                 "the robot a BaseTorque too"
             )
         # `inputs` contains, for each input of the tool, the index of the same input of the robot.
-        self.inputs, at = (
-            np.arange(len(acting.names)),
-            np.flatnonzero(wrench.any(axis=0)),
-        )
+        self.inputs = np.arange(len(acting.names))
+        at = np.flatnonzero(wrench.any(axis=0))
         if not is_fflin:
             self.inputs[at] = at[
                 np.argsort((wrench[:, at].argmax(axis=0) + self._roll) % 6)
@@ -284,14 +282,13 @@ class ToolCoordinates:
         # Take a complex step along the motion. If the reference moves with the robot, the attitude
         # error and the tangent vector of the pose stay zero, so they take no step.
         twist: Any = X @ nu[:6] + _STEP * (X @ rates[:6])
-        moved = (not self._moving) * _STEP * twist.real
-        turns = (
-            0.5 * product_matrix(quaternion_now) @ np.append(twist.real[ANGULAR], 0.0)
-        )
-        quaternion = (
-            quaternion_now
-            + (not (self._moving and kind.attitude == "q_b")) * _STEP * turns
-        )
+        pose_step = 0j if self._moving else _STEP
+        error_is_still = self._moving and kind.attitude == "q_b"
+        attitude_step = 0j if error_is_still else _STEP
+        moved = pose_step * twist.real
+        spin = np.append(twist.real[ANGULAR], 0.0)
+        turns = 0.5 * product_matrix(quaternion_now) @ spin
+        quaternion = quaternion_now + attitude_step * turns
         R = rotation_matrix(quaternion)
         w = quaternion[3]
         vec = quaternion[:3]
@@ -311,16 +308,12 @@ class ToolCoordinates:
             base[k - 3 : k, :6] = np.hstack((0.5 * skew(moved[LINEAR]), attitude))
         base[k:, :3] = by_turn
         base[k:, 6:] = self._rotated(R, rates=kind.rates)
-        base[:k], base[k:] = (
-            np.roll(base[:k], self._roll, 0),
-            np.roll(base[k:], self._roll, 0),
-        )
+        base[:k] = np.roll(base[:k], self._roll, 0)
+        base[k:] = np.roll(base[k:], self._roll, 0)
         first = k + nv - 6
         P = np.zeros((first + nv, 12 + 2 * n), dtype=complex)
-        rows, columns = (
-            [*range(k), *range(first, first + 6)],
-            [*range(6), *range(6 + n, 12 + n)],
-        )
+        rows = [*range(k), *range(first, first + 6)]
+        columns = [*range(6), *range(6 + n, 12 + n)]
         P[np.ix_(rows, columns)] = base @ np.kron(np.eye(2), X)
         of_joints = (self.state.spread(np.eye(6 + n))[6:, self._idx_v] / self._scales).T
         P[k:first, 6 : 6 + n] = P[first + 6 :, 12 + n :] = of_joints
@@ -331,15 +324,18 @@ class ToolCoordinates:
         poses, twists = _left(P.real[:first, : 6 + n]), _left(P.real[first:, 6 + n :])
         below = -twists @ P.real[first:, : 6 + n] @ poses
         left = np.block([[poses, np.zeros((6 + n, nv))], [below, twists]])
-        wrench = self._wrench
-        H = np.zeros((len(u), 12 + 2 * n))
-        V = (
-            np.eye(len(u))
-            + wrench.T @ (X.T @ self._rotated(R_now).T - np.eye(6)) @ wrench
-        )
+        V, H = self._input_jacobians(R_now, u)
+        return Jacobians(P.real, P.imag / _STEP.imag, left, V, H, extra)
+
+    def _input_jacobians(self, R: Array, u: Array) -> tuple[Array, Array]:
+        """Return V and H of the `Jacobians` under the inputs u; R is the tool's base attitude."""
+        X, wrench = self._X, self._wrench
+        rotation = X.T @ self._rotated(R).T - np.eye(6)
+        V = np.eye(len(u)) + wrench.T @ rotation @ wrench
+        H = np.zeros((len(u), 12 + 2 * self.state.robot.n))
         held = self._held(np.linalg.solve(X.T, wrench @ u))
         H[:, :3] = wrench.T @ X.T @ held @ X[ANGULAR, ANGULAR]
-        return Jacobians(P.real, P.imag / _STEP.imag, left, V[:, self.inputs], H, extra)
+        return V[:, self.inputs], H
 
 
 def tool_coordinates(

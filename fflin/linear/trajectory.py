@@ -161,10 +161,8 @@ class Trajectory(Design):
                 )
         for k, t in enumerate(times):
             with located(f"at t = {t:g} s"):
-                q[k], v[k] = (
-                    robot.checked_configuration(q[k]),
-                    robot.checked_velocity(v[k]),
-                )
+                q[k] = robot.checked_configuration(q[k])
+                v[k] = robot.checked_velocity(v[k])
                 require_slow("v", v[k])
                 vector("u", u[k], nu, "the robot's inputs")
         values: dict[str, object] = {
@@ -444,11 +442,9 @@ class Trajectory(Design):
         # change the accelerations. A fast wheel would hide the errors of slower joints if they had
         # the same divisor. Therefore, each rotor has its own divisor.
         t, u, state = self.t, self.u, self._aba.state
-        rotations, q, v = (
-            rotation_matrices(self.q[:, 3:7]),
-            self.q.copy(),
-            self.v.copy(),
-        )
+        rotations = rotation_matrices(self.q[:, 3:7])
+        q = self.q.copy()
+        v = self.v.copy()
         velocities = (rotations @ v[:, :3, None])[..., 0]
         usual = np.median(velocities, axis=0)
         flown = np.outer(t - t[0], usual)

@@ -50,7 +50,10 @@ _TABLES = {"inputs": ("input",), "appendages": ("flexible", "slosh")}
 
 # Keys of a robot file; the guide explains them. A file without the key `urdf` contains only inputs.
 KEYS = (
-    *("urdf", "package_dirs", "xacro", "lock"),
+    "urdf",
+    "package_dirs",
+    "xacro",
+    "lock",
     *(table for tables in _TABLES.values() for table in tables),
     *(name for name in FIELDS if name not in _TABLES),
 )
@@ -300,11 +303,9 @@ def _robot(
 def _check_model(model: pin.Model, name: str) -> None:
     """Raise `ModelError` if a value of a joint or body is infinite, NaN or unphysical."""
     for index in range(ROOT, model.njoints):
-        body, joint, parent = (
-            model.inertias[index],
-            model.joints[index],
-            model.parents[index],
-        )
+        body = model.inertias[index]
+        joint = model.joints[index]
+        parent = model.parents[index]
         armature = model.armature[joint.idx_v : joint.idx_v + joint.nv]
         moments = np.linalg.eigvalsh(np.nan_to_num(body.inertia)).tolist()
         shown = ", ".join(f"{moment:.3g}" for moment in moments)

@@ -137,10 +137,8 @@ def random_bodies(
             # of mass, along each axis.
             second = 0.5 * np.trace(body.inertia) - body.inertia.diagonal()
             radii = np.sqrt(np.abs(second) / (body.mass or np.inf))
-            density, com = (
-                spreads["mass"] * drawn[:, 0],
-                spreads["com"] * drawn[:, 1:4] * radii,
-            )
+            density = spreads["mass"] * drawn[:, 0]
+            com = spreads["com"] * drawn[:, 1:4] * radii
             wider = spreads["inertia"] * drawn[:, 4:]
             mass, com, about = properties(
                 _stretched(body, np.eye(3), density, com, wider)

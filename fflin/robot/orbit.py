@@ -110,10 +110,8 @@ class CircularOrbit:
             require_known("central body", [self.body], BODIES)
             mu, ground = BODIES[self.body]
         else:
-            mu, ground = (
-                positive("mu", self.mu),
-                positive("body_radius", self.body_radius),
-            )
+            mu = positive("mu", self.mu)
+            ground = positive("body_radius", self.body_radius)
         if self.altitude is None:
             n = positive("mean_motion", self.mean_motion)
             altitude = (mu / n) ** (1.0 / 3.0) / n ** (1.0 / 3.0) - ground

@@ -276,10 +276,8 @@ def _candidates(robot: Robot) -> tuple[str, list[str]]:
                 size = axis @ model.inertias[frame.parentJoint].inertia @ axis
                 spun.append(_text(model.names[frame.parentJoint]))
                 lock = f"# To use this wheel, lock joint {spun[-1]} above.\n"
-                effort, speed = (
-                    model.effortLimit[joint.idx_v],
-                    model.velocityLimit[joint.idx_v],
-                )
+                effort = model.effortLimit[joint.idx_v]
+                speed = model.velocityLimit[joint.idx_v]
             else:
                 size = axis @ frame.inertia.inertia @ axis
                 effort = speed = 0.0

@@ -211,7 +211,7 @@ class LaneLoop:
         # `_fresh` contains a pair for each array with lanes: the array, and the column of initial
         # values that is copied to all lanes.
         self.parts, self._words, self._fresh = laid_out(parts, loop.ARGUMENTS)
-        self._work = work_space(self.parts.robot.tree.size)
+        self._work = work_space(self.parts.robot.tree.offsets.size)
         self._advance = kernel("loop", "advance")
         robot, point = self.parts.robot, self.parts.point
         self.ends = np.cumsum([len(point.q), len(point.nu), len(point.u), 6, 3])
@@ -585,7 +585,7 @@ def _allocation(
         asking=asks,
         giving=giving,
         point=point,
-        work=np.zeros(max(asks.tree.size, giving.tree.size)),
+        work=np.zeros(max(asks.tree.offsets.size, giving.tree.offsets.size)),
         problem=allocation.least_squares(least, most, size),
     )
 

@@ -33,11 +33,9 @@ from fflin.simulation.plant import ROUNDED_DOWN, ROUNDED_UP, Plant
 
 # Names in messages: the robot with constant inputs, a loop that is constant during the run, and a
 # rotation, which acts like an undamped oscillation.
-ROBOT, CLOSED_LOOP, ROTATION = (
-    "robot",
-    "closed loop",
-    "rotation of the base or of a joint",
-)
+ROBOT = "robot"
+CLOSED_LOOP = "closed loop"
+ROTATION = "rotation of the base or of a joint"
 LONGEST_STEP = 0.01  # [s] default time step, if no pole requires a shorter step
 _DAMPING, _AMPLITUDE = 0.05, 0.01  # tolerances in (11.4)
 _SHORTEST_STEP = 1e-12  # [s] at which the search for a step ends

@@ -128,10 +128,8 @@ def curves(motion: Motion) -> Iterator[Curve]:
             ]
         for kind, of_kind, size in kinds:
             if size and not (wheel and group == "q_m"):
-                bounds, values = (
-                    size * limits.get(name, unlimited),
-                    size * motion.x[:, i],
-                )
+                bounds = size * limits.get(name, unlimited)
+                values = size * motion.x[:, i]
                 linear = None if motion.linear is None else size * motion.linear[:, i]
                 target = size * motion.target[:, i] if motion.tracked else None
                 yield Curve(name, kind, name, of_kind, values, bounds, linear, target)

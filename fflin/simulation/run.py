@@ -87,10 +87,8 @@ class Conserved:
         self._stack = np.zeros((2 + len(method.weights), 6))
         self._sums = self._stack[:2]
         self.wrenches = tuple(self._stack[2:])
-        weights, moments = (
-            h * np.array(method.weights),
-            h * h * np.array(method.moments),
-        )
+        weights = h * np.array(method.weights)
+        moments = h * h * np.array(method.moments)
         self._after = np.array(
             [[1.0, 0.0, *weights], [h * per_mass, 1.0, *(per_mass * moments)]]
         )
@@ -291,8 +289,7 @@ def go(plan: Plan, hint: str = "") -> Recording:
     follow = _follower(plan)
     pushed = not plant.isolated(driven=law is not None)
     rows = _Rows(plan, kept)
-    t = 0.0
-    stages = 0
+    t, stages = 0.0, 0
 
     def acceleration(t: float, q: Array, v: Array) -> Array:
         nonlocal stages
@@ -309,10 +306,8 @@ def go(plan: Plan, hint: str = "") -> Recording:
             follow(stages)
         return a
 
-    ending, bar = (
-        ending_of(plan, stop_conditions(plan)),
-        Progress(plan.options.progress),
-    )
+    ending = ending_of(plan, stop_conditions(plan))
+    bar = Progress(plan.options.progress)
     try:
         for step in range(times.steps):
             u = applied(step, t, q, v) if applied else plan.initial

@@ -88,10 +88,8 @@ class ModelDerivatives:
         self._chart: Chart = Standing()
         if not default_reference:
             self._chart = state.chart(lin.q)
-        self._u, self._nu = (
-            actuation.in_base_axes(self._chart, lin.u0),
-            state.velocities(lin.v),
-        )
+        self._u = actuation.in_base_axes(self._chart, lin.u0)
+        self._nu = state.velocities(lin.v)
         nv, nu = len(self._nu), len(self._u)
         self._inverse, slopes, by_u = (
             np.empty((nv, size)) for size in (nv, state.nx, nu)
@@ -118,10 +116,8 @@ class ModelDerivatives:
         ready = self._ready
         count = len(parameters) + 1
         nv = len(self._nu)
-        A, B = (
-            np.zeros((count, state.nx, state.nx)),
-            np.zeros((count, state.nx, len(self._u))),
-        )
+        A = np.zeros((count, state.nx, state.nx))
+        B = np.zeros((count, state.nx, len(self._u)))
         c, gravity = np.zeros((count, nv)), np.zeros((count, 3))
         rates = AccelerationDerivatives(c, A[:, nv:], B[:, nv:], gravity)
         for joint in self._joints:
@@ -383,10 +379,8 @@ class ModelDerivatives:
         )
         if derivatives.c.any():
             F_q = F_q + self._by_acceleration(derivatives.c)
-        derivatives.by_q_m[:], derivatives.by_nu[:] = (
-            -self._inverse @ F_q,
-            -self._inverse @ F_nu,
-        )
+        derivatives.by_q_m[:] = -self._inverse @ F_q
+        derivatives.by_nu[:] = -self._inverse @ F_nu
         return derivatives
 
 

@@ -424,10 +424,8 @@ class _Form:
         springs = self.state.robot.springs
         K, D = springs.stiffness[index], springs.damping[index]
         omega, ratio = joint.oscillation(K, D)
-        position, rate = (
-            self.x[[6 + index]],
-            self.x[[self.state.groups.qdot_m.start + index]],
-        )
+        position = self.x[[6 + index]]
+        rate = self.x[[self.state.groups.qdot_m.start + index]]
         turns = 2.0 * np.pi
 
         def by_frequency(signal: Array) -> Array:

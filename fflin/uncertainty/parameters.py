@@ -129,10 +129,8 @@ class Parameters(dict[str, Parameter]):
             robot = nominal.with_bodies(bodies)
         springs = {"stiffness": {**robot.stiffness}, "damping": {**robot.damping}}
         for joint in robot.joints:
-            changes, stiffness = (
-                parts.get(joint.name, {}),
-                nominal.stiffness.get(joint.name, 0.0),
-            )
+            changes = parts.get(joint.name, {})
+            stiffness = nominal.stiffness.get(joint.name, 0.0)
             if changes and joint.mode and stiffness:
                 omega, ratio = joint.oscillation(
                     stiffness, nominal.damping.get(joint.name, 0.0)
@@ -181,10 +179,8 @@ class Parameters(dict[str, Parameter]):
             piece = self.pieces.get(name)
             if piece is None or not changed_parts:
                 continue
-            com, inertia = (
-                piece.frame.actInv(piece.placement.translation),
-                piece.inertia.copy(),
-            )
+            com = piece.frame.actInv(piece.placement.translation)
+            inertia = piece.inertia.copy()
             com = [
                 parts.get(f"com.{axis}", x) for axis, x in zip(AXES, com, strict=True)
             ]

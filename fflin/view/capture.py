@@ -20,28 +20,33 @@ from typing import Any
 from fflin.base.errors import FileError, MissingPackageError
 
 _NAMES = (
-    *(
-        "chromium",
-        "chromium-browser",
-        "google-chrome",
-        "google-chrome-stable",
-        "chrome",
-    ),
-    *("microsoft-edge", "msedge"),
+    "chromium",
+    "chromium-browser",
+    "google-chrome",
+    "google-chrome-stable",
+    "chrome",
+    "microsoft-edge",
+    "msedge",
 )
 
 # Options for a headless browser, which reads its commands from a pipe. They also enable WebGL
 # without a graphics card, and disable background network access.
 _ARGUMENTS = (
-    *("--headless=new", "--remote-debugging-pipe", "--hide-scrollbars", "--mute-audio"),
-    *(
-        "--use-angle=swiftshader",
-        "--enable-unsafe-swiftshader",
-        "--ignore-gpu-blocklist",
-    ),
-    *("--disable-background-networking", "--disable-quic", "--no-first-run"),
-    *("--no-default-browser-check", "--disable-component-update", "--disable-sync"),
-    *("--disable-dev-shm-usage", "--disable-extensions"),
+    "--headless=new",
+    "--remote-debugging-pipe",
+    "--hide-scrollbars",
+    "--mute-audio",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--ignore-gpu-blocklist",
+    "--disable-background-networking",
+    "--disable-quic",
+    "--no-first-run",
+    "--no-default-browser-check",
+    "--disable-component-update",
+    "--disable-sync",
+    "--disable-dev-shm-usage",
+    "--disable-extensions",
 )
 
 # Chromium reads commands from file descriptor 3 and answers on file descriptor 4. Both are pipes to

@@ -71,8 +71,22 @@ _ELSEWHERE: dict[str, object] = {
 }
 
 _SCRIPTS = (
-    *("sky", "orbit", "look", "camera", "stage", "marks", "equipment", "pick", "keys"),
-    *("chart", "plots", "large", "player", "live", "modes", "main"),
+    "sky",
+    "orbit",
+    "look",
+    "camera",
+    "stage",
+    "marks",
+    "equipment",
+    "pick",
+    "keys",
+    "chart",
+    "plots",
+    "large",
+    "player",
+    "live",
+    "modes",
+    "main",
 )
 
 

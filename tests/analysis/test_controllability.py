@@ -20,17 +20,17 @@ def selection(lin):
     return S
 
 
-def holds_together(lin, found):
+def holds_together(lin, result):
     """The laws of any answer, in units of energy."""
     nx = len(lin.A)
-    assert found.dimension == len(found.controllable) == found.basis.shape[1]
-    assert nx - found.dimension == len(found.uncontrollable) == len(found.rows)
-    assert len(found.fixed_poles) == nx - found.dimension
+    assert result.dimension == len(result.controllable) == result.basis.shape[1]
+    assert nx - result.dimension == len(result.uncontrollable) == len(result.rows)
+    assert len(result.fixed_poles) == nx - result.dimension
     X = (lin.A - np.eye(nx)) / lin.dt if lin.dt else lin.A
     size = np.tile(np.sqrt(lin.M.diagonal()), 2)
-    rows = found.rows / size
+    rows = result.rows / size
     rows = rows / np.linalg.norm(rows, axis=1, keepdims=True)
-    basis = found.basis * size[:, None]
+    basis = result.basis * size[:, None]
     basis = basis / np.linalg.norm(basis, axis=0)
     A, B = X * size[:, None] / size, lin.B * size[:, None]
     scale = max(1.0, np.abs(A).max())
@@ -38,8 +38,8 @@ def holds_together(lin, found):
     assert np.abs(rows @ B).max(initial=0.0) < 1e-9 * np.abs(B).max()
     assert np.abs(rows @ A @ basis).max(initial=0.0) < 1e-8 * scale
     assert not len(rows) or np.linalg.matrix_rank(rows) == len(rows)
-    index = [lin.state_names.index(name) for name in found.controllable]
-    assert (found.basis[index] == np.eye(found.dimension)).all()
+    index = [lin.state_names.index(name) for name in result.controllable]
+    assert (result.basis[index] == np.eye(result.dimension)).all()
 
 
 @pytest.mark.parametrize("name", BUNDLED)
@@ -55,38 +55,38 @@ def test_no_springs_is_twice_the_rank(robots, name):
     for rank, inputs in cases.items():
         lin = fflin.linearize(robot.replace(inputs=inputs))
         for model in (lin, lin.discretize(0.1)):
-            found = fflin.controllability(model)
-            assert found.dimension == 2 * rank and found.method == "closed form"
-            assert found.stabilizable == (rank == 6 + robot.n)
-            assert (found.fixed_poles == (1.0 if model.dt else 0.0)).all()
-            assert found.margin.kept > 1e6 and found.margin.dropped < 1e-2
-            holds_together(model, found)
+            result = fflin.controllability(model)
+            assert result.dimension == 2 * rank and result.method == "closed form"
+            assert result.stabilizable == (rank == 6 + robot.n)
+            assert (result.fixed_poles == (1.0 if model.dt else 0.0)).all()
+            assert result.margin.kept > 1e6 and result.margin.dropped < 1e-2
+            holds_together(model, result)
 
 
 def test_unactuated_base_leaves_the_twelve_of_momentum(robots):
     """L1 = [0, M_b], L2 = [M_b N^-1, 0]: L1 A = 0, L2 A = L1, L B = 0."""
     robot = robots["servicer_7dof"]
     lin = fflin.linearize(robot.replace(inputs=motors(robot)))
-    found = fflin.controllability(lin)
-    L1, L2 = found.rows[:6], found.rows[6:]
+    result = fflin.controllability(lin)
+    L1, L2 = result.rows[:6], result.rows[6:]
     nv = 6 + robot.n
     N = lin.A[:nv, nv:]
     assert L1 == pytest.approx(np.hstack((np.zeros((6, nv)), lin.M[:6])), abs=1e-9)
     assert L2 == pytest.approx(
         np.hstack((lin.M[:6] @ np.linalg.inv(N), np.zeros((6, nv)))), abs=1e-9
     )
-    assert found.uncontrollable[:6] == (
+    assert result.uncontrollable[:6] == (
         *(f"angular momentum {axis}" for axis in "xyz"),
         *(f"linear momentum {axis}" for axis in "xyz"),
     )
-    assert found.uncontrollable[6] == "base attitude x with the joints fixed"
-    assert found.controllable == tuple(
+    assert result.uncontrollable[6] == "base attitude x with the joints fixed"
+    assert result.controllable == tuple(
         s for s in lin.state_names if s.startswith(("q_m", "qdot_m"))
     )
-    assert says(str(found), "periodic joint motion")
+    assert says(str(result), "periodic joint motion")
     # The base moves as the joints do: v_b, omega_b = G qdot_m.
     G = -np.linalg.solve(lin.M[:6, :6], lin.M[:6, 6:])
-    assert found.basis[nv : nv + 6, robot.n :] == pytest.approx(G, abs=1e-12)
+    assert result.basis[nv : nv + 6, robot.n :] == pytest.approx(G, abs=1e-12)
 
 
 def test_partly_actuated_bases_are_named(robots):
@@ -96,11 +96,11 @@ def test_partly_actuated_bases_are_named(robots):
         (BaseForce(), "r_b", "angular momentum"),
     ):
         lin = fflin.linearize(robot.replace(inputs=[wrench, *motors(robot)]))
-        found = fflin.controllability(lin)
-        assert len(found.uncontrollable) == 6
-        assert {n.rsplit(" ", 1)[0] for n in found.uncontrollable[:3]} == {lost}
-        assert sum(name.startswith(kept) for name in found.controllable) == 3
-        assert ("periodic joint motion" in str(found)) == (lost == "angular momentum")
+        result = fflin.controllability(lin)
+        assert len(result.uncontrollable) == 6
+        assert {n.rsplit(" ", 1)[0] for n in result.uncontrollable[:3]} == {lost}
+        assert sum(name.startswith(kept) for name in result.controllable) == 3
+        assert ("periodic joint motion" in str(result)) == (lost == "angular momentum")
 
 
 def test_three_wheels_put_the_attitude_anywhere(robots):
@@ -122,9 +122,9 @@ def test_three_wheels_put_the_attitude_anywhere(robots):
             wheel, pin.Inertia(3.0, np.zeros(3), 0.05 * np.eye(3)), pin.SE3.Identity()
         )
     robot = fflin.from_model(model, name="wheels")
-    found = fflin.controllability(fflin.linearize(robot.replace(inputs=motors(robot))))
-    assert found.dimension == 6
-    assert found.reach == {"base attitude": 3, "base position": 0, "joints": 3}
+    result = fflin.controllability(fflin.linearize(robot.replace(inputs=motors(robot))))
+    assert result.dimension == 6
+    assert result.reach == {"base attitude": 3, "base position": 0, "joints": 3}
     two = fflin.controllability(fflin.linearize(robot.replace(inputs=motors(robot, 2))))
     assert two.reach["base attitude"] == 2
 
@@ -136,10 +136,10 @@ def test_thrusters_are_combined(robots):
     at = [(0.1, 0.0, 0.0), (-0.1, 0.0, 0.0)]
     inputs = [fflin.Thruster(frame, position, (0, 0, 1)) for position in at]
     lin = fflin.linearize(robot.replace(inputs=inputs))
-    found = fflin.controllability(lin)
-    assert found.dimension == 4
-    assert found.controllable == ("q_b.y", "r_b.z", "omega_b.y", "v_b.z")
-    holds_together(lin, found)
+    result = fflin.controllability(lin)
+    assert result.dimension == 4
+    assert result.controllable == ("q_b.y", "r_b.z", "omega_b.y", "v_b.z")
+    holds_together(lin, result)
     third = fflin.Thruster(frame, (0.0, 0.0, 0.0), (0, 0, 1))
     lin = fflin.linearize(robot.replace(inputs=[*inputs, third]))
     assert fflin.controllability(lin).dimension == 4
@@ -180,9 +180,9 @@ def test_springs_and_dampers_against_exact_arithmetic(robots, name):
             for d in (values, drag)
         )
         expected = exact.dimension(lin.M, K, D, selection(lin))
-        found = fflin.controllability(lin)
-        assert found.dimension == expected, (case, values, drag, inputs)
-        holds_together(lin, found)
+        result = fflin.controllability(lin)
+        assert result.dimension == expected, (case, values, drag, inputs)
+        holds_together(lin, result)
         assert fflin.controllability(lin.discretize(0.01)).dimension == expected
 
 
@@ -212,9 +212,9 @@ def test_random_trees_against_exact_arithmetic(n):
             np.diag([0.0] * 6 + [d.get(j, 0.0) for j in robot.joint_names])
             for d in (stiffness, damping)
         )
-        found = fflin.controllability(lin)
-        assert found.dimension == exact.dimension(lin.M, K, D, selection(lin))
-        holds_together(lin, found)
+        result = fflin.controllability(lin)
+        assert result.dimension == exact.dimension(lin.M, K, D, selection(lin))
+        holds_together(lin, result)
 
 
 def repeated(rng, like, squares, drive, spread):
@@ -248,10 +248,10 @@ def test_repeated_frequencies_against_exact_arithmetic(robots, seed, spread):
     groups = [squares == value for value in np.unique(squares)]
     formula = 2 * sum(np.linalg.matrix_rank(drive[group]) for group in groups)
     assert formula == exact.dimension(M, K, np.zeros_like(M), S)
-    found = fflin.controllability(lin)
-    assert found.dimension == formula
-    assert found.stabilizable == (formula == 24)
-    holds_together(lin, found)
+    result = fflin.controllability(lin)
+    assert result.dimension == formula
+    assert result.stabilizable == (formula == 24)
+    holds_together(lin, result)
 
 
 def test_undriven_vibrations_are_named_with_their_poles(robots):
@@ -262,19 +262,19 @@ def test_undriven_vibrations_are_named_with_their_poles(robots):
     drive[:6, :6] = np.eye(6)
     drive[6:10, 6] = 1.0
     lin, *_ = repeated(rng, like, squares, drive, 0)
-    found = fflin.controllability(lin)
-    assert found.dimension == 18
-    speeds = sorted(abs(found.fixed_poles))
+    result = fflin.controllability(lin)
+    assert result.dimension == 18
+    speeds = sorted(abs(result.fixed_poles))
     assert speeds == pytest.approx([2.0, 2.0, 5.0, 5.0, 6.0, 6.0], rel=1e-9)
-    assert found.fixed_poles.real == pytest.approx(0.0)
-    assert np.sum(found.fixed_poles.imag) == pytest.approx(0.0)
-    assert not found.stabilizable
+    assert result.fixed_poles.real == pytest.approx(0.0)
+    assert np.sum(result.fixed_poles.imag) == pytest.approx(0.0)
+    assert not result.stabilizable
     for speed in (2, 5, 6):
         assert (
-            sum(f"vibration at {speed} rad/s" in name for name in found.uncontrollable)
+            sum(f"vibration at {speed} rad/s" in name for name in result.uncontrollable)
             == 2
         )
-    poles = np.linalg.eigvals(found.rows @ lin.A @ np.linalg.pinv(found.rows))
+    poles = np.linalg.eigvals(result.rows @ lin.A @ np.linalg.pinv(result.rows))
     assert np.sort(abs(poles)) == pytest.approx(speeds, rel=1e-6)
 
 
@@ -308,14 +308,14 @@ def test_a_damped_undriven_spring_can_be_left_alone(robots):
     S[10:, 10] = 1.0
     lin = mechanical(M, K, D, S, like)
     for model in (lin, lin.discretize(0.05)):
-        found = fflin.controllability(model)
-        assert found.dimension == 22 == exact.dimension(M, K, D, S)
-        assert found.stabilizable
-        holds_together(model, found)
+        result = fflin.controllability(model)
+        assert result.dimension == 22 == exact.dimension(M, K, D, S)
+        assert result.stabilizable
+        holds_together(model, result)
     s = (
-        found.fixed_poles
+        result.fixed_poles
         if not model.dt
-        else np.log(found.fixed_poles.astype(complex)) / 0.05
+        else np.log(result.fixed_poles.astype(complex)) / 0.05
     )
     assert s.real == pytest.approx(-0.2, rel=1e-3)
     growing = mechanical(M, K, -D, S, like)
@@ -328,16 +328,16 @@ def test_off_rest_the_frozen_model_is_judged_and_said_so(robots):
     robot = robots["planar_detumble"]
     v = fflin.velocity(robot, {"omega_b.z": 0.2, "joint_1": 0.1})
     lin = fflin.linearize(robot.replace(inputs=motors(robot)), v=v)
-    found = fflin.controllability(lin)
-    assert found.method == "frozen" and "frozen" in str(found)
-    reached = np.linalg.qr(found.basis)[0]
+    result = fflin.controllability(lin)
+    assert result.method == "frozen" and "frozen" in str(result)
+    reached = np.linalg.qr(result.basis)[0]
     outside = null_space(reached.T)
     assert np.abs(outside.T @ lin.B).max() < 1e-8
     # The momenta are not invariant under the frozen A, only the rows that A itself leaves out.
-    others = found.rows[9:] / np.linalg.norm(found.rows[9:], axis=1, keepdims=True)
-    assert found.bound == 9 and len(others) == 9 - found.dimension > 0
+    others = result.rows[9:] / np.linalg.norm(result.rows[9:], axis=1, keepdims=True)
+    assert result.bound == 9 and len(others) == 9 - result.dimension > 0
     assert np.abs(others @ lin.A @ reached).max() < 1e-8
-    momenta = found.rows[:9] / np.linalg.norm(found.rows[:9], axis=1, keepdims=True)
+    momenta = result.rows[:9] / np.linalg.norm(result.rows[:9], axis=1, keepdims=True)
     assert np.abs(momenta @ lin.A @ reached).max() > 1e-3
     full = fflin.controllability(fflin.linearize(robot, v=v))
     assert full.dimension == 12 + 2 * robot.n and full.stabilizable
@@ -354,8 +354,8 @@ def test_a_hundred_joints():
         (motors(robot, 7), 7),
     ):
         lin = fflin.linearize(robot.replace(inputs=inputs), q)
-        found = fflin.controllability(lin)
-        assert found.dimension == 2 * rank
+        result = fflin.controllability(lin)
+        assert result.dimension == 2 * rank
     stiffness = {j: 50.0 for j in robot.joint_names[:10]}
     lin = fflin.linearize(
         robot.replace(inputs=motors(robot)[5:8], stiffness=stiffness, rest=at), q
@@ -371,15 +371,15 @@ def test_a_file_gives_the_same_answer(robots, tmp_path):
         robot.replace(inputs=motors(robot), stiffness={"left_1": 3.0})
     )
     lin.save(tmp_path / "m.json")
-    found, again = map(
+    result, again = map(
         fflin.controllability, (lin, fflin.LinearModel.load(tmp_path / "m.json"))
     )
     assert (
-        found.rows == again.rows
-    ).all() and found.uncontrollable == again.uncontrollable
+        result.rows == again.rows
+    ).all() and result.uncontrollable == again.uncontrollable
 
 
-def test_what_is_no_model_is_refused():
+def test_an_invalid_model_is_refused():
     with pytest.raises(fflin.InputError, match="LinearModel"):
         fflin.controllability(np.eye(3))
 
@@ -389,8 +389,8 @@ def test_a_lost_vibration_is_lost_to_every_input(robots, share, dimension):
     robot = robots["servicer_7dof"].replace(stiffness={"panel_left": 100.0})
     lin = fflin.linearize(robot)
     period = 2.0 * np.pi / fflin.modes(lin).frequencies[-1]
-    found = fflin.controllability(lin.discretize(share * period))
-    assert found.dimension == dimension and found.stabilizable == (dimension == 30)
+    result = fflin.controllability(lin.discretize(share * period))
+    assert result.dimension == dimension and result.stabilizable == (dimension == 30)
 
 
 def test_states_are_named_whatever_the_basis_of_their_combinations_is():

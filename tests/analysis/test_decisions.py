@@ -32,7 +32,7 @@ CORES = ("", "Haswell", "Nehalem", "Prescott", "Sandybridge")
     ],
     ids=["picked", "many"],
 )
-def test_random_decisions_are_those_of_exact_arithmetic(robots, seeds):
+def test_random_decisions_match_exact_arithmetic(robots, seeds):
     wrong, doubts, count = {}, 0, 0
     for seed in seeds:
         lin, K, D = decisions.case(seed, robots)
@@ -66,10 +66,10 @@ def test_the_decisions_are_the_same_on_every_processor():
             with finishing(process):
                 outputs.append(process.communicate()[0])
         assert not any(process.returncode for process in running)
-    found = [json.loads(output) for output in outputs]
-    assert len(found[0]) == 40 * len(decisions.PERIODS)
-    for core, other in zip(CORES, found, strict=True):
-        assert {key for key in other if other[key] != found[0][key]} == set(), core
+    result = [json.loads(output) for output in outputs]
+    assert len(result[0]) == 40 * len(decisions.PERIODS)
+    for core, other in zip(CORES, result, strict=True):
+        assert {key for key in other if other[key] != result[0][key]} == set(), core
 
 
 def test_equal_ends_leave_a_vibration_that_the_middle_cannot_drive(robots):
@@ -78,9 +78,9 @@ def test_equal_ends_leave_a_vibration_that_the_middle_cannot_drive(robots):
     robot = robot.replace(inputs=motors(robot)[2:4], stiffness=8.063)
     lin = fflin.linearize(robot)
     for model in (lin, lin.discretize(0.1)):
-        found = fflin.controllability(model)
-        assert found.dimension == 12 and not any(
-            "undecided" in note for note in found.notes
+        result = fflin.controllability(model)
+        assert result.dimension == 12 and not any(
+            "undecided" in note for note in result.notes
         )
 
 
@@ -103,16 +103,16 @@ def test_a_decision_within_rounding_names_the_state_and_both_answers(
     assert none.dimension == 22 and none.margin.dropped < 0.1
     seen = set()
     for exponent in np.arange(-11.4, -9.8, 0.25):
-        found = fflin.controllability(weakly_driven(robots, 10.0**exponent))
-        (note,) = found.notes
-        other = 22 if found.dimension == 24 else 24
-        assert "joint_5" in note and f"{found.dimension} or {other} of 24" in note
-        assert max(map(len, str(found).splitlines())) <= 80
-        seen.add(found.dimension)
+        result = fflin.controllability(weakly_driven(robots, 10.0**exponent))
+        (note,) = result.notes
+        other = 22 if result.dimension == 24 else 24
+        assert "joint_5" in note and f"{result.dimension} or {other} of 24" in note
+        assert max(map(len, str(result).splitlines())) <= 80
+        seen.add(result.dimension)
     assert seen == {22, 24}
 
 
-def test_doubt_is_told_by_the_errors_and_by_what_succeeds(robots):
+def test_uncertain_decisions_are_reported_with_their_errors(robots):
     lin = weakly_driven(robots, 10.0**-11.25)
     assert fflin.controllability(lin).dimension == 22
     with pytest.raises(fflin.StabilizabilityError, match=r"joint_5.*22.*24") as error:
@@ -120,10 +120,10 @@ def test_doubt_is_told_by_the_errors_and_by_what_succeeds(robots):
     assert error.value.margin.dropped > 0.1
     C = np.eye(24)[[*range(10), 11]]
     blind = replace(lin, C=C, D=np.zeros((11, 11)), output_names=lin.input_names)
-    found = fflin.observability(blind)
-    (note,) = found.notes
+    result = fflin.observability(blind)
+    (note,) = result.notes
     assert "joint_5" in note and ("24 or 22" in note or "22 or 24" in note)
-    assert says(str(found), "undecided")
+    assert says(str(result), "undecided")
     lin = weakly_driven(robots, 10.0**-10.5)
     with pytest.warns(fflin.FflinWarning, match="joint_5"):
         fflin.kalman(
@@ -138,7 +138,7 @@ def test_doubt_is_told_by_the_errors_and_by_what_succeeds(robots):
     assert 0.01 < error.value.margin.dropped < 1.0
 
 
-def test_a_decay_within_rounding_is_told(robots):
+def test_a_decay_within_rounding_is_reported(robots):
     """Twins in one damping: their difference is not driven, and hardly decays."""
     like = fflin.linearize(robots["ets_vii"])
     K = np.diag([0.0] * 10 + [4.0, 4.0])
@@ -150,15 +150,15 @@ def test_a_decay_within_rounding_is_told(robots):
         return fflin.controllability(mechanical(np.eye(12), K, decay * K, S, like))
 
     for decay, stabilizable in ((1e-9, True), (0.0, False)):
-        found = judged(decay)
-        assert found.dimension == 22 and found.stabilizable == stabilizable
-        assert not any("undecided" in note for note in found.notes)
+        result = judged(decay)
+        assert result.dimension == 22 and result.stabilizable == stabilizable
+        assert not any("undecided" in note for note in result.notes)
     near = judged(1e-12)
     (note,) = (note for note in near.notes if note.startswith("undecided"))
     assert says(note, "by itself") and says(note, "may not be stabilizable")
 
 
-def test_what_died_out_between_samples_is_told(robots):
+def test_modes_that_decay_between_samples_are_reported(robots):
     """Of a file, which holds the samples alone, two fast motions look like one."""
     lin, K, D = decisions.case(164, robots)
     sampled = lin.discretize(0.1)

@@ -37,16 +37,16 @@ def test_one_panel_on_a_spring_has_the_closed_form():
     Over all: m_z and what is left are the mass.
     """
     k = 37.0
-    found = masses(panels(k, sides=(1.0,)))
+    result = masses(panels(k, sides=(1.0,)))
     J, pull = PANEL_Y + PANEL * ARM**2, PANEL * ARM
     turn = PANEL_Y + PANEL * ARM * (ARM + HINGE)
-    assert found.frequencies == pytest.approx([np.sqrt(k / J)], rel=1e-12)
-    np.testing.assert_allclose(found.masses, [[0.0, 0.0, pull**2 / J]], rtol=1e-12)
-    np.testing.assert_allclose(found.inertias, [[0.0, turn**2 / J, 0.0]], rtol=1e-12)
-    assert found.residual[2, 2] == pytest.approx(HUB + PANEL - pull**2 / J, rel=1e-12)
-    assert not found.free.any()
+    assert result.frequencies == pytest.approx([np.sqrt(k / J)], rel=1e-12)
+    np.testing.assert_allclose(result.masses, [[0.0, 0.0, pull**2 / J]], rtol=1e-12)
+    np.testing.assert_allclose(result.inertias, [[0.0, turn**2 / J, 0.0]], rtol=1e-12)
+    assert result.residual[2, 2] == pytest.approx(HUB + PANEL - pull**2 / J, rel=1e-12)
+    assert not result.free.any()
     # A panel up and towards the base's -z turns it about -y: L L^T has the product.
-    assert found.participation[2] * found.participation[4] == pytest.approx(
+    assert result.participation[2] * result.participation[4] == pytest.approx(
         -pull * turn / J
     )
 
@@ -55,16 +55,16 @@ def test_one_panel_on_a_spring_has_the_closed_form():
 def test_of_a_symmetric_pair_one_mode_alone_has_mass(shift):
     """Clamped, both have one frequency; the other turns the base and does not shift it."""
     base = pin.SE3(np.eye(3), np.array(shift))
-    found = masses(panels(base=base))
+    result = masses(panels(base=base))
     J, pull = PANEL_Y + PANEL * ARM**2, PANEL * ARM
     turn = PANEL_Y + PANEL * ARM * (ARM + HINGE)
-    lifting, turning = found.masses
+    lifting, turning = result.masses
     np.testing.assert_allclose(
         lifting, [0.0, 0.0, 2.0 * pull**2 / J], rtol=1e-12, atol=1e-12
     )
     np.testing.assert_allclose(turning, np.zeros(3), atol=1e-12)
     np.testing.assert_allclose(
-        found.inertias[1], [0.0, 2.0 * turn**2 / J, 0.0], atol=1e-9
+        result.inertias[1], [0.0, 2.0 * turn**2 / J, 0.0], atol=1e-9
     )
     # In the floating robot too, one mode lifts the base and one turns it.
     slow, fast = fflin.modes(fflin.linearize(panels(base=base))).modes
@@ -75,7 +75,7 @@ def test_of_a_symmetric_pair_one_mode_alone_has_mass(shift):
 
 
 @pytest.mark.parametrize("name", ["servicer_7dof", "dual_arm", "talos"])
-def test_all_modes_and_what_is_left_are_the_mass_and_inertia(name):
+def test_effective_masses_and_the_residual_sum_to_the_mass_and_inertia(name):
     rng = np.random.default_rng(2)
     robot = fflin.load(name)
     q, _, _ = random_point(robot, rng)
@@ -84,32 +84,32 @@ def test_all_modes_and_what_is_left_are_the_mass_and_inertia(name):
         for joint in robot.joint_names
         if rng.random() < 0.6
     }
-    found = masses(robot.replace(stiffness=some), q)
-    L = found.participation
-    assert L.shape == (6, len(some)) and found.free.any()
-    whole = L @ L.T + found.free + found.residual
+    result = masses(robot.replace(stiffness=some), q)
+    L = result.participation
+    assert L.shape == (6, len(some)) and result.free.any()
+    whole = L @ L.T + result.free + result.residual
     np.testing.assert_allclose(
-        whole, found.total, atol=1e-10 * np.abs(found.total).max()
+        whole, result.total, atol=1e-10 * np.abs(result.total).max()
     )
-    for part in (found.free, found.residual):
-        assert np.linalg.eigvalsh(part).min() > -1e-10 * np.abs(found.total).max()
+    for part in (result.free, result.residual):
+        assert np.linalg.eigvalsh(part).min() > -1e-10 * np.abs(result.total).max()
     # The total is the rigid robot's: mass, and inertia about the base frame's origin.
     data = robot.model.createData()
     pin.crba(robot.model, data, q)
     rigid = data.Ycrb[1].matrix()
-    np.testing.assert_allclose(found.total, rigid, atol=1e-10 * np.abs(rigid).max())
-    assert found.total[:3, :3] == pytest.approx(
+    np.testing.assert_allclose(result.total, rigid, atol=1e-10 * np.abs(rigid).max())
+    assert result.total[:3, :3] == pytest.approx(
         robot.mass * np.eye(3), abs=1e-9 * robot.mass
     )
     # The residual does not depend on which joints have springs.
     sprung = masses(robot.replace(stiffness=3.0), q)
     np.testing.assert_allclose(
-        sprung.residual, found.residual, atol=1e-9 * np.abs(rigid).max()
+        sprung.residual, result.residual, atol=1e-9 * np.abs(rigid).max()
     )
     assert not sprung.free.any()
 
 
-def test_frequencies_are_those_of_a_robot_on_a_base_that_hardly_moves():
+def test_frequencies_match_a_robot_on_a_base_that_hardly_moves():
     light = fflin.load("servicer_7dof", stiffness=20.0)
     model = light.model.copy()
     model.inertias[1] = pin.Inertia(1e9, np.zeros(3), 1e9 * np.eye(3))
@@ -126,23 +126,23 @@ def test_the_base_s_axes_are_meant_wherever_it_stands(frame):
     expected = masses(robot, fflin.configuration(robot, joints))
     q = fflin.configuration(robot, joints, random_pose(np.random.default_rng(4), 140.0))
     for reference in (None, pin.SE3.Identity()):
-        found = masses(robot, q, frame=frame, reference=reference)
-        np.testing.assert_allclose(found.masses, expected.masses, atol=1e-9)
-        np.testing.assert_allclose(found.inertias, expected.inertias, atol=1e-9)
-        np.testing.assert_allclose(found.total, expected.total, atol=1e-9)
+        result = masses(robot, q, frame=frame, reference=reference)
+        np.testing.assert_allclose(result.masses, expected.masses, atol=1e-9)
+        np.testing.assert_allclose(result.inertias, expected.inertias, atol=1e-9)
+        np.testing.assert_allclose(result.total, expected.total, atol=1e-9)
 
 
 def test_masses_turn_with_the_base_frame_and_do_not_change_with_its_origin():
     rng = np.random.default_rng(7)
     base = random_pose(rng, 100.0)
-    expected, found = masses(panels(80.0)), masses(panels(80.0, base=base))
+    expected, result = masses(panels(80.0)), masses(panels(80.0, base=base))
     turned = base.rotation @ expected.participation[:3]
-    np.testing.assert_allclose(found.participation[:3] ** 2, turned**2, atol=1e-9)
+    np.testing.assert_allclose(result.participation[:3] ** 2, turned**2, atol=1e-9)
     X = pin.SE3(base).toDualActionMatrix()
-    np.testing.assert_allclose(found.residual, X @ expected.residual @ X.T, atol=1e-8)
+    np.testing.assert_allclose(result.residual, X @ expected.residual @ X.T, atol=1e-8)
 
 
-def test_soft_modes_beside_stiff_ones_keep_their_digits():
+def test_soft_modes_next_to_stiff_ones_keep_their_accuracy():
     soft, stiff = 1e-4, 1e8
     robot = fflin.load(
         "servicer_7dof", stiffness={"panel_left": soft, "joint_7": stiff}
@@ -150,9 +150,9 @@ def test_soft_modes_beside_stiff_ones_keep_their_digits():
     alone = fflin.load(
         "servicer_7dof", lock=["joint_7"], stiffness={"panel_left": soft}
     )
-    found, expected = masses(robot), masses(alone)
-    assert found.frequencies[0] == pytest.approx(expected.frequencies[0], rel=1e-12)
-    np.testing.assert_allclose(found.masses[0], expected.masses[0], atol=1e-11)
+    result, expected = masses(robot), masses(alone)
+    assert result.frequencies[0] == pytest.approx(expected.frequencies[0], rel=1e-12)
+    np.testing.assert_allclose(result.masses[0], expected.masses[0], atol=1e-11)
 
 
 def test_reports_and_command_line(capsys):
@@ -162,14 +162,14 @@ def test_reports_and_command_line(capsys):
     robot = fflin.load(
         "servicer_7dof", stiffness={"panel_left": 100.0, "panel_right": 100.0}
     )
-    found = masses(robot)
-    assert str(found) in out and max(map(len, out.splitlines())) <= 80
+    result = masses(robot)
+    assert str(result) in out and max(map(len, out.splitlines())) <= 80
     row = next(
         line
-        for line in str(found).splitlines()
-        if f"{found.frequencies[0]:.6g}" in line
+        for line in str(result).splitlines()
+        if f"{result.frequencies[0]:.6g}" in line
     )
-    heavy = found.masses[0, 2]
+    heavy = result.masses[0, 2]
     assert row.split()[-2:] == [f"{heavy:.4g}", f"{100.0 * heavy / robot.mass:.1f}"]
     assert cli.main(["modes", "servicer_7dof"]) == 0
     assert "clamped" not in capsys.readouterr().out

@@ -43,11 +43,11 @@ def felt_inertias():
     both one way: the hub turns the other. Of T = 1/2 m v^2 + ... the hub's rate is eliminated by
     the momentum that is conserved.
     """
-    own = PANEL_Y + PANEL * ARM**2
-    lifting = own - 2.0 * (PANEL * ARM) ** 2 / (HUB + 2.0 * PANEL)
+    inertias = PANEL_Y + PANEL * ARM**2
+    lifting = inertias - 2.0 * (PANEL * ARM) ** 2 / (HUB + 2.0 * PANEL)
     coupling = PANEL_Y + PANEL * ARM * (HINGE + ARM)
     total = HUB_Y + 2.0 * (PANEL_Y + PANEL * (HINGE + ARM) ** 2)
-    turning = own - 2.0 * coupling**2 / total
+    turning = inertias - 2.0 * coupling**2 / total
     return lifting, turning
 
 
@@ -56,16 +56,16 @@ def test_two_hinged_panels_have_the_frequencies_derived_by_hand(frame):
     k = 1562.0
     robot = two_panels(stiffness=k)
     q = fflin.configuration(robot, None, random_pose(np.random.default_rng(1), 130.0))
-    found = fflin.modes(
+    result = fflin.modes(
         fflin.linearize(robot, q, frame=frame, reference=pin.SE3.Identity())
     )
     expected = np.sqrt(k / np.array(felt_inertias()))
-    assert found.frequencies == pytest.approx(expected, rel=1e-13)
-    assert found.frequencies == pytest.approx([2.61954, 3.45462], abs=5e-6)
-    assert not found.damping_ratios.any() and not found.unstable
-    assert found.rigid_body == 6 and found.zero_eigenvalues == 12
+    assert result.frequencies == pytest.approx(expected, rel=1e-13)
+    assert result.frequencies == pytest.approx([2.61954, 3.45462], abs=5e-6)
+    assert not result.damping_ratios.any() and not result.unstable
+    assert result.rigid_body == 6 and result.zero_eigenvalues == 12
     lifting, turning = (
-        dict(zip(found.state_names, m.shape, strict=True)) for m in found.modes
+        dict(zip(result.state_names, m.shape, strict=True)) for m in result.modes
     )
     assert lifting["q_m.left"] == pytest.approx(-lifting["q_m.right"], rel=1e-12)
     assert turning["q_m.left"] == pytest.approx(turning["q_m.right"], rel=1e-12)
@@ -73,15 +73,15 @@ def test_two_hinged_panels_have_the_frequencies_derived_by_hand(frame):
 
 def test_mode_shapes_conserve_momentum():
     """Of the panels lifting by ARM each, the hub sinks by 2 m ARM / (M + 2 m)."""
-    found = fflin.modes(fflin.linearize(two_panels(stiffness=50.0)))
-    shape = dict(zip(found.state_names, found.modes[0].shape, strict=True))
+    result = fflin.modes(fflin.linearize(two_panels(stiffness=50.0)))
+    shape = dict(zip(result.state_names, result.modes[0].shape, strict=True))
     assert shape["q_m.left"] == pytest.approx(1.0, abs=1e-15) and shape[
         "q_b.y"
     ] == pytest.approx(0.0, abs=1e-14)
     sunk = -2.0 * PANEL * ARM / (HUB + 2.0 * PANEL)
     assert shape["r_b.z"] == pytest.approx(sunk, rel=1e-12)
-    assert shape["v_b.z"] == pytest.approx(found.modes[0].pole * sunk, rel=1e-12)
-    turned = dict(zip(found.state_names, found.modes[1].shape, strict=True))
+    assert shape["v_b.z"] == pytest.approx(result.modes[0].pole * sunk, rel=1e-12)
+    turned = dict(zip(result.state_names, result.modes[1].shape, strict=True))
     coupling = PANEL_Y + PANEL * ARM * (HINGE + ARM)
     total = HUB_Y + 2.0 * (PANEL_Y + PANEL * (HINGE + ARM) ** 2)
     # q_b is half the angle.
@@ -91,33 +91,35 @@ def test_mode_shapes_conserve_momentum():
 def test_damping_ratios_have_the_closed_form():
     """J a'' + d a' + k a = 0: ratio d / (2 sqrt(k J)); beyond 1 two time constants."""
     k, d = 100.0, 7.0
-    found = fflin.modes(fflin.linearize(two_panels(stiffness=k, damping=d)))
+    result = fflin.modes(fflin.linearize(two_panels(stiffness=k, damping=d)))
     J = np.array(felt_inertias())
-    assert found.frequencies == pytest.approx(np.sqrt(k / J), rel=1e-12)
-    assert found.damping_ratios == pytest.approx(d / 2.0 / np.sqrt(k * J), rel=1e-12)
-    assert found.modes[0].time_constant == pytest.approx(2.0 * J[0] / d, rel=1e-12)
+    assert result.frequencies == pytest.approx(np.sqrt(k / J), rel=1e-12)
+    assert result.damping_ratios == pytest.approx(d / 2.0 / np.sqrt(k * J), rel=1e-12)
+    assert result.modes[0].time_constant == pytest.approx(2.0 * J[0] / d, rel=1e-12)
     d = 2e3
-    found = fflin.modes(fflin.linearize(two_panels(stiffness=k, damping=d)))
-    assert not found.vibrations and found.zero_eigenvalues == 12 and not found.unstable
+    result = fflin.modes(fflin.linearize(two_panels(stiffness=k, damping=d)))
+    assert (
+        not result.vibrations and result.zero_eigenvalues == 12 and not result.unstable
+    )
     roots = np.concatenate([np.roots([inertia, d, k]) for inertia in J])
-    times = sorted(mode.time_constant for mode in found.modes)
+    times = sorted(mode.time_constant for mode in result.modes)
     assert times == pytest.approx(sorted(-1.0 / roots), rel=1e-10)
-    assert {mode.damping_ratio for mode in found.modes} == {1.0}
+    assert {mode.damping_ratio for mode in result.modes} == {1.0}
 
 
 def test_a_joint_that_only_drags_has_one_zero_and_one_time_constant():
     robot = two_panels(damping={"left": 3.0})
     lin = fflin.linearize(robot)
-    found = fflin.modes(lin)
-    (mode,) = found.modes
+    result = fflin.modes(lin)
+    (mode,) = result.modes
     assert mode.pole.real == pytest.approx(-3.0 * lin.B[-2, -2], rel=1e-13)
-    assert (found.rigid_body, found.zero_eigenvalues) == (8, 15)
-    assert found.poles.shape == (16,)
+    assert (result.rigid_body, result.zero_eigenvalues) == (8, 15)
+    assert result.poles.shape == (16,)
 
 
-def matched(found, expected):
+def matched(result, expected):
     """Largest distance between two sets of eigenvalues, paired."""
-    distance = np.abs(found[:, None] - expected)
+    distance = np.abs(result[:, None] - expected)
     return distance[linear_sum_assignment(distance)].max()
 
 
@@ -129,31 +131,33 @@ def test_poles_are_the_eigenvalues(name, damped):
     for share in (1.0, 0.5):
         some = [joint for joint in bare.joint_names if rng.random() < share]
         inertia = fflin.linearize(bare).M.diagonal()[6:]
-        own = dict(zip(bare.joint_names, inertia, strict=True))
-        robot = bare.replace(stiffness={j: own[j] * rng.uniform(1, 9) for j in some})
+        inertias = dict(zip(bare.joint_names, inertia, strict=True))
+        robot = bare.replace(
+            stiffness={j: inertias[j] * rng.uniform(1, 9) for j in some}
+        )
         if damped:
             robot = robot.replace(
-                damping={j: own[j] * rng.uniform(0.1, 2) for j in some}
+                damping={j: inertias[j] * rng.uniform(0.1, 2) for j in some}
             )
         q, _, _ = random_point(bare, rng)
         robot = robot.replace(
             rest={joint.name: joint.value(q) for joint in bare.joints}
         )
         lin = fflin.linearize(robot, q)
-        found = fflin.modes(lin)
+        result = fflin.modes(lin)
         expected = np.linalg.eigvals(lin.A)
         size = np.abs(expected).max(initial=1.0)
         # The zeros of eigvals, Jordan blocks of two, are off by the root of its round-off.
-        assert matched(found.poles, expected) < 1e-6 * size
+        assert matched(result.poles, expected) < 1e-6 * size
         nonzero = expected[np.abs(expected) > 1e-6 * size]
         assert len(nonzero) == 2 * len(some)
-        mine = found.poles[np.abs(found.poles) > 0.0]
+        mine = result.poles[np.abs(result.poles) > 0.0]
         if some:
             assert matched(mine, nonzero) < 1e-9 * size
-        assert found.rigid_body == 6 + robot.n - len(some)
-        assert found.zero_eigenvalues == 12 + 2 * (robot.n - len(some))
-        assert not found.unstable and found.equilibrium
-        assert found.residual < 1e-14 + 1e-16 * lin.certificate.condition
+        assert result.rigid_body == 6 + robot.n - len(some)
+        assert result.zero_eigenvalues == 12 + 2 * (robot.n - len(some))
+        assert not result.unstable and result.equilibrium
+        assert result.residual < 1e-14 + 1e-16 * lin.certificate.condition
         if damped and some:
             # The joints alone, the base and the free joints floating, have no zeros to disturb.
             on = [6 + bare.joint_names.index(joint) for joint in some]
@@ -173,15 +177,15 @@ def test_poles_are_the_eigenvalues(name, damped):
             M_star = M[6:, 6:] - M[6:, :6] @ np.linalg.solve(M[:6, :6], M[:6, 6:])
             squares = eigh(np.diag(robot.springs.stiffness), M_star, eigvals_only=True)
             expected = np.sqrt(squares[-len(some) :])
-            assert found.frequencies == pytest.approx(expected, rel=1e-10)
+            assert result.frequencies == pytest.approx(expected, rel=1e-10)
 
 
 def test_only_rigid_body_modes_without_springs(robots):
     for name, robot in robots.items():
-        found = fflin.modes(fflin.linearize(robot))
-        assert found.rigid_body == 6 + robot.n and not found.modes, name
-        assert not found.poles.any() and len(found.poles) == 12 + 2 * robot.n
-        assert says(str(found), name, f"{6 + robot.n} rigid-body")
+        result = fflin.modes(fflin.linearize(robot))
+        assert result.rigid_body == 6 + robot.n and not result.modes, name
+        assert not result.poles.any() and len(result.poles) == 12 + 2 * robot.n
+        assert says(str(result), name, f"{6 + robot.n} rigid-body")
 
 
 def test_chains_of_four_zeros_stay_zeros():
@@ -189,10 +193,10 @@ def test_chains_of_four_zeros_stay_zeros():
     up = fflin.Thruster("base_link", (0, 0, 0), (0, 0, 1))
     robot = fflin.load("hector", gravity=(0, 0, -9.81), inputs=[up, fflin.BaseTorque()])
     lin = fflin.linearize(robot, u=fflin.equilibrium(robot).u)
-    found = fflin.modes(lin)
-    assert found.equilibrium and not found.modes
+    result = fflin.modes(lin)
+    assert result.equilibrium and not result.modes
     # pitch and roll accelerate
-    assert (found.rigid_body, found.zero_eigenvalues) == (4, 12)
+    assert (result.rigid_body, result.zero_eigenvalues) == (4, 12)
 
 
 def test_a_stiff_and_a_soft_spring():
@@ -208,10 +212,10 @@ def test_a_stiff_and_a_soft_spring():
         rotor = pin.Inertia(1.0, np.zeros(3), J * np.eye(3))
         model.appendBodyToJoint(index, rotor, pin.SE3.Identity())
     robot = fflin.from_model(model, stiffness={"soft": k, "stiff": 1e8 * k})
-    found = fflin.modes(fflin.linearize(robot))
+    result = fflin.modes(fflin.linearize(robot))
     floating = 1.0 / (1.0 / J + 1.0 / (1.0 + J))  # the other rotor turns with the hub
     expected = np.sqrt(np.array([k, 1e8 * k]) / floating)
-    assert found.frequencies == pytest.approx(expected, rel=1e-7)
+    assert result.frequencies == pytest.approx(expected, rel=1e-7)
 
 
 def test_a_spinning_wheel_nutates():
@@ -226,34 +230,40 @@ def test_a_spinning_wheel_nutates():
     model.appendBodyToJoint(2, wheel, pin.SE3.Identity())
     robot = fflin.from_model(model)
     lin = fflin.linearize(robot, v=fflin.velocity(robot, {"wheel": 20.0}))
-    found = fflin.modes(lin)
-    (nutation,) = found.modes
-    assert found.equilibrium
+    result = fflin.modes(lin)
+    (nutation,) = result.modes
+    assert result.equilibrium
     assert nutation.pole == pytest.approx(1j * 0.5 * 20.0 / 2.3, rel=1e-12)
     assert nutation.damping_ratio == 0.0 and not nutation.unstable
-    assert found.zero_eigenvalues == 12
+    assert result.zero_eigenvalues == 12
 
 
 @pytest.mark.parametrize(
     "name, rotor", [("canadarm2", "joint_7"), ("ets_vii", "joint_6")]
 )
-def test_what_loses_no_energy_neither_decays_nor_grows(name, rotor):
+def test_a_conservative_system_neither_decays_nor_grows(name, rotor):
     """Springs and a spinning rotor: gyroscopic, so that every pole is imaginary; exactly so."""
     rng = np.random.default_rng(5)
     bare = fflin.load(name)
     q, _, _ = random_point(bare, rng)
-    own = dict(
+    inertias = dict(
         zip(bare.joint_names, fflin.linearize(bare, q).M.diagonal()[6:], strict=True)
     )
-    springs = {joint: own[joint] * rng.uniform(1, 9) for joint in own if joint != rotor}
+    springs = {
+        joint: inertias[joint] * rng.uniform(1, 9)
+        for joint in inertias
+        if joint != rotor
+    }
     rest = {joint.name: joint.value(q) for joint in bare.joints}
     robot = bare.replace(stiffness=springs, rest=rest)
     lin = fflin.linearize(robot, q, fflin.velocity(robot, {rotor: 3.0}))
     assert lin.is_equilibrium() and lin.A[-len(lin.M) :, -len(lin.M) :].any()
-    found = fflin.modes(lin)
-    assert len(found.vibrations) == len(found.modes) >= len(springs)
-    assert not found.damping_ratios.any() and not found.unstable
-    assert matched(found.poles, np.linalg.eigvals(lin.A)) < 1e-6 * found.frequencies[-1]
+    result = fflin.modes(lin)
+    assert len(result.vibrations) == len(result.modes) >= len(springs)
+    assert not result.damping_ratios.any() and not result.unstable
+    assert (
+        matched(result.poles, np.linalg.eigvals(lin.A)) < 1e-6 * result.frequencies[-1]
+    )
 
 
 def test_null_space_thrust_on_moving_links_is_seen_to_be_unstable(capsys):
@@ -270,16 +280,16 @@ def test_null_space_thrust_on_moving_links_is_seen_to_be_unstable(capsys):
     lin = linearizer(q, None, u)
     assert np.abs(B @ u).max() < 1e-13 * np.abs(u).max() and lin.is_equilibrium()
     assert fflin.check(robot, lin).ok
-    found = fflin.modes(lin)
-    assert found.equilibrium and found.unstable
+    result = fflin.modes(lin)
+    assert result.equilibrium and result.unstable
     expected = np.linalg.eigvals(lin.A)
     growing = expected[expected.real > 1e-2 * np.abs(expected).max()]
-    mine = np.array([mode.pole for mode in found.unstable])
+    mine = np.array([mode.pole for mode in result.unstable])
     assert matched(np.concatenate((mine, mine[mine.imag > 0].conj())), growing) < 1e-8
-    assert found.residual < 1e-12
-    for text in (model_report(lin), str(found)):
+    assert result.residual < 1e-12
+    for text in (model_report(lin), str(result)):
         assert says(text, "unstable")
-        for mode in found.unstable:
+        for mode in result.unstable:
             assert f"{mode.pole:.5g}" in " ".join(text.split())
 
 
@@ -306,17 +316,17 @@ def test_a_rod_that_buckles_has_the_rate_derived_by_hand(f):
         fflin.Thruster("base", (0, 0, 0), (1, 0, 0)),
     ]
     robot = fflin.from_model(model, inputs=inputs, stiffness={"hinge": k})
-    found = fflin.modes(fflin.linearize(robot, u=[f, f]))
+    result = fflin.modes(fflin.linearize(robot, u=[f, f]))
     square = (m * l * f / (M + m) - k) / (J + m * l**2 - (m * l) ** 2 / (M + m))
-    assert found.equilibrium and found.zero_eigenvalues == 12
+    assert result.equilibrium and result.zero_eigenvalues == 12
     if square < 0.0:
-        assert found.frequencies == pytest.approx([np.sqrt(-square)], rel=1e-9)
-        assert not found.damping_ratios.any() and not found.unstable
+        assert result.frequencies == pytest.approx([np.sqrt(-square)], rel=1e-9)
+        assert not result.damping_ratios.any() and not result.unstable
     else:
-        assert [mode.pole for mode in found.unstable] == pytest.approx(
+        assert [mode.pole for mode in result.unstable] == pytest.approx(
             [np.sqrt(square)], rel=1e-9
         )
-        assert len(found.modes) == 2 and found.unstable[0].damping_ratio == -1.0
+        assert len(result.modes) == 2 and result.unstable[0].damping_ratio == -1.0
 
 
 def test_models_from_files_and_in_other_hands(tmp_path):
@@ -402,8 +412,8 @@ def test_inputs_that_cancel_leave_no_mode():
     lin = fflin.linearize(
         robot, q, u=fflin.effort(robot, {"thruster_1": 5, "thruster_2": 5})
     )
-    found = fflin.modes(lin)
-    assert lin.is_equilibrium() and not found.modes and found.zero_eigenvalues == 30
+    result = fflin.modes(lin)
+    assert lin.is_equilibrium() and not result.modes and result.zero_eigenvalues == 30
 
 
 @pytest.mark.parametrize("thrust", [1e-3, 1.0])
@@ -419,21 +429,21 @@ def test_a_weak_asymmetry_is_not_taken_for_a_spring(thrust):
     lin = fflin.linearize(
         robot, fflin.configuration(robot, {"joint_2": 0.4}), u=[thrust] * 2
     )
-    found = fflin.modes(lin)
+    result = fflin.modes(lin)
     expected = np.linalg.eigvals(lin.A)
     expected = expected[np.abs(expected) > 1e-4 * thrust**0.5]
-    poles = found.poles[np.abs(found.poles) > 1e-4 * thrust**0.5]
+    poles = result.poles[np.abs(result.poles) > 1e-4 * thrust**0.5]
     assert len(poles) == len(expected)
     distance = np.abs(poles[:, None] - expected).min(axis=1)
     assert (distance <= 1e-5 * np.abs(poles)).all()
     growing = (expected.real > 1e-6) & (expected.imag >= 0.0)
-    assert len(found.unstable) == growing.sum() > 0
+    assert len(result.unstable) == growing.sum() > 0
 
 
 @pytest.mark.parametrize(
     ("growth", "doubtful"), [(1e-9, False), (1.0, True), (1e3, False)]
 )
-def test_growth_within_rounding_is_told(robots, growth, doubtful):
+def test_growth_within_rounding_is_reported(robots, growth, doubtful):
     """A pole that turns and grows by so many times its rounding, beside a damper."""
     lin = fflin.linearize(robots["planar_detumble"].replace(stiffness=9.0, damping=0.1))
     (first, *_) = (mode for mode in fflin.modes(lin).modes if mode.oscillates)
@@ -442,9 +452,9 @@ def test_growth_within_rounding_is_told(robots, growth, doubtful):
     assert (
         error < 1e-10 * first.frequency and first.margin < -1e3 and not first.unstable
     )
-    found = replace(fflin.modes(lin), modes=(changed,))
-    assert bool(found.notes) == doubtful
-    assert ("undecided" in str(found)) == doubtful
+    result = replace(fflin.modes(lin), modes=(changed,))
+    assert bool(result.notes) == doubtful
+    assert ("undecided" in str(result)) == doubtful
     assert not fflin.modes(lin).notes
 
 
@@ -458,15 +468,15 @@ def spun(robot, frame="hybrid", moving=False):
 
 @pytest.mark.parametrize("frame", FRAMES)
 @pytest.mark.parametrize("name", ["servicer_7dof", "dual_arm", "canadarm2"])
-def test_energies_of_bodies_are_those_of_the_velocities(name, frame):
+def test_energies_of_bodies_match_the_velocities(name, frame):
     """The fractions are not negative, sum to 1, and the base has what its velocities say."""
     robot = fflin.load(name, stiffness=20.0)
     lin = spun(robot.replace(damping={robot.joint_names[1]: 30.0}), frame)
-    found, robot = fflin.modes(lin), lin._robot
-    assert max(np.abs(mode.shape[6:12].imag).max() for mode in found.vibrations) > 0.1
+    result, robot = fflin.modes(lin), lin._robot
+    assert max(np.abs(mode.shape[6:12].imag).max() for mode in result.vibrations) > 0.1
     state = fflin.StateMap(robot, reference=lin.reference, frame=frame)
     half = len(lin.M)
-    for mode in found.vibrations:
+    for mode in result.vibrations:
         parts = np.array(list(mode.energy.values()))
         assert (parts >= 0.0).all() and parts.sum() == pytest.approx(1.0, rel=1e-12)
         assert (np.diff(parts) <= 1e-9).all() and len(parts) == robot.model.njoints - 1
@@ -535,14 +545,14 @@ def test_two_bodies_on_a_spring_share_the_energy_as_derived_by_hand():
 
 def test_energy_does_not_depend_on_which_body_is_the_base():
     rng = np.random.default_rng(9)
-    found = {}
+    result = {}
     for turned in (False, True):
         for shift in (pin.SE3.Identity(), random_pose(rng, 170.0)):
             robot, _ = two_bodies(shift, turned)
             (mode,) = fflin.modes(fflin.linearize(robot)).modes
             a = mode.energy["hinge" if turned else "base"]
-            found[turned, shift] = (mode.frequency, a)
-    figures = np.array(list(found.values()))
+            result[turned, shift] = (mode.frequency, a)
+    figures = np.array(list(result.values()))
     np.testing.assert_allclose(figures, figures[[0]].repeat(4, axis=0), rtol=1e-10)
     assert 0.05 < figures[0, 1] < 0.95
 
@@ -552,11 +562,11 @@ def test_panels_that_move_most_are_named_first_with_percentages():
     robot = fflin.load(
         "servicer_7dof", stiffness={"panel_left": 100.0, "panel_right": 100.0}
     )
-    found = fflin.modes(fflin.linearize(robot))
-    rows = str(found).splitlines()[3:]
+    result = fflin.modes(fflin.linearize(robot))
+    rows = str(result).splitlines()[3:]
     assert "panel_left_link 48 %" in rows[0]
-    for mode, row in zip(found.modes, rows, strict=True):
-        numbers = [int(each) for each in re.findall(r"(\d+) %", row)]
+    for mode, row in zip(result.modes, rows, strict=True):
+        numbers = [int(item) for item in re.findall(r"(\d+) %", row)]
         named = len(numbers) - ("more" in row)
         expected = [100.0 * part for part in list(mode.energy.values())[:named]]
         assert numbers[:named] == pytest.approx(expected, abs=0.51)
@@ -566,11 +576,11 @@ def test_panels_that_move_most_are_named_first_with_percentages():
 def test_models_from_files_say_that_bodies_are_not_known(tmp_path):
     lin = fflin.linearize(two_panels(stiffness=5.0))
     lin.save(tmp_path / "m.npz")
-    found = fflin.modes(fflin.LinearModel.load(tmp_path / "m.npz"))
-    assert not any(mode.energy for mode in found.modes)
-    assert "file" in found.notes[-1] and not fflin.modes(lin).notes
-    assert f"{found.frequencies[0]:.6g}" in str(found)
-    assert fflin.plot_modes(found).axes[0].patches
+    result = fflin.modes(fflin.LinearModel.load(tmp_path / "m.npz"))
+    assert not any(mode.energy for mode in result.modes)
+    assert "file" in result.notes[-1] and not fflin.modes(lin).notes
+    assert f"{result.frequencies[0]:.6g}" in str(result)
+    assert fflin.plot_modes(result).axes[0].patches
 
 
 def test_terms_of_a_combination_that_are_left_out_are_counted():
@@ -601,8 +611,8 @@ def test_modes_build_as_many_data_for_many_modes_as_for_one(monkeypatch, slosh):
         robot = fflin.load("canadarm2", appendages=tanks, stiffness=springs)
         lin = fflin.linearize(robot)
         built.clear()
-        found = fflin.modes(lin)
-        assert len(found.vibrations) == modes * (2 if slosh else 1)
+        result = fflin.modes(lin)
+        assert len(result.vibrations) == modes * (2 if slosh else 1)
         return len(built)
 
     assert count(1) == count(6)
@@ -610,9 +620,9 @@ def test_modes_build_as_many_data_for_many_modes_as_for_one(monkeypatch, slosh):
 
 def test_motions_in_orbit_are_not_listed_as_modes_of_appendages():
     robot = fflin.load("inspector_flexible.toml", lock=["arm_*"], orbit=550e3)
-    found = fflin.modes(fflin.linearize(robot))
-    assert len(found.vibrations) > len(robot.modes)
-    _, after = str(found).split("the link that carries them free and clamped\n")
+    result = fflin.modes(fflin.linearize(robot))
+    assert len(result.vibrations) > len(robot.modes)
+    _, after = str(result).split("the link that carries them free and clamped\n")
     table, _ = after.split("\n\n")
     listed = [float(row.split()[0]) for row in table.splitlines()[1:]]
     assert len(listed) == len(robot.modes)

@@ -52,8 +52,8 @@ def test_unactuated_base_leaves_the_generalised_inertia(robots, name):
     assert reduced.M == pytest.approx(schur, rel=1e-9, abs=1e-9)
     assert schur @ reduced.B[n:] == pytest.approx(np.eye(n), abs=1e-8)
     assert np.linalg.inv(M)[6:, 6:] @ schur == pytest.approx(np.eye(n), abs=1e-8)
-    found = fflin.controllability(reduced)
-    assert found.dimension == 2 * n and found.stabilizable
+    result = fflin.controllability(reduced)
+    assert result.dimension == 2 * n and result.stabilizable
 
 
 @pytest.mark.parametrize("name", ARMS)
@@ -98,7 +98,7 @@ def test_transfer_function_is_kept(robots, name, wrench):
         assert len(reduced.momenta) == 6 - 3 * len(wrench)
 
 
-def test_motions_without_momentum_are_those_of_the_reduced_model(robots):
+def test_motions_without_momentum_match_the_reduced_model(robots):
     rng = np.random.default_rng(2)
     robot = robots["ets_vii"]
     whole = fflin.linearize(robot.replace(inputs=[BaseTorque(), *motors(robot)]))
@@ -168,7 +168,7 @@ def test_it_can_be_controlled(robots):
     assert np.sum(np.abs(poles) < 1e-6) == 12
 
 
-def test_what_drifts_is_carried_over(robots):
+def test_a_drift_is_converted(robots):
     """The base may fly on, since nothing depends on where it is; what is kept keeps its f0."""
     robot = robots["ets_vii"]
     v = fflin.velocity(robot, {"v_b.x": 0.3})
@@ -242,7 +242,7 @@ def test_generalised_jacobian_is_the_reduced_models_output(robots):
         fflin.generalized_jacobian(robot, q, "tol")
 
 
-def test_the_report_states_what_is_kept_and_what_is_removed():
+def test_the_report_lists_kept_and_removed_states():
     """A printed reduction, of a spacecraft that floats free and of one whose base is driven."""
     arm = fflin.load("planar_detumble")
     for inputs, momenta in ((motors(arm), 6), ([*motors(arm), BaseTorque()], 3)):

@@ -99,7 +99,7 @@ def random_moving(rng, name, robots):
 
 
 @pytest.mark.parametrize("name", [*ARMS, ""])
-def test_no_more_than_what_the_momenta_leave_is_controllable(robots, name):
+def test_controllability_excludes_the_conserved_momenta(robots, name):
     rng = np.random.default_rng(len(name))
     robot, q, v = random_moving(rng, name, robots)
     nx = 12 + 2 * robot.n
@@ -108,19 +108,19 @@ def test_no_more_than_what_the_momenta_leave_is_controllable(robots, name):
         for axes in ({}, {"frame": "world"}, {"moving": True}):
             continuous = fflin.linearize(pushed, q, v, **axes)
             for lin in (continuous, continuous.discretize(0.01)):
-                found = fflin.controllability(lin)
-                assert found.bound == nx - conserved >= found.dimension
-                assert found.method == "frozen"
-                assert found.stabilizable is (False if conserved else None)
-                text = " ".join(str(found).split()).replace("not stabilizable", "")
+                result = fflin.controllability(lin)
+                assert result.bound == nx - conserved >= result.dimension
+                assert result.method == "frozen"
+                assert result.stabilizable is (False if conserved else None)
+                text = " ".join(str(result).split()).replace("not stabilizable", "")
                 assert "frozen" in text and "stabilizable" not in text
                 size = np.tile(np.sqrt(lin.M.diagonal()), 2)
-                rows = found.rows / size
+                rows = result.rows / size
                 rows /= np.linalg.norm(rows, axis=1, keepdims=True)
-                basis = found.basis * size[:, None]
+                basis = result.basis * size[:, None]
                 basis /= np.linalg.norm(basis, axis=0)
                 assert np.abs(rows @ basis).max(initial=0.0) < 1e-8
-                assert len(rows) == nx - found.dimension == np.linalg.matrix_rank(rows)
+                assert len(rows) == nx - result.dimension == np.linalg.matrix_rank(rows)
                 B = lin.B * size[:, None]
                 assert (
                     np.abs(rows[:conserved] @ B).max(initial=0.0)
@@ -134,13 +134,13 @@ def test_inputs_on_all_coordinates_control_all_states_in_motion(robots, name):
     lin = fflin.linearize(
         robot.replace(inputs=[BaseTorque(), BaseForce(), *motors(robot)]), q, v
     )
-    found = fflin.controllability(lin)
+    result = fflin.controllability(lin)
     assert (
-        found.dimension == len(lin.A)
-        and found.method == "closed form"
-        and found.stabilizable
+        result.dimension == len(lin.A)
+        and result.method == "closed form"
+        and result.stabilizable
     )
-    assert says(str(found), "not an equilibrium")
+    assert says(str(result), "not an equilibrium")
     # Sampling may lose states, which the frozen matrices cannot exclude.
     assert fflin.controllability(lin.discretize(0.1)).stabilizable is None
 
@@ -150,15 +150,15 @@ def test_the_motion_of_one_joint_leaves_seventeen_of_twenty_six(robots):
     robot = robot.replace(inputs=motors(robot))
     for velocity in ({"joint_1": 0.1}, {"omega_b.z": 0.1}):
         lin = fflin.linearize(robot, v=fflin.velocity(robot, velocity))
-        found = fflin.controllability(lin)
-        assert found.bound == 17 and found.stabilizable is False
-        assert found.uncontrollable[:9] == (
+        result = fflin.controllability(lin)
+        assert result.bound == 17 and result.stabilizable is False
+        assert result.uncontrollable[:9] == (
             *(f"angular momentum {axis}" for axis in "xyz"),
             *(f"linear momentum {axis}" for axis in "xyz"),
             *(f"centre of mass {axis}" for axis in "xyz"),
         )
         assert says(
-            str(found), "at most 17 of 26", "linear momentum x/y/z", "robot leaves"
+            str(result), "at most 17 of 26", "linear momentum x/y/z", "robot leaves"
         )
 
 
@@ -209,11 +209,11 @@ def test_gramians_along_a_motion_have_the_rank_of_another_integration(
     shown, least, hidden = gap(np.hstack(seen), 1.0 / size)
     assert kept > 1e2 * lost and least > 1e2 * hidden
     for model in (traj, traj.discretize(t[1])):
-        found = fflin.controllability(model)
-        assert found.method == "Gramian" and found.dimension == found.bound == rank
-        assert found.stabilizable is False and found.duration == 1.0
-        assert says(str(found), f"{rank} of {len(size)}", "motion of 1 s")
-        rows = found.rows / size
+        result = fflin.controllability(model)
+        assert result.method == "Gramian" and result.dimension == result.bound == rank
+        assert result.stabilizable is False and result.duration == 1.0
+        assert says(str(result), f"{rank} of {len(size)}", "motion of 1 s")
+        rows = result.rows / size
         rows /= np.linalg.norm(rows, axis=1, keepdims=True)
         F = np.hstack(reached) * size[:, None]
         assert np.abs(rows @ F).max() < 1e-6 * np.abs(F).max()
@@ -235,14 +235,14 @@ def test_a_trajectory_at_rest_gives_the_closed_form(robots, knots):
         q = np.tile(lin.q, (knots, 1))
         v, u = np.zeros((knots, robot.nv)), np.zeros((knots, lin.B.shape[1]))
         traj = fflin.linearize_trajectory(chosen, np.linspace(0.0, 3.0, knots), q, v, u)
-        found = fflin.controllability(traj)
-        assert found.dimension == still.dimension
-        assert found.stabilizable is still.stabilizable
+        result = fflin.controllability(traj)
+        assert result.dimension == still.dimension
+        assert result.stabilizable is still.stabilizable
         seen = fflin.observability(traj)
         assert seen.dimension == len(lin.A) and seen.detectable is True
 
 
-def test_what_no_output_depends_on_stays_unobservable_in_motion(robots):
+def test_states_without_effect_on_outputs_are_unobservable_in_motion(robots):
     robot = robots["ets_vii"]
     v = fflin.velocity(robot, {"joint_2": 0.4, "omega_b.x": 0.2, "v_b.y": 0.1})
     sensors = {
@@ -255,20 +255,22 @@ def test_what_no_output_depends_on_stays_unobservable_in_motion(robots):
             for axes in ({}, {"moving": True}):
                 lin = fflin.linearize(chosen, v=v, **axes)
                 for model in (lin, lin.discretize(0.05)):
-                    found = fflin.observability(model)
-                    assert found.bound == 24 - hidden >= found.dimension
-                    assert found.detectable is False and found.method == "frozen"
-                    assert found.unobservable[:3] in (
+                    result = fflin.observability(model)
+                    assert result.bound == 24 - hidden >= result.dimension
+                    assert result.detectable is False and result.method == "frozen"
+                    assert result.unobservable[:3] in (
                         ("q_b.x", "q_b.y", "q_b.z"),
                         ("r_b.x", "r_b.y", "r_b.z"),
                     )
                     assert says(
-                        str(found), f"at most {24 - hidden} of 24", "not detectable"
+                        str(result), f"at most {24 - hidden} of 24", "not detectable"
                     )
     posed = robot.replace(outputs=[fflin.BasePose(), fflin.JointPositions()])
     lin = fflin.linearize(posed, v=v)
-    found = fflin.observability(lin)
-    assert found.dimension == 24 and found.method == "closed form" and found.detectable
+    result = fflin.observability(lin)
+    assert (
+        result.dimension == 24 and result.method == "closed form" and result.detectable
+    )
     sampled = fflin.observability(lin.discretize(0.1))
     assert sampled.bound == 24 and sampled.detectable is None
     assert says(str(sampled), "detectability is undecided")
@@ -276,7 +278,7 @@ def test_what_no_output_depends_on_stays_unobservable_in_motion(robots):
     assert fflin.observability(whole).detectable is True
 
 
-def test_a_trajectory_decides_what_one_point_cannot(robots):
+def test_a_trajectory_decides_controllability_that_one_point_cannot(robots):
     """Force on the base alone: the frozen matrices leave it open, the motion does not."""
     robot = robots["astrobee_arm"]
     robot = robot.replace(inputs=[BaseForce(), *motors(robot)])
@@ -288,8 +290,8 @@ def test_a_trajectory_decides_what_one_point_cannot(robots):
     rank, kept, lost = gap(np.hstack(reached), size)
     assert rank == 16 and kept > 1e2 * lost
     traj = fflin.linearize_trajectory(robot, t, q, v, np.zeros((len(t), 5)))
-    found = fflin.controllability(traj)
-    assert found.dimension == 16 and found.stabilizable is True
+    result = fflin.controllability(traj)
+    assert result.dimension == 16 and result.stabilizable is True
 
 
 def test_models_from_files_are_refused_only_if_the_momenta_matter(robots, tmp_path):
@@ -315,15 +317,15 @@ def test_in_orbit_no_momentum_is_conserved(robots):
         inputs=motors(robot), outputs=[fflin.JointPositions()], orbit=700e3
     )
     lin = fflin.linearize(robot, v=fflin.velocity(robot, {"joint_1": 0.1}))
-    found = fflin.controllability(lin)
-    assert found.bound == 24 and found.stabilizable is None
-    assert says(str(found), "stabilizability is undecided")
+    result = fflin.controllability(lin)
+    assert result.bound == 24 and result.stabilizable is None
+    assert says(str(result), "stabilizability is undecided")
     # The gravity gradient depends on position and attitude, so that joints may reveal them.
     view = fflin.observability(lin)
     assert view.bound == 24 and view.detectable is None
 
 
-def test_momentum_that_is_no_rate_is_not_removed(robots):
+def test_momentum_that_is_not_a_rate_is_not_removed(robots):
     robot = robots["ets_vii"]
     spun = fflin.velocity(robot, {"joint_1": 0.1})
     for inputs, text in (

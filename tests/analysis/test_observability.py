@@ -12,18 +12,18 @@ from tests.support.robots import BUNDLED
 ARMS = [name for name in BUNDLED if name != "cubesat"]
 
 
-def hidden(lin, found):
+def hidden(lin, result):
     """The unobservable motions stay so: C V = 0, and A V within V."""
-    V = np.linalg.qr(found.basis)[0]
+    V = np.linalg.qr(result.basis)[0]
     scale = max(1.0, np.abs(lin.A).max())
-    assert found.dimension + V.shape[1] == len(lin.A)
-    assert found.dimension == len(found.rows)
-    assert len(found.unobservable) == V.shape[1] == len(found.fixed_poles)
+    assert result.dimension + V.shape[1] == len(lin.A)
+    assert result.dimension == len(result.rows)
+    assert len(result.unobservable) == V.shape[1] == len(result.fixed_poles)
     assert np.abs(lin.C @ V).max(initial=0.0) < 1e-8 * max(1.0, np.abs(lin.C).max())
     assert np.abs(lin.A @ V - V @ (V.T @ lin.A @ V)).max(initial=0.0) < 1e-7 * scale
     assert (
-        np.abs(found.rows @ found.basis).max(initial=0.0)
-        < 1e-8 * np.abs(found.rows).max()
+        np.abs(result.rows @ result.basis).max(initial=0.0)
+        < 1e-8 * np.abs(result.rows).max()
     )
 
 
@@ -42,23 +42,23 @@ def test_at_rest_it_is_the_kernel_of_C_and_CA(robots, name):
     ):
         lin = fflin.linearize(robot.replace(outputs=outputs))
         for model in (lin, lin.discretize(0.1)):
-            found = fflin.observability(model)
-            assert found.dimension == dimension and found.method == "closed form"
-            assert found.detectable == (dimension == 12 + 2 * n)
-            hidden(model, found)
+            result = fflin.observability(model)
+            assert result.dimension == dimension and result.method == "closed form"
+            assert result.detectable == (dimension == 12 + 2 * n)
+            hidden(model, result)
 
 
 def test_joints_only_hide_the_base(robots):
     robot = robots["ets_vii"]
-    found = fflin.observability(
+    result = fflin.observability(
         fflin.linearize(robot.replace(outputs=[JointPositions()]))
     )
-    assert found.unobservable == tuple(
+    assert result.unobservable == tuple(
         f"{group}.{axis}"
         for group in ("q_b", "r_b", "omega_b", "v_b")
         for axis in "xyz"
     )
-    assert "not detectable" in str(found)
+    assert "not detectable" in str(result)
 
 
 @pytest.mark.parametrize("name", ARMS)
@@ -69,7 +69,7 @@ def test_springs_and_dampers_against_exact_arithmetic(robots, name):
     for _ in range(4):
         joints = list(robot.joint_names)
         # Each spring of 1 to 9 rad/s on what it moves with the base free, each damper of 0.1 to 1.
-        own = dict(
+        default = dict(
             zip(
                 joints,
                 1.0 / np.linalg.inv(fflin.linearize(robot).M).diagonal()[6:],
@@ -77,10 +77,14 @@ def test_springs_and_dampers_against_exact_arithmetic(robots, name):
             )
         )
         K = {
-            j: own[j] * float(rng.uniform(1, 90)) for j in joints if rng.random() < 0.6
+            j: default[j] * float(rng.uniform(1, 90))
+            for j in joints
+            if rng.random() < 0.6
         }
         D = {
-            j: own[j] * float(rng.uniform(0.1, 1)) for j in joints if rng.random() < 0.6
+            j: default[j] * float(rng.uniform(0.1, 1))
+            for j in joints
+            if rng.random() < 0.6
         }
         seen = [j for j in joints if rng.random() < 0.5] or joints[:1]
         chosen = robot.replace(
@@ -99,9 +103,9 @@ def test_springs_and_dampers_against_exact_arithmetic(robots, name):
         A[:nv, nv:] = np.eye(nv, dtype=np.int64)
         A[nv:] = slopes
         expected = exact.krylov_dimension(A.T.copy(), exact.modular(lin.C).T.copy())
-        found = fflin.observability(lin)
-        assert found.dimension == expected
-        hidden(lin, found)
+        result = fflin.observability(lin)
+        assert result.dimension == expected
+        hidden(lin, result)
         assert fflin.observability(lin.discretize(0.02)).dimension == expected
 
 
@@ -118,9 +122,9 @@ def damped(robots):
 
 def test_endless_gramians_solve_lyapunov(robots):
     lin = damped(robots)
-    found = fflin.gramians(lin)
-    Wc, Wo = found.controllability, found.observability
-    assert found.duration == np.inf
+    result = fflin.gramians(lin)
+    Wc, Wo = result.controllability, result.observability
+    assert result.duration == np.inf
     assert lin.A @ Wc + Wc @ lin.A.T == pytest.approx(-lin.B @ lin.B.T, abs=1e-9)
     assert lin.A.T @ Wo + Wo @ lin.A == pytest.approx(-lin.C.T @ lin.C, abs=1e-9)
     sampled = lin.discretize(0.2)
@@ -137,17 +141,17 @@ def test_finite_gramians_are_the_integrals(robots):
     robot = robots["planar_detumble"]
     lin = fflin.linearize(robot)
     T = 3.0
-    found = fflin.gramians(lin, T)
+    result = fflin.gramians(lin, T)
     # At rest A^2 = 0: the integrand is a polynomial of degree two, which Simpson sums exactly.
     nodes, weights = (0.0, T / 2, T), (T / 6, 4 * T / 6, T / 6)
     terms = [expm(lin.A * t) @ lin.B for t in nodes]
     Wc = sum(w * x @ x.T for w, x in zip(weights, terms, strict=True))
-    assert found.controllability == pytest.approx(
+    assert result.controllability == pytest.approx(
         Wc, rel=1e-10, abs=1e-10 * np.abs(Wc).max()
     )
     terms = [lin.C @ expm(lin.A * t) for t in nodes]
     Wo = sum(w * x.T @ x for w, x in zip(weights, terms, strict=True))
-    assert found.observability == pytest.approx(Wo, rel=1e-10, abs=1e-10)
+    assert result.observability == pytest.approx(Wo, rel=1e-10, abs=1e-10)
     sampled = lin.discretize(0.5)
     powers = [np.linalg.matrix_power(sampled.A, k) @ sampled.B for k in range(7)]
     expected = sum(x @ x.T for x in powers)
@@ -159,10 +163,10 @@ def test_finite_gramians_are_the_integrals(robots):
 @pytest.mark.parametrize("T", [1e-3, 1e5, 1e8])
 def test_gramians_at_rest_are_exact_over_any_horizon(robots, T):
     lin = fflin.linearize(robots["astrobee_arm"])
-    found = fflin.gramians(lin, T)
+    result = fflin.gramians(lin, T)
     for A, B, W in (
-        (lin.A, lin.B, found.controllability),
-        (lin.A.T, lin.C.T, found.observability),
+        (lin.A, lin.B, result.controllability),
+        (lin.A.T, lin.C.T, result.observability),
     ):
         Q = B @ B.T
         expected = Q * T + (A @ Q + Q @ A.T) * T**2 / 2 + A @ Q @ A.T * T**3 / 3

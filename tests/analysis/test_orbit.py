@@ -11,7 +11,7 @@ from tests.support.robots import free_body
 LEO, GEO = 1.06e-3, 7.29e-5  # [rad/s]
 
 
-def test_passive_panels_sag_beside_motors_in_a_relative_equilibrium():
+def test_passive_panels_sag_next_to_motors_in_a_relative_equilibrium():
     robot = fflin.load("servicer_7dof", orbit=800e3, passive=["panel_*"])
     robot = robot.replace(stiffness={"panel_*": 40.0})
     q = fflin.relative_equilibria(robot, fflin.configuration(robot, {"joint_2": 0.5}))[
@@ -24,7 +24,7 @@ def test_passive_panels_sag_beside_motors_in_a_relative_equilibrium():
 
 
 @pytest.mark.parametrize("n", [0.3, LEO, GEO])
-def test_what_thrust_reaches_is_known(n):
+def test_reachable_forces_of_thrusters_are_known(n):
     """Along the orbit all of the plane, away from the body all but one; askew, as the plane and
     what is across it have the poles +-jn alike, no more than four."""
     robot = in_orbit(free_body((3.0, 5.0, 4.0)), n)
@@ -38,8 +38,8 @@ def test_what_thrust_reaches_is_known(n):
     for direction, dimension in expected.items():
         thrust = robot.replace(inputs=[fflin.Thruster(frame, center, direction)])
         lin = fflin.linearize(thrust, frame="hill")
-        found = fflin.controllability(lin)
-        assert (found.dimension, found.stabilizable) == (dimension, False)
+        result = fflin.controllability(lin)
+        assert (result.dimension, result.stabilizable) == (dimension, False)
         assert not len(fflin.momentum_reduction(lin).momenta)
         assert fflin.observability(lin).dimension == 12
     # The drift of a radial thrust's orbit, dy/dt + 2 n x, is what it cannot change.
@@ -100,7 +100,7 @@ def test_wheels_stay_in_a_design_since_their_carrier_turns():
     assert [name for name in reduced.state_names if name.startswith("qdot_m.")]
 
 
-def test_springs_beside_which_an_orbit_is_rounding_are_told():
+def test_springs_that_are_much_stiffer_than_the_orbit_are_reported():
     robot = fflin.load("servicer_7dof", orbit=800e3).replace(stiffness=1e9)
     with pytest.warns(fflin.FflinWarning, match="rounding"):
         fflin.modes(fflin.linearize(robot))

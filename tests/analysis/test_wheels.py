@@ -9,7 +9,7 @@ import pytest
 import fflin
 from fflin import BaseForce, BaseTorque, JointTorque, ReactionWheel, Thruster
 from fflin.analysis.controllability import require_detectable, require_stabilizable
-from fflin.analysis.reduction import regulated_part, without
+from fflin.analysis.reduction import outputs_of, regulated_part, without
 from tests.support.marks import exhaustive
 from tests.support.robots import FRAMES, mostly, random_pose, random_tree
 from tests.support.wheels import AXES, carrier_alone, unit, wheels
@@ -60,18 +60,23 @@ def test_attitude_and_joints_stay_and_the_quotient_is_exact(count, frame):
             np.linalg.eigvalsh(body.inertia)[0]
             for body in robot.model.inertias.tolist()
         ]
-        own, J = motors(robot), 1e-3 * min(moment for moment in bodies if moment > 0.0)
+        default, J = (
+            motors(robot),
+            1e-3 * min(moment for moment in bodies if moment > 0.0),
+        )
         on = [None] if robot.name != "servicer_7dof" else [None, "link_3", "panel_left"]
         added = wheels(AXES[:count], J, on)
         passive = {}
-        if own:
+        if default:
             passive = {"stiffness": {robot.joint_names[-1]: 3.0}, "damping": 0.2}
-        ship = robot.replace(inputs=[*own, *added], **passive)
+        ship = robot.replace(inputs=[*default, *added], **passive)
         q = posed(ship, rng)
         at = fflin.linearize(ship, q).x0[6 : 6 + ship.n]
-        if own:
-            there = dict(zip(ship.joint_names, at, strict=True))
-            ship = ship.replace(rest={name: there[name] for name in robot.joint_names})
+        if default:
+            expected_value = dict(zip(ship.joint_names, at, strict=True))
+            ship = ship.replace(
+                rest={name: expected_value[name] for name in robot.joint_names}
+            )
         lin = fflin.linearize(ship, q, frame=frame, reference=pin.SE3.Identity())
         for model in (lin, lin.discretize(0.1)):
             part = fflin.momentum_reduction(model)
@@ -98,7 +103,7 @@ def test_attitude_and_joints_stay_and_the_quotient_is_exact(count, frame):
 
 @pytest.mark.parametrize("count", [3, 4])
 @pytest.mark.parametrize("speed", [0.0, 400.0])
-def test_what_is_left_is_the_carrier_without_its_wheels_under_minus_a_u(count, speed):
+def test_the_reduced_model_is_the_carrier_without_wheels_under_minus_a_u(count, speed):
     """Beside another robot: its base lacks J a a^T, holds the momentum, and bears -a u."""
     bare, J = fflin.load("servicer_7dof"), 0.4
     speeds = {f"wheel_{k + 1}": speed * (1.0 + k) for k in range(count)}
@@ -134,7 +139,7 @@ def test_what_is_left_is_the_carrier_without_its_wheels_under_minus_a_u(count, s
     assert part.M == pytest.approx(expected, abs=1e-11 * np.abs(expected).max())
 
 
-def test_which_speeds_stay_is_what_the_inputs_can_hold():
+def test_the_inputs_determine_which_speeds_remain():
     bare = fflin.load("cubesat")
     three, four = wheels(AXES[:3], 1e-5), wheels(AXES[:4], 1e-5)
     about_x = [Thruster("base", (0, y, 0), (0, 0, 1)) for y in (0.1, -0.1)]
@@ -179,7 +184,7 @@ def test_the_speed_of_a_wheel_matters_on_a_carrier_that_turns_and_with_friction(
     assert "q_m.wheel_1" in regulated_part(fflin.linearize(sprung), False).state_names
 
 
-def test_what_grows_without_an_input_is_named_beside_speeds_alone():
+def test_states_that_grow_without_an_input_are_named_if_only_speeds_are_regulated():
     """Of the first-order models that speeds without angles make."""
     ship = fflin.load("cubesat").replace(inputs=[BaseTorque(), *wheels(AXES[:3], 1e-5)])
     part = regulated_part(fflin.linearize(ship))
@@ -195,7 +200,7 @@ def test_what_grows_without_an_input_is_named_beside_speeds_alone():
         require_detectable(replace(part, A=A, C=np.delete(part.C, 1, axis=0)))
 
 
-def test_from_inputs_to_what_stays_the_transfer_function_is_kept():
+def test_the_transfer_function_to_the_kept_states_is_unchanged():
     robot = fflin.load("servicer_7dof")
     ship = robot.replace(
         inputs=[*motors(robot), *wheels(AXES[:4], 0.05)],
@@ -250,7 +255,7 @@ def test_joints_that_are_rotors_stay_joints():
 )
 @pytest.mark.parametrize("speed", [1.0, 4000.0])
 @pytest.mark.parametrize("net", [True, False])
-def test_what_rounding_leaves_of_a_spin_is_no_spring(name, J, speed, net):
+def test_rounding_errors_of_a_spin_are_not_springs(name, J, speed, net):
     """Balanced wheels and others: the reduction keeps as many states as at rest."""
     bare = fflin.load(name)
     axes = [(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)]  # whose sum is zero
@@ -264,6 +269,25 @@ def test_what_rounding_leaves_of_a_spin_is_no_spring(name, J, speed, net):
         )
         still, spun = (linearizer(q, v) for v in (None, fflin.velocity(ship, speeds)))
         expected = fflin.momentum_reduction(still)
-        found = fflin.momentum_reduction(spun)
-        assert found.state_names == expected.state_names
-        assert len(found.momenta) == len(expected.momenta) == 3 and not found.notes
+        result = fflin.momentum_reduction(spun)
+        assert result.state_names == expected.state_names
+        assert len(result.momenta) == len(expected.momenta) == 3 and not result.notes
+
+
+@pytest.mark.parametrize("unit", [1e-9, 1.0, 1e9])
+def test_the_outputs_of_a_reduced_model_do_not_depend_on_their_units(unit):
+    """An output is kept if its other entries of C are rounding errors of its largest entry."""
+    lin = fflin.linearize(fflin.load("cubesat"))
+    C = np.zeros((2, len(lin.A)))
+    C[:, 0] = unit
+    C[:, -1] = unit * np.array([1e-14, 1e-9])
+    model = replace(
+        lin,
+        C=C,
+        D=np.zeros((2, lin.B.shape[1])),
+        output_names=("kept", "removed"),
+        output_units=("1", "1"),
+        y0=np.zeros(2),
+    )
+    S = np.eye(len(lin.A))[:-1]
+    assert outputs_of(model, S).tolist() == [[1.0, 0.0]]

@@ -39,7 +39,7 @@ def test_copies_are_read_only_and_equal(results, way):
         again, count = COPIES[way](result), 0
         for name, value in vars(result).items():
             if isinstance(value, np.ndarray):
-                found, count = vars(again)[name], count + 1
-                assert np.array_equal(found, value)
-                assert not found.flags.writeable, (type(result).__name__, name)
+                outcome, count = vars(again)[name], count + 1
+                assert np.array_equal(outcome, value)
+                assert not outcome.flags.writeable, (type(result).__name__, name)
         assert count > 4

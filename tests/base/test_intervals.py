@@ -10,8 +10,8 @@ from fflin.base import intervals
 @pytest.mark.parametrize("successes, count", [(0, 10), (3, 10), (10, 10), (411, 1000)])
 def test_the_share_is_clopper_and_pearsons(successes, count):
     expected = stats.binomtest(successes, count).proportion_ci(0.9)
-    found = intervals.clopper_pearson(successes, count, 0.9)
-    assert found == pytest.approx(
+    result = intervals.clopper_pearson(successes, count, 0.9)
+    assert result == pytest.approx(
         (successes / count, expected.low, expected.high), rel=1e-9
     )
 
@@ -22,9 +22,9 @@ def test_the_interval_of_a_quantile_holds_as_often_as_binomial_says(p, count):
     rng, within = np.random.default_rng(7), 0
     truth = stats.expon.ppf(p)
     for _ in range(1000):
-        found = intervals.quantile(rng.exponential(size=count), p, 0.9)
-        assert found.low <= found.value <= found.high
-        within += found.low <= truth <= found.high
+        result = intervals.quantile(rng.exponential(size=count), p, 0.9)
+        assert result.low <= result.value <= result.high
+        within += result.low <= truth <= result.high
     # At least 900, and no more than one order statistic too wide on either side.
     assert 870 <= within <= 1000
     ranks = np.arange(1.0, count + 1)
@@ -38,8 +38,8 @@ def test_the_interval_of_a_quantile_holds_as_often_as_binomial_says(p, count):
 def test_the_mean_has_students_interval():
     values = np.random.default_rng(1).normal(size=30)
     expected = stats.t.interval(0.8, 29, values.mean(), stats.sem(values))
-    found = intervals.mean(values, 0.8)
-    assert found == pytest.approx((values.mean(), *expected), rel=1e-12)
+    result = intervals.mean(values, 0.8)
+    assert result == pytest.approx((values.mean(), *expected), rel=1e-12)
     assert intervals.mean(values[:1], 0.8)[1:] == (-np.inf, np.inf)
 
 

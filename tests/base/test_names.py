@@ -19,7 +19,7 @@ NAMES = (
 
 
 @pytest.mark.parametrize(
-    ("key", "found"),
+    ("key", "result"),
     [
         ("q_m.hinge_2", [2]),
         ("q_m", [1, 2, 3]),
@@ -34,12 +34,12 @@ NAMES = (
         ("*", [0, 1, 2, 3, 4, 5]),
     ],
 )
-def test_what_a_key_stands_for(key, found):
-    if found is None:
+def test_keys_of_robot_files_have_their_documented_meaning(key, result):
+    if result is None:
         with pytest.raises(fflin.InputError, match=r"q_m\.hinge_"):
             matching("state", key, NAMES)
     else:
-        assert matching("state", key, NAMES) == found
+        assert matching("state", key, NAMES) == result
 
 
 @pytest.mark.parametrize("key", ["hinge_9", "q_n", "q_m.hinge_9*", "q_m.", ""])
@@ -77,7 +77,7 @@ def test_robots_take_patterns_of_joints():
         robot.replace(damping={"joint_9*": 1.0})
 
 
-def test_wheels_are_no_joints_of_a_pattern():
+def test_wheels_are_not_joints_of_a_pattern():
     robot = fflin.load("cubesat").replace(
         inputs=[fflin.ReactionWheel((0, 0, 1), inertia=1e-5, name="spin")]
     )

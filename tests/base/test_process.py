@@ -57,7 +57,7 @@ def test_the_path_is_without_a_folder_by_any_of_its_names(tmp_path, monkeypatch)
 
 
 @pytest.mark.parametrize("beside", [False, True])
-def test_an_expansion_runs_no_code_beside_it(beside, poison, tmp_path, monkeypatch):
+def test_an_expansion_runs_no_code_next_to_it(beside, poison, tmp_path, monkeypatch):
     pytest.importorskip("xacrodoc")
     poison(*ALL)
     monkeypatch.setattr(sys, "path", ["", str(tmp_path), *sys.path])

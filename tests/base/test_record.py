@@ -114,7 +114,7 @@ def test_no_flipped_bit_is_silent_or_a_crash(kind, ending, flips, tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["model", "gain"])
-def test_every_bit_of_what_stands_before_the_figures_of_a_mat(kind, tmp_path):
+def test_every_bit_of_the_header_of_a_mat_file_is_checked(kind, tmp_path):
     """Header and digest, where a flip is the likeliest to be taken for a file of another."""
     thing, path = made(kind), tmp_path / "x.mat"
     thing.save(path)
@@ -175,7 +175,7 @@ def test_a_file_without_a_digest_is_read_and_said_to_be_unverified(
     "trials", [FLIPS, pytest.param(6 * FLIPS, marks=pytest.mark.fuzz)]
 )
 @pytest.mark.parametrize("ending", [".npz", ".json"])
-def test_a_damaged_file_without_a_digest_is_no_crash(ending, trials, tmp_path):
+def test_a_damaged_file_without_a_digest_is_not_a_crash(ending, trials, tmp_path):
     thing, path = made("gain"), tmp_path / f"x{ending}"
     thing.save(path)
     unsealed(path)
@@ -196,7 +196,7 @@ def test_a_damaged_file_without_a_digest_is_no_crash(ending, trials, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("kind", "change", "said"),
+    ("kind", "change", "message"),
     [
         ("gain", {"dt": -1.0}, "dt is -1"),
         ("gain", {"dt": np.nan}, "dt is nan"),
@@ -219,7 +219,7 @@ def test_a_damaged_file_without_a_digest_is_no_crash(ending, trials, tmp_path):
     ],
 )
 def test_an_impossible_value_in_a_file_without_a_digest_is_refused(
-    kind, change, said, tmp_path
+    kind, change, message, tmp_path
 ):
     thing, path = made(kind), tmp_path / "x.npz"
     thing.save(path)
@@ -227,11 +227,11 @@ def test_an_impossible_value_in_a_file_without_a_digest_is_refused(
         record = {key: file[key] for key in file.files if key != "sha256"}
     assert change.keys() <= record.keys()
     np.savez(path, **record | change)
-    with pytest.raises(fflin.FileError, match=rf"x\.npz: .*{said}"):
+    with pytest.raises(fflin.FileError, match=rf"x\.npz: .*{message}"):
         type(thing).load(path)
 
 
-def test_an_edited_file_is_refused_and_says_what_to_do(tmp_path):
+def test_an_edited_file_is_refused_with_a_remedy(tmp_path):
     path = tmp_path / "x.json"
     made("model").save(path)
     record = json.loads(path.read_text())
@@ -248,7 +248,7 @@ def test_each_ending_has_a_codec():
     assert tuple(CODECS) == RECORDS
 
 
-def test_the_digest_is_what_the_documents_say(tmp_path):
+def test_the_digest_is_as_documented(tmp_path):
     """Others can make and check it."""
     for ending in (".npz", ".mat", ".json"):
         made("model").save(tmp_path / f"x{ending}")
@@ -296,22 +296,26 @@ def test_matlab_files_of_others_are_read(tmp_path):
     }
     for compressed in (False, True):
         savemat(tmp_path / "x.mat", record, do_compression=compressed)
-        found, verified = read_record(tmp_path / "x.mat")
-        assert not verified and set(found) == set(record)
+        result, verified = read_record(tmp_path / "x.mat")
+        assert not verified and set(result) == set(record)
         for key in ("A", "z", "i"):
             assert (
-                found[key].shape == record[key].shape
-                and (found[key] == record[key]).all()
+                result[key].shape == record[key].shape
+                and (result[key] == record[key]).all()
             )
-        assert (found["text"], found["nothing"]) == ("größe", "")
-        assert found["rows"] == ["ab", "cde"] and found["cells"] == ["one", "", "three"]
-        assert found["group"]["x"].item() == 1.5 and found["group"]["name"] == "n"
+        assert (result["text"], result["nothing"]) == ("größe", "")
+        assert result["rows"] == ["ab", "cde"] and result["cells"] == [
+            "one",
+            "",
+            "three",
+        ]
+        assert result["group"]["x"].item() == 1.5 and result["group"]["name"] == "n"
     (tmp_path / "x.mat").write_bytes(bytes(124) + b"\0\2IM")
     with pytest.raises(fflin.FileError, match="save -v7"):
         fflin.Gain.load(tmp_path / "x.mat")
 
 
-def test_plain_numpy_and_scipy_read_what_is_saved(tmp_path):
+def test_plain_numpy_and_scipy_read_saved_files(tmp_path):
     from scipy.io import loadmat
 
     gain = made("gain")
@@ -342,7 +346,7 @@ def test_verified_is_kept_where_a_thing_is_changed(tmp_path):
         *(fflin.lqg(gain, made("estimator")), fflin.lqg(sound, estimator)),
         fflin.lqr_batch(replace(made("batch"), verified=False), 1.0, 1.0),
     )
-    assert not any(each.verified for each in made_of_it)
+    assert not any(item.verified for item in made_of_it)
     assert fflin.lqg(sound, made("estimator")).verified
     assert all(made(kind).verified for kind in FORMATS)
 
@@ -360,7 +364,7 @@ def test_a_header_of_mat_that_is_nearly_sealed_is_refused(kind, tmp_path):
             type(made(kind)).load(path)
 
 
-def test_a_record_of_others_says_what_it_has_not(tmp_path):
+def test_a_record_of_another_program_names_its_missing_fields(tmp_path):
     np.savez(tmp_path / "x.npz", a=1.0)
     with pytest.raises(fflin.FileError, match="'state_names'"):
         fflin.LinearModel.load(tmp_path / "x.npz")
@@ -386,7 +390,7 @@ def test_a_batch_that_is_not_held_against_its_digest_says_so(tmp_path):
         (b"\x89HDF\r\n\x1a\n", "HDF5 file"),
     ],
 )
-def test_other_formats_of_octave_and_matlab_are_told_with_the_remedy(
+def test_other_formats_of_octave_and_matlab_are_reported_with_the_remedy(
     tmp_path, content, format_
 ):
     (tmp_path / "x.mat").write_bytes(content.ljust(200, b" "))
@@ -399,8 +403,8 @@ def test_sparse_matrices_of_matlab_are_read(tmp_path):
 
     A = np.diag([1.0, 0.0, -2.0])
     savemat(tmp_path / "x.mat", {"A": scipy.sparse.csc_matrix(A)})
-    found, _ = read_record(tmp_path / "x.mat")
-    assert np.array_equal(found["A"], A)
+    result, _ = read_record(tmp_path / "x.mat")
+    assert np.array_equal(result["A"], A)
 
 
 # Values that programs, or attackers, may write in the place of an entry.
@@ -475,14 +479,14 @@ def test_files_are_not_unpacked_if_they_would_fill_the_memory(monkeypatch, tmp_p
     room = 2 * zeros.nbytes
     for name in ("bomb.npz", "bomb.mat"):
         assert (tmp_path / name).stat().st_size < 10_000
-        for memory, said in (
+        for memory, message in (
             (room, "not fit into memory"),
             (room + 10_000, "500 inputs"),
         ):
             monkeypatch.setattr(
                 "fflin.base.record.memory", lambda memory=memory: memory
             )
-            with pytest.raises(fflin.FflinError, match=said):
+            with pytest.raises(fflin.FflinError, match=message):
                 fflin.LinearController(tmp_path / name, lin)
 
 

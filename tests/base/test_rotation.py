@@ -14,7 +14,7 @@ def test_skew_is_the_cross_product():
     assert (skew(a) == -skew(a).T).all()
 
 
-def test_quaternion_product_is_that_of_rotations():
+def test_quaternion_product_matches_rotations():
     pin.seed(1)
     a, b = pin.SE3.Random().rotation, pin.SE3.Random().rotation
     qa, qb = (pin.Quaternion(R).coeffs() for R in (a, b))

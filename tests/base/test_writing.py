@@ -136,7 +136,9 @@ def test_other_inputs_are_protected_too(urdf, tmp_path, capsys, monkeypatch):
     assert code == 2 and "input file" in error and error.count("\n") == 1
 
 
-def test_a_session_may_save_over_what_it_has_read(urdf, tmp_path, capsys, monkeypatch):
+def test_a_session_may_overwrite_a_file_that_it_read(
+    urdf, tmp_path, capsys, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
     robot = fflin.load(urdf)
     t, q = np.array([0.0, 1.0]), np.tile(robot.neutral(), (2, 1))
@@ -162,14 +164,14 @@ def linked(tmp_path, read, *command):
         text=True,
     )
     assert read.read_bytes() == before and (tmp_path / command[-1]).is_symlink()
-    said = [line for line in done.stderr.splitlines() if "warning" not in line]
-    assert done.returncode == 2 and len(said) == 1
-    assert says(said[0], str(command[-1]), f"input file {read}")
+    message = [line for line in done.stderr.splitlines() if "warning" not in line]
+    assert done.returncode == 2 and len(message) == 1
+    assert says(message[0], str(command[-1]), f"input file {read}")
 
 
 @pytest.mark.process
 @pytest.mark.parametrize("included", ["inc.xacro", "deep.xacro", "mass.yaml"])
-def test_what_a_xacro_reads_is_protected(included, tmp_path):
+def test_files_that_a_xacro_reads_are_protected(included, tmp_path):
     pytest.importorskip("xacrodoc")
     namespace = 'xmlns:xacro="http://www.ros.org/wiki/xacro"'
     (tmp_path / "mass.yaml").write_text("m: 3\n")
@@ -185,13 +187,13 @@ def test_what_a_xacro_reads_is_protected(included, tmp_path):
     (tmp_path / "x.urdf.xacro").write_text(
         f'<robot name="r" {namespace}><xacro:include filename="inc.xacro"/></robot>'
     )
-    there = tmp_path / "there"
-    there.mkdir()
+    target = tmp_path / "there"
+    target.mkdir()
     for name in ("x.urdf.xacro", "inc.xacro", "deep.xacro", "mass.yaml"):
-        (tmp_path / name).rename(there / name)
+        (tmp_path / name).rename(target / name)
     linked(
         tmp_path,
-        there / included,
+        target / included,
         "linearize",
         "there/x.urdf.xacro",
         "--force",
@@ -208,12 +210,12 @@ def test_what_a_xacro_reads_is_protected(included, tmp_path):
         ("simulate", "--duration", ".1", "--html", "o.html"),
     ],
 )
-@pytest.mark.parametrize("of", ["visual", "collision"])
-def test_meshes_of_a_robot_are_protected(of, command, urdf, tmp_path):
+@pytest.mark.parametrize("source", ["visual", "collision"])
+def test_meshes_of_a_robot_are_protected(source, command, urdf, tmp_path):
     mesh = tmp_path / "package" / "m.stl"
     mesh.parent.mkdir()
     mesh.write_text("solid m\nendsolid m\n")
-    named = f'<{of}><geometry><mesh filename="package://package/m.stl"/></geometry></{of}></link>'
+    named = f'<{source}><geometry><mesh filename="package://package/m.stl"/></geometry></{source}></link>'
     urdf.write_text(urdf.read_text().replace("</link>", named, 1))
     linked(tmp_path, mesh, command[0], urdf.name, *command[1:])
 
@@ -280,18 +282,18 @@ def test_a_limit_of_the_size_of_a_file_is_one_line(tmp_path):
         capture_output=True,
         text=True,
     )
-    said = [
+    message = [
         line
         for line in done.stderr.splitlines()
         if not re.search("warning|about .* points", line)
     ]
-    assert done.returncode == 0 and said[1::2] == ["2"] * len(commands), done.stderr
-    for line in said[::2]:
+    assert done.returncode == 0 and message[1::2] == ["2"] * len(commands), done.stderr
+    for line in message[::2]:
         assert re.match(r"fflin: error: .*File too large", line), line
     assert not list(tmp_path.iterdir())
 
 
-def test_room_that_is_not_there_is_told_before_work(tmp_path, monkeypatch):
+def test_room_that_is_not_there_is_reported_before_work(tmp_path, monkeypatch):
     """The disk is full although it said that it has room, as with quotas."""
     pytest.importorskip("h5py")
 
@@ -318,8 +320,8 @@ def test_the_room_of_a_sweep_is_its_own_from_the_start(tmp_path):
 
     def look(done, _):
         if not held:
-            found = os.stat(tmp_path / "x.h5.part")
-            held.append(found.st_blocks * 512 / found.st_size)
+            result = os.stat(tmp_path / "x.h5.part")
+            held.append(result.st_blocks * 512 / result.st_size)
 
     points = fflin.random_configurations(robot, 1500)
     fflin.sweep(

@@ -35,7 +35,7 @@ def robot(robots):
 @pytest.mark.compiled
 @pytest.mark.process
 @pytest.mark.parametrize("moving", [False, True])
-def test_processes_give_what_this_one_gives(moving, pool, robot):
+def test_processes_agree_with_this_process(moving, pool, robot):
     q, v, u = points(robot, 50)
     arguments = (v, u) if moving else ()
     batch = fflin.sweep(robot, q, *arguments, executor=pool, chunk=4)
@@ -129,7 +129,7 @@ if __name__ == "__main__":
 
 @pytest.mark.process
 @pytest.mark.parametrize(
-    "task, said",
+    "task, message",
     [
         ("workers.submit(busy, 0)", "begun"),
         ("workers.submit(time.sleep, 9999); print('begun', flush=True)", "begun"),
@@ -141,7 +141,7 @@ if __name__ == "__main__":
     ],
 )
 @pytest.mark.parametrize("end", ["kill", "return"])
-def test_no_worker_outlives_its_caller(task, said, end, tmp_path):
+def test_no_worker_outlives_its_caller(task, message, end, tmp_path):
     """It is killed, or ends the workers; these may be busy, asleep, idle or not yet there."""
     script = tmp_path / "script.py"
     script.write_text(BEGIN.format(task=task))
@@ -151,8 +151,8 @@ def test_no_worker_outlives_its_caller(task, said, end, tmp_path):
         stdout=subprocess.PIPE,
         text=True,
     ) as process:
-        with finishing(process, said):
-            assert process.stdout.readline() == f"{said}\n"
+        with finishing(process, message):
+            assert process.stdout.readline() == f"{message}\n"
         if end == "kill":
             process.kill()
         # The workers have the same stdout, which ends with the last of them.
@@ -183,7 +183,7 @@ def test_there_are_no_more_workers_than_cores(robot):
         (["what is this"], 8),
     ],
 )
-def test_cores_are_those_of_the_container(files, cores, tmp_path, monkeypatch):
+def test_cores_match_the_container(files, cores, tmp_path, monkeypatch):
     paths = [tmp_path / str(index) for index in range(len(files))]
     for path, text in zip(paths, files, strict=True):
         path.write_text(text)
@@ -211,7 +211,7 @@ def test_workers_that_cannot_start_are_one_line(tmp_path):
 
 @pytest.mark.compiled
 @pytest.mark.process
-def test_an_executor_that_dies_is_one_line_and_what_is_finished_is_kept(
+def test_a_failed_executor_gives_a_one_line_error_and_keeps_finished_chunks(
     robot, killing, tmp_path
 ):
     pytest.importorskip("h5py")
@@ -225,16 +225,16 @@ def test_an_executor_that_dies_is_one_line_and_what_is_finished_is_kept(
     ):
         fflin.sweep(robot, q, executor=doomed, chunk=8, out=path)
     assert (24, 32) in [failure[:2] for failure in caught.value.failed]
-    told = []
+    messages = []
     batch = fflin.sweep(
         robot,
         q,
         executor=None,
         chunk=8,
         out=path,
-        progress=lambda done, _: told.append(done),
+        progress=lambda done, _: messages.append(done),
     )
-    assert told[0] == 24
+    assert messages[0] == 24
     assert np.abs(batch.B_lower - fflin.sweep(robot, q).B_lower).max() < 1e-13
 
 
@@ -298,7 +298,7 @@ def test_dask(robot):
     waits = ("connect", "tcp")
     with (
         dask.config.set(
-            {f"distributed.comm.timeouts.{each}": f"{STALL} s" for each in waits}
+            {f"distributed.comm.timeouts.{wait}": f"{STALL} s" for wait in waits}
         ),
         distributed.LocalCluster(
             n_workers=2,
@@ -313,8 +313,8 @@ def test_dask(robot):
         expected = fflin.sweep(robot, configurations)
         q, v, u = points(robot, 30)
         moving = fflin.sweep(robot, q, v, u, executor=client.get_executor(), chunk=7)
-        here = fflin.sweep(robot, q, v, u).A
-        assert np.abs(moving.A - here).max() < 1e-12 * np.abs(here).max()
+        matrices = fflin.sweep(robot, q, v, u).A
+        assert np.abs(moving.A - matrices).max() < 1e-12 * np.abs(matrices).max()
         worker = next(iter(client.scheduler_info()["workers"].values()))["id"]
         pid = next(
             nanny.pid for name, nanny in cluster.workers.items() if name == worker

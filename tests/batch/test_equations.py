@@ -113,7 +113,7 @@ def test_kernel_counts_rotors(robots):
 @pytest.mark.parametrize(
     "types", [("revolute", "revolute"), ("prismatic", "continuous")]
 )
-def test_kernel_knows_joints_that_turn_against_others_with_rotors_of_their_own(
+def test_the_kernel_supports_joints_with_rotors_that_rotate_against_others(
     types, tmp_path
 ):
     mimic = '<mimic joint="b" multiplier="-2" offset="0.3"/>'
@@ -127,7 +127,7 @@ def test_kernel_knows_joints_that_turn_against_others_with_rotors_of_their_own(
     assert agreement(replace(robot, model=model)) < 1e-13
 
 
-def test_kernel_knows_what_mimics_a_joint_of_another_branch_beside_one_that_does_not(
+def test_the_kernel_supports_mimic_joints_on_another_branch(
     tmp_path,
 ):
     """c on b mimics a; d, on b too, is not moved by a, and yet its row of the inverse is."""
@@ -166,16 +166,16 @@ def test_fewer_points_than_lanes_and_more_than_a_block(robots):
         )
 
 
-def test_a_sweep_takes_the_kernel_and_leaves_what_the_linearizer_refuses(robots):
+def test_a_sweep_uses_the_kernel_and_omits_points_that_the_linearizer_refuses(robots):
     robot = robots["servicer_7dof"]
     q, v, u = operating_points(robot, 40)
     batch = fflin.sweep(robot, q, v, u)
     for row in (0, 39):
         one = fflin.linearize(robot, q[row], v[row], u[row])
         for key in ("A", "B", "C", "D", "f0", "x0", "u0", "y0"):
-            found, expected = getattr(batch[row], key), getattr(one, key)
+            result, expected = getattr(batch[row], key), getattr(one, key)
             scale = max(1.0, np.abs(expected).max())
-            assert np.abs(found - expected).max() < 1e-12 * scale, key
+            assert np.abs(result - expected).max() < 1e-12 * scale, key
     # Turned by pi from the reference.
     q[17, 3:7] = 1.0, 0.0, 0.0, 0.0
     with pytest.raises(fflin.SweepError, match=r"17.*180 deg"):
@@ -239,9 +239,9 @@ def test_one_set_of_machine_code_serves_every_robot_and_option(robots):
         ]
         if name == "servicer_7dof":
             variants.append(robot.replace(inputs=thrusters))
-        for each in variants:
+        for variant in variants:
             for case in CASES.values():
-                q, v, u = operating_points(each, 9)
+                q, v, u = operating_points(variant, 9)
                 for point in ((q,), (q, v), (q, None, u), (q[:3], v[:3], u[:3])):
-                    fflin.sweep(each, *point, **case)
+                    fflin.sweep(variant, *point, **case)
     assert len(derive.signatures) == 1

@@ -77,7 +77,7 @@ def test_hdf5_is_plain(robot, tmp_path):
 
 
 @pytest.mark.parametrize("ending", FORMATS)
-def test_what_is_no_batch_is_refused(ending, robot, tmp_path):
+def test_an_invalid_batch_is_refused(ending, robot, tmp_path):
     path = tmp_path / f"b{ending}"
     with pytest.raises(fflin.FileError, match="No such file"):
         fflin.LinearBatch.load(path)
@@ -135,16 +135,16 @@ def test_a_run_goes_on_from_the_chunks_that_are_there_and_intact(
             original(store, start, *rest),
         ),
     )
-    told = []
+    messages = []
     batch = fflin.sweep(
-        robot, q, chunk=16, out=path, progress=lambda *x: told.append(x)
+        robot, q, chunk=16, out=path, progress=lambda *x: messages.append(x)
     )
-    assert written == [16, 64] and told == [(48, 80), (64, 80), (80, 80)]
+    assert written == [16, 64] and messages == [(48, 80), (64, 80), (80, 80)]
     assert [entry.name for entry in tmp_path.iterdir()] == ["b.h5"]
     assert np.abs(batch.B_lower / fflin.sweep(robot, q).B_lower - 1).max() < 1e-9
 
 
-def test_a_run_that_cannot_go_on_keeps_what_is_finished(robot, tmp_path, monkeypatch):
+def test_a_failed_run_keeps_its_finished_chunks(robot, tmp_path, monkeypatch):
     """The disk has become full since the first part of the run."""
     path, part = tmp_path / "b.h5", tmp_path / "b.h5.part"
     q = fflin.random_configurations(robot, 12)
@@ -178,11 +178,11 @@ def test_a_run_goes_on_in_the_chunks_that_it_was_begun_in(chunk, robot, tmp_path
     q, _, _ = points(robot, 80)
     path = tmp_path / "b.h5"
     interrupted(robot, q, path, 64)
-    told = []
+    messages = []
     batch = fflin.sweep(
-        robot, q, chunk=chunk, out=path, progress=lambda *x: told.append(x)
+        robot, q, chunk=chunk, out=path, progress=lambda *x: messages.append(x)
     )
-    assert told == [(64, 80), (80, 80)]
+    assert messages == [(64, 80), (80, 80)]
     assert np.array_equal(batch.B_lower, fflin.sweep(robot, q, threads=1).B_lower)
 
 
@@ -270,16 +270,16 @@ def test_a_killed_run_goes_on(robot, tmp_path):
     command = [sys.executable, "-c", script, str(path)]
     assert finished(command).returncode == -signal.SIGKILL
     assert part.exists() and not path.exists()
-    told = []
+    messages = []
     points = fflin.random_configurations(robot, 4000, seed=3)
     batch = fflin.sweep(
         robot,
         points,
         chunk=80,
         out=path,
-        progress=lambda *counts: told.append(counts[0]),
+        progress=lambda *counts: messages.append(counts[0]),
     )
-    assert 240 <= told[0] < 4000, "some chunks were kept"
+    assert 240 <= messages[0] < 4000, "some chunks were kept"
     expected = fflin.sweep(robot, points)
     assert (
         np.abs(batch.B_lower - expected.B_lower).max()

@@ -11,7 +11,7 @@ from tests.support.sweeps import points
 @pytest.mark.parametrize(
     "name", mostly(BUNDLED, "cubesat", "planar_detumble", "ets_vii")
 )
-def test_every_gain_is_that_of_lqr(name, robots):
+def test_every_gain_matches_lqr(name, robots):
     robot = robots[name]
     batch = fflin.sweep(robot, points(robot, 6)[0])
     rng = np.random.default_rng(3)

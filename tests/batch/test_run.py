@@ -57,7 +57,7 @@ def test_a_file_goes_on_where_a_run_ended_and_is_the_same_on_any_workers(
     threads, workers, expected, tmp_path
 ):
     pytest.importorskip("h5py")
-    path, told = tmp_path / "walks.h5", []
+    path, messages = tmp_path / "walks.h5", []
 
     def run(job):
         texts = {"kind": "walks"}
@@ -68,15 +68,15 @@ def test_a_file_goes_on_where_a_run_ended_and_is_the_same_on_any_workers(
             ) as store,
             Execution(workers=workers or None, threads=threads) as how,
         ):
-            tell = lambda done, _: told.append(done)  # noqa: E731
+            tell = lambda done, _: messages.append(done)  # noqa: E731
             run_chunks(job, seeds, store, how, tell, of_what="walks", made=list)
             store.complete()
 
     with pytest.raises(fflin.SweepError, match=r"1 of 7.*16 to 23.*20"):
         run(Walks(endless=20))
-    told.clear()
+    messages.clear()
     run(Walks())
-    assert told == [42, 50]
+    assert messages == [42, 50]
     arrays, constant, texts, verified = read_rows(path, verify=True)
     assert verified and constant == ["pace"] and texts["kind"] == "walks"
     assert np.array_equal(arrays["pace"], [1.5])
@@ -86,14 +86,14 @@ def test_a_file_goes_on_where_a_run_ended_and_is_the_same_on_any_workers(
 
 @pytest.mark.filterwarnings("ignore:tired")
 def test_where_all_chunks_are_needed_the_first_that_fails_is_the_last():
-    told, store = [], MemoryStore(COUNT, CHUNK, STORED)
-    tell = lambda done, _: told.append(done)  # noqa: E731
+    messages, store = [], MemoryStore(COUNT, CHUNK, STORED)
+    tell = lambda done, _: messages.append(done)  # noqa: E731
     with any_wording(), pytest.raises(fflin.FflinError, match="walk 20 has no end"):
         run_chunks(Walks(endless=20), seeds, store, ALONE, tell)
-    assert told == [8, 16]
+    assert messages == [8, 16]
 
 
-def test_in_memory_the_error_has_what_is_made_of_the_rest():
+def test_an_error_in_memory_carries_the_partial_result():
     store = MemoryStore(COUNT, CHUNK, STORED)
     with (
         pytest.warns(fflin.FflinWarning, match="tired"),
@@ -120,7 +120,7 @@ class CountedWalks(Walks):
         return super().run(rows, start, out)[:0]
 
 
-def test_a_second_call_in_memory_computes_only_what_is_missing(expected):
+def test_a_second_call_in_memory_computes_only_the_missing_rows(expected):
     job, store = CountedWalks(), MemoryStore(COUNT, CHUNK, STORED)
     run_chunks(job, seeds, store, ALONE, upto=20)
     assert job.starts == [0, 8, 16]

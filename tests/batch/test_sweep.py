@@ -15,7 +15,7 @@ from tests.support.sweeps import assert_same, points
 
 @pytest.mark.compiled
 @pytest.mark.parametrize("name", BUNDLED)
-def test_at_rest_every_model_is_that_of_linearize(name, robots):
+def test_at_rest_every_model_matches_linearize(name, robots):
     robot = robots[name]
     q, _, _ = points(robot, 24)
     batch = fflin.sweep(robot, q)
@@ -29,7 +29,7 @@ def test_at_rest_every_model_is_that_of_linearize(name, robots):
 
 
 @pytest.mark.parametrize("frame", ["hybrid", "local", "world"])
-def test_at_operating_points_every_model_is_that_of_linearize(frame, robots):
+def test_at_operating_points_every_model_matches_linearize(frame, robots):
     robot = robots["servicer_7dof"]
     q, v, u = points(robot, 5)
     reference = random_pose(np.random.default_rng(3), 20.0)
@@ -97,7 +97,7 @@ def test_root_that_stands_elsewhere(robots):
 
 
 @pytest.mark.compiled
-def test_what_is_constant_is_held_once_and_memory_is_the_results(robots):
+def test_constant_arrays_are_stored_once(robots):
     import tracemalloc
 
     robot = robots["servicer_7dof"]
@@ -276,14 +276,16 @@ def damaged(robot, row, column, value):
         (lambda r: {"q": fflin.random_configurations(r, 3), "workers": True}, "True"),
     ],
 )
-def test_bad_input_is_one_line_that_names_the_row(make, message, robots, tmp_path):
+def test_invalid_input_is_one_line_that_names_the_row(make, message, robots, tmp_path):
     robot = robots["servicer_7dof"]
     with pytest.raises(fflin.InputError, match=message):
         fflin.sweep(robot, **make(robot), out=tmp_path / "x.npz")
     assert not list(tmp_path.iterdir())
 
 
-def test_what_has_no_room_is_refused_before_it_is_begun(robots, tmp_path):
+def test_a_result_that_exceeds_the_memory_is_refused_before_the_computation(
+    robots, tmp_path
+):
     robot = robots["servicer_7dof"]
     many = fflin.random_configurations(robot, 10**15)
     for out in (None, tmp_path / "x.npz"):
@@ -317,7 +319,7 @@ def test_a_singular_configuration_fails_its_chunk_and_the_rest_is_kept(parallel)
 
 
 @pytest.mark.compiled
-def test_ill_conditioned_points_are_told_once():
+def test_ill_conditioned_points_are_reported_once():
     model = fflin.load("ets_vii").model.copy()
     model.jointPlacements[4] = pin.SE3(np.eye(3), np.array([1e5, 0.0, 0.0]))
     robot = fflin.from_model(model, name="far")
@@ -328,13 +330,13 @@ def test_ill_conditioned_points_are_told_once():
 
 
 @pytest.mark.compiled
-def test_progress_is_told(robots):
-    told = []
+def test_progress_is_reported(robots):
+    messages = []
     q = np.tile(robots["cubesat"].neutral(), (25, 1))
     fflin.sweep(
-        robots["cubesat"], q, chunk=10, progress=lambda *counts: told.append(counts)
+        robots["cubesat"], q, chunk=10, progress=lambda *counts: messages.append(counts)
     )
-    assert told == [(10, 25), (20, 25), (25, 25)]
+    assert messages == [(10, 25), (20, 25), (25, 25)]
 
 
 def test_nothing_of_the_callers_is_changed_or_kept(robots):

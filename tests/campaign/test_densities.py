@@ -18,10 +18,10 @@ def drawn(robot, given):
 
 def same_bodies(robot, other):
     for body, expected in zip(robot.model.inertias, other.model.inertias, strict=True):
-        there = expected.toDynamicParameters()
+        parameters = expected.toDynamicParameters()
         assert (
-            np.abs(body.toDynamicParameters() - there).max()
-            <= 1e-13 * np.abs(there).max()
+            np.abs(body.toDynamicParameters() - parameters).max()
+            <= 1e-13 * np.abs(parameters).max()
         )
 
 
@@ -33,14 +33,14 @@ def same_bodies(robot, other):
         ("inspector.toml", {"base": 0.2, "gripper": -0.3}),
     ],
 )
-def test_a_density_is_that_of_uncertain_robots(name, changes):
+def test_a_density_matches_uncertain_robots(name, changes):
     robot = fflin.load(name)
     ranges = {f"{link}.density": (0.1, 4.0) for link in changes}
-    of = fflin.uncertain(robot, ranges)
-    expected = of.at({f"{link}.density": 1.0 + d for link, d in changes.items()})
-    found = drawn(robot, {f"{link}.density": [d] for link, d in changes.items()})
-    same_bodies(found, expected)
-    assert found.mass != robot.mass
+    uncertain = fflin.uncertain(robot, ranges)
+    expected = uncertain.at({f"{link}.density": 1.0 + d for link, d in changes.items()})
+    result = drawn(robot, {f"{link}.density": [d] for link, d in changes.items()})
+    same_bodies(result, expected)
+    assert result.mass != robot.mass
 
 
 @pytest.mark.parametrize(
@@ -52,18 +52,20 @@ def test_a_centre_of_mass_moves_as_that_of_uncertain_robots(name, link, body):
     shift = {"x": 0.03, "y": -0.02, "z": 0.05}
     parameters = fflin.sensitivity(fflin.linearize(robot)).parameters
     now = {axis: parameters[f"{link}.com.{axis}"].value for axis in shift}
-    of = fflin.uncertain(
+    uncertain = fflin.uncertain(
         robot, {f"{link}.com.{a}": (x - 0.1, x + 0.1) for a, x in now.items()}
     )
     job = CampaignJob(
         robot, None, {f"{body}.com": 0.02}, 0, "python", {"duration": 1.0}
     )
     assert job.dispersions.names == tuple(f"{body}.com.{axis}" for axis in shift)
-    found = job.dispersions.one(np.array([*shift.values()]))[0].robot
-    same_bodies(found, of.at({f"{link}.com.{a}": now[a] + d for a, d in shift.items()}))
+    result = job.dispersions.one(np.array([*shift.values()]))[0].robot
+    same_bodies(
+        result, uncertain.at({f"{link}.com.{a}": now[a] + d for a, d in shift.items()})
+    )
     at = robot.model.getJointId(body) if body != "base" else 1
     assert not np.array_equal(
-        found.model.inertias[at].lever, robot.model.inertias[at].lever
+        result.model.inertias[at].lever, robot.model.inertias[at].lever
     )
 
 
@@ -114,8 +116,8 @@ def test_one_draw_for_all_that_a_pattern_names():
 
 def test_a_tied_density_is_of_all_its_links():
     robot = fflin.load("planar_detumble")
-    found = drawn(robot, {"link_*.density": {"range": [0.3], "tied": True}})
-    same_bodies(found, drawn(robot, {"link_*.density": [0.3]}))
+    result = drawn(robot, {"link_*.density": {"range": [0.3], "tied": True}})
+    same_bodies(result, drawn(robot, {"link_*.density": [0.3]}))
     with pytest.raises(fflin.InputError, match="disperse the same mass"):
         drawn(
             robot, {"link_*.density": {"range": 0.3, "tied": True}, "joint_1.mass": 0.1}
@@ -125,7 +127,9 @@ def test_a_tied_density_is_of_all_its_links():
 def test_a_body_of_one_link_has_the_name_of_its_joint_too():
     robot = fflin.load("servicer_7dof")
     for part in ("density", "mass"):
-        by_link, by_joint = ({f"{of}_3.{part}": [0.3]} for of in ("link", "joint"))
+        by_link, by_joint = (
+            {f"{source}_3.{part}": [0.3]} for source in ("link", "joint")
+        )
         same_bodies(drawn(robot, by_link), drawn(robot, by_joint))
         with pytest.raises(fflin.InputError, match=r"'link_3'.*'joint_3'.*only once"):
             drawn(robot, by_link | by_joint)
@@ -135,11 +139,13 @@ def test_a_body_of_one_link_has_the_name_of_its_joint_too():
 def test_a_mass_leaves_the_inertia_about_the_centre_as_in_uncertain_robots(name):
     robot = fflin.load(name)
     links = [name for name, piece in robot.pieces.items() if not piece.whole][:4]
-    of = fflin.uncertain(robot, {f"{link}.mass": 0.5 for link in links})
-    values = {each.parameter.name: 1.3 * each.parameter.value for each in of.ranges}
-    found = drawn(robot, {f"{link}.mass": [0.3] for link in links})
-    same_bodies(found, of.at(values))
-    assert found.mass > robot.mass
+    uncertain = fflin.uncertain(robot, {f"{link}.mass": 0.5 for link in links})
+    values = {
+        range.parameter.name: 1.3 * range.parameter.value for range in uncertain.ranges
+    }
+    result = drawn(robot, {f"{link}.mass": [0.3] for link in links})
+    same_bodies(result, uncertain.at(values))
+    assert result.mass > robot.mass
     one = next(x for n, x in robot.pieces.items() if n == links[0])
     alone = drawn(robot, {f"{links[0]}.mass": [0.3]}).model.inertias[one.joint]
     if len([x for x in robot.pieces.values() if x.joint == one.joint]) == 1:
@@ -176,7 +182,7 @@ def test_the_root_link_has_two_names_everywhere(tmp_path):
         same_bodies(*changed)
     ranges = ({f"{name}.mass": 0.2} for name in ("bus", "base"))
     one, two = (
-        fflin.uncertain(robot, each).at({"bus.mass": 3000.0}) for each in ranges
+        fflin.uncertain(robot, range).at({"bus.mass": 3000.0}) for range in ranges
     )
     same_bodies(one, two)
 
@@ -185,7 +191,7 @@ def test_a_pattern_means_the_links_and_not_the_bodies_that_they_form_too():
     robot = fflin.load("planar_detumble")
     links = {f"{link}.mass" for link in robot.links}
     assert {
-        each.parameter.name for each in fflin.uncertain(robot, {"*.mass": 0.1}).ranges
+        range.parameter.name for range in fflin.uncertain(robot, {"*.mass": 0.1}).ranges
     } == links
     job = CampaignJob(robot, None, {"*.mass": 0.1}, 0, "python", {"duration": 1.0})
     assert set(job.dispersions.names) == links
@@ -219,7 +225,7 @@ def test_lanes_and_patterns():
     assert len(names) == len(robot.links)
 
 
-def test_what_is_wrong_is_one_line():
+def test_errors_are_one_line():
     robot = fflin.load("servicer_7dof")
     both_of = {"link_3.density": 0.1, "joint_3.mass": 0.1}
     with pytest.raises(fflin.InputError, match=r"'joint_3\.mass'.*'link_3\.density'"):

@@ -115,9 +115,9 @@ def test_a_direction_is_turned_about_two_axes_across_it():
     for direction in (*np.eye(3), *rng.normal(size=(3, 3))):
         along = direction / np.linalg.norm(direction)
         axes, angles = turned_to(along), rng.normal(size=(5, 2))
-        for found, (a, b) in zip(turned(along, angles), angles, strict=True):
+        for result, (a, b) in zip(turned(along, angles), angles, strict=True):
             expected = pin.exp3(a * axes[:, 0] + b * axes[:, 1]) @ along
-            np.testing.assert_allclose(found, expected, atol=1e-15)
+            np.testing.assert_allclose(result, expected, atol=1e-15)
 
 
 @pytest.mark.parametrize("engine", ENGINES)
@@ -167,8 +167,8 @@ def test_sensor_errors_act_on_the_policy_that_an_allocation_realises(engine):
     given = {"q_b.x.sensor": (0.02, 0.03), "omega_b.noise": 1e-3}
     run = {"runs": 3, "duration": 60.0, "dt": 0.1, "sample": 0.2, "engine": engine}
     ends = [
-        fflin.monte_carlo(robot, each, given, **run)
-        for each in (policy, fflin.Allocation(policy, robot))
+        fflin.monte_carlo(robot, item, given, **run)
+        for item in (policy, fflin.Allocation(policy, robot))
     ]
     # The attitude that is read as zero is minus the error of the sensor.
     offset = ends[0].values("drawn q_b.x.sensor")
@@ -201,7 +201,7 @@ def test_noise_is_white_and_each_run_has_its_own(engine):
 
 
 @pytest.mark.parametrize("spread", [0.05, (0.01, 0.05)])
-def test_the_worst_runs_of_noise_are_told_by_its_deviation(spread):
+def test_the_worst_runs_of_noise_are_reported_by_its_deviation(spread):
     """The seed of a run's noise is drawn too and is none of what errors come of."""
     campaign = turned_by_noise("python", spread, runs=4, duration=1.0)
     rows = worst_runs(campaign, 2)[1].splitlines()
@@ -223,7 +223,7 @@ def test_noise_is_the_same_for_any_chunks_and_threads_and_whatever_else_ends():
 
 
 @pytest.mark.compiled
-def test_a_delay_that_is_drawn_is_that_of_a_run(robots):
+def test_a_drawn_delay_is_the_delay_of_its_run(robots):
     robot = robots["planar_detumble"]
     lin = fflin.linearize(robot)
     policy = fflin.StateFeedback(lin, fflin.lqr(lin).K)
@@ -254,7 +254,7 @@ def test_a_delay_that_is_drawn_is_that_of_a_run(robots):
         ({"delay.x": 0.1}, "delay.x"),
     ],
 )
-def test_what_cannot_be_dispersed_is_told(robots, given, words):
+def test_a_quantity_that_cannot_be_dispersed_is_refused(robots, given, words):
     robot = robots["planar_detumble"]
     lin = fflin.linearize(robot)
     policy = fflin.StateFeedback(lin, fflin.lqr(lin).K)
@@ -270,7 +270,7 @@ def test_dask_flies_the_same(robots):
     policy = fflin.StateFeedback(lin, fflin.lqr(lin).K)
     given = {"q_b": 0.05, "*.mass": 0.1, "q_b.noise": 1e-3, "delay": [0.0, 0.02]}
     case = {"runs": 20, "duration": 0.2, "dt": 0.02, "sample": 0.04, "engine": "python"}
-    here = fflin.monte_carlo(robot, policy, given, **case)
+    campaign = fflin.monte_carlo(robot, policy, given, **case)
     with (
         distributed.LocalCluster(
             n_workers=2,
@@ -280,21 +280,22 @@ def test_dask_flies_the_same(robots):
         ) as cluster,
         distributed.Client(cluster) as client,
     ):
-        there = fflin.monte_carlo(
+        expected_value = fflin.monte_carlo(
             robot, policy, given, executor=client.get_executor(), chunk=8, **case
         )
     assert all(
-        np.array_equal(getattr(here, name), getattr(there, name)) for name in ARRAYS
+        np.array_equal(getattr(campaign, name), getattr(expected_value, name))
+        for name in ARRAYS
     )
-    assert np.array_equal(there.replay(19).q[-1], here.q[19])
+    assert np.array_equal(expected_value.replay(19).q[-1], campaign.q[19])
 
 
 @pytest.mark.process
-def test_a_lost_worker_of_dask_is_told(robots):
+def test_a_lost_worker_of_dask_is_reported(robots):
     distributed = pytest.importorskip("distributed")
     robot = robots["planar_detumble"]
     case = {"runs": 64, "duration": 0.2, "dt": 0.02, "engine": "python", "chunk": 8}
-    here = fflin.monte_carlo(robot, None, {"q_b": 0.05}, **case)
+    campaign = fflin.monte_carlo(robot, None, {"q_b": 0.05}, **case)
     with (
         distributed.LocalCluster(
             n_workers=2,
@@ -312,7 +313,7 @@ def test_a_lost_worker_of_dask_is_told(robots):
                 processes.clear()
 
         with pytest.warns(fflin.FflinWarning, match="1 worker of the executor ended"):
-            there = fflin.monte_carlo(
+            expected_value = fflin.monte_carlo(
                 robot,
                 None,
                 {"q_b": 0.05},
@@ -320,4 +321,4 @@ def test_a_lost_worker_of_dask_is_told(robots):
                 progress=kill,
                 **case,
             )
-    assert np.array_equal(here.q, there.q)
+    assert np.array_equal(campaign.q, expected_value.q)

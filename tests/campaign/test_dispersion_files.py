@@ -17,7 +17,7 @@ def read(tmp_path, text, head="[dispersions]\n"):
 
 
 def test_all_kinds_of_spreads(tmp_path):
-    found = read(
+    result = read(
         tmp_path,
         "q_b = 0.05\n"
         "r_b = {normal = 2}\n"
@@ -28,8 +28,8 @@ def test_all_kinds_of_spreads(tmp_path):
         "[dispersions.q_m]\n"
         "joint_1 = {uniform = [0, 0]}\n",
     )
-    omega = found.pop("omega_b")
-    assert dict(found) == {
+    omega = result.pop("omega_b")
+    assert dict(result) == {
         "q_b": 0.05,
         "r_b": 2,
         "*.mass": (-0.1, 0.2),
@@ -38,14 +38,14 @@ def test_all_kinds_of_spreads(tmp_path):
         "q_m.joint_1": (0, 0),
     }
     assert omega.ppf(0.9) == pytest.approx(stats.t(4, scale=0.01).ppf(0.9), rel=1e-14)
-    assert pickle.loads(pickle.dumps(found)) == found
+    assert pickle.loads(pickle.dumps(result)) == result
 
 
 def test_a_tied_spread_is_one_draw(tmp_path, robots):
-    found = read(
+    result = read(
         tmp_path, '"*.mass" = {uniform = [-0.1, 0.2], tied = true}\nq_b = 0.01\n'
     )
-    assert found["*.mass"] == {"range": (-0.1, 0.2), "tied": True}
+    assert result["*.mass"] == {"range": (-0.1, 0.2), "tied": True}
     scaled = read(tmp_path, 'q_b = {distribution = "norm", scale = 0.1, tied = true}')[
         "q_b"
     ]
@@ -53,7 +53,7 @@ def test_a_tied_spread_is_one_draw(tmp_path, robots):
 
 
 @pytest.mark.parametrize(
-    ("text", "line", "said"),
+    ("text", "line", "message"),
     [
         ("q_b = [1, 2]", 3, r"\[1, 2\]"),
         ("q_b = true", 3, "True"),
@@ -91,8 +91,8 @@ def test_a_tied_spread_is_one_draw(tmp_path, robots):
         ("q_b = 0.6", 1, "attitude"),
     ],
 )
-def test_what_is_wrong_has_file_and_line(tmp_path, robots, text, line, said):
-    with pytest.raises(fflin.FflinError, match=said) as caught:
+def test_errors_have_file_and_line(tmp_path, robots, text, line, message):
+    with pytest.raises(fflin.FflinError, match=message) as caught:
         given = read(tmp_path, "r_b = 0.01\n" + text)
         fflin.monte_carlo(
             robots["planar_detumble"], None, given, runs=100, duration=0.1
@@ -102,7 +102,7 @@ def test_what_is_wrong_has_file_and_line(tmp_path, robots, text, line, said):
 
 
 @pytest.mark.parametrize(
-    ("text", "line", "said"),
+    ("text", "line", "message"),
     [
         ("", 1, "spread"),
         ("[dispersions]", 1, "spread"),
@@ -113,8 +113,8 @@ def test_what_is_wrong_has_file_and_line(tmp_path, robots, text, line, said):
         ("[dispersions]\nq_b = 1\nq_b.sensor = 1", 3, '"q_b.sensor"'),
     ],
 )
-def test_what_is_no_such_file(tmp_path, text, line, said):
-    with pytest.raises(fflin.FflinError, match=said) as caught:
+def test_a_missing_file_is_refused(tmp_path, text, line, message):
+    with pytest.raises(fflin.FflinError, match=message) as caught:
         read(tmp_path, text, head="")
     assert f"uncertain.toml:{line}: " in str(caught.value)
 
@@ -154,13 +154,13 @@ def test_a_distribution_draws_each_value_once_whatever_is_asked_for(robots):
         )
     ]
     once, uniform, plain = dispersions
-    before = [each.columns[0].inverse.__self__.count for each in (once, plain)]
-    for each in (once, plain):
-        each.require_possible(2100)
+    before = [item.columns[0].inverse.__self__.count for item in (once, plain)]
+    for item in (once, plain):
+        item.require_possible(2100)
     assert once.drawn(3, 20).shape == (17, 1)
     parts = [once.drawn(*span) for span in ((0, 1000), (1000, 1030), (1030, 2100))]
-    counts = [each.columns[0].inverse.__self__.count for each in (once, plain)]
-    assert counts == [each + 2100 for each in before]
+    counts = [item.columns[0].inverse.__self__.count for item in (once, plain)]
+    assert counts == [item + 2100 for item in before]
     u = plain.drawn(0, 2100)
     np.testing.assert_allclose(
         np.concatenate(parts), stats.logistic(scale=0.1).ppf(u), rtol=1e-14
@@ -169,7 +169,7 @@ def test_a_distribution_draws_each_value_once_whatever_is_asked_for(robots):
 
 
 @pytest.mark.parametrize(
-    ("ppf", "said"),
+    ("ppf", "message"),
     [
         (lambda u: np.where(np.asarray(u) > 0.9, np.inf, 0.0), "finite"),
         (lambda u: np.where(np.asarray(u) > 0.9, np.nan, 0.0), "finite"),
@@ -179,12 +179,12 @@ def test_a_distribution_draws_each_value_once_whatever_is_asked_for(robots):
         ),
     ],
 )
-def test_what_cannot_be_drawn_is_refused_before_the_runs(
-    ppf, said, robots, monkeypatch
+def test_an_invalid_dispersion_is_refused_before_the_runs(
+    ppf, message, robots, monkeypatch
 ):
     monkeypatch.setattr("fflin.campaign.monte_carlo.run_chunks", None)  # the runs
     given = {"r_b.x": Given(ppf)}
-    with pytest.raises(fflin.InputError, match=said) as caught:
+    with pytest.raises(fflin.InputError, match=message) as caught:
         fflin.monte_carlo(
             robots["planar_detumble"], None, given, runs=100, duration=0.1
         )

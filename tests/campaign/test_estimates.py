@@ -33,9 +33,9 @@ def clock(monkeypatch):
         return done(job, rows, start, out)
 
     def stepped(plan, every):
-        found = flown(plan, every)
-        now[0] += found.steps * STEP  # a run may end early
-        return found
+        result = flown(plan, every)
+        now[0] += result.steps * STEP  # a run may end early
+        return result
 
     monkeypatch.setattr(CampaignJob, "run", timed)
     monkeypatch.setattr(runs_module, "_recorded", stepped)
@@ -49,7 +49,7 @@ def loop_of(robot):
     return lin, gain, fflin.StateFeedback(lin, gain.K)
 
 
-def test_a_campaign_and_validity_say_what_they_will_take(clock):
+def test_a_campaign_and_validity_estimate_their_duration(clock):
     robot = fflin.load("cubesat")
     lin, gain, policy = loop_of(robot)
     bar, options = Told(), {"duration": 10.0, "dt": 0.1, "engine": "python"}
@@ -72,7 +72,7 @@ def test_a_campaign_and_validity_say_what_they_will_take(clock):
 
 
 @pytest.mark.parametrize(
-    ("seconds", "cores", "said"),
+    ("seconds", "cores", "message"),
     [
         (9.0, 1, ""),
         (41.4, 2, "fflin: about 41 s on 2 cores\n"),
@@ -81,9 +81,9 @@ def test_a_campaign_and_validity_say_what_they_will_take(clock):
         (9000.0, 8, "fflin: about 2.5 h on 8 cores\n"),
     ],
 )
-def test_an_estimate_is_a_line_on_stderr(capsys, seconds, cores, said):
+def test_an_estimate_is_a_line_on_stderr(capsys, seconds, cores, message):
     Progress().expect(seconds, cores)
-    assert capsys.readouterr() == ("", said)
+    assert capsys.readouterr() == ("", message)
 
 
 @pytest.mark.parametrize(

@@ -139,7 +139,7 @@ def test_a_narrower_goal_is_a_narrower_funnel(still, schedule):
     assert weak.rho[0] < strong.rho[0]
 
 
-def test_what_is_sure_is_so_in_as_many_cases_as_it_says(still, schedule):
+def test_confidence_intervals_have_their_stated_coverage(still, schedule):
     """The share inside that succeeds at least, over many funnels of the linear loop."""
     goal, rng = 1e-8, np.random.default_rng(1)
     M, count, held = ends(still, schedule, 0.0), 40, 0
@@ -162,13 +162,13 @@ def test_it_is_the_same_whoever_does_it(arm, found):
     goal = {"attitude": 5.0, "joints": 0.1}
     options = {"knots": 3, "samples": 16, "dt": 0.05}
     pytest.importorskip("numba")
-    told = []
+    messages = []
     compiled = fflin.funnel(*arm, goal, **options, engine="compiled")
     for more in (
         {
             "threads": 3,
             "engine": "compiled",
-            "progress": lambda *each: told.append(each),
+            "progress": lambda *item: messages.append(item),
         },
         {"workers": 2, "engine": "compiled"},
         {"engine": "compiled", "threads": 1},
@@ -176,7 +176,7 @@ def test_it_is_the_same_whoever_does_it(arm, found):
         again = fflin.funnel(*arm, goal, **options, **more)
         assert np.array_equal(again.outcomes, compiled.outcomes)
         assert np.array_equal(again.tried, compiled.tried)
-    assert told == [(1, 3), (2, 3), (3, 3)]
+    assert messages == [(1, 3), (2, 3), (3, 3)]
     slow = fflin.funnel(*arm, goal, **options, engine="python")
     assert np.array_equal(slow.outcomes, compiled.outcomes)
     policy = fflin.TrajectoryFeedback(schedule.trajectory(robot), schedule)
@@ -231,9 +231,9 @@ def test_sizes_and_contains(arm, found):
         chart = StateMap(robot, reference=pin.XYZQUATToSE3(q[:7]), frame="local")
         for share, inside in ((0.99, True), (1.01, False)):
             x = moved_by("local", chart.to_state(q, v)[None], share * e[:1])[0]
-            there = chart.to_pinocchio(x)
-            assert found.contains(t, q=there[0], v=there[1]) is inside
-            assert found.contains(t, state.to_state(*there)) is inside
+            expected_value = chart.to_pinocchio(x)
+            assert found.contains(t, q=expected_value[0], v=expected_value[1]) is inside
+            assert found.contains(t, state.to_state(*expected_value)) is inside
     assert found.level(found.t[0] + 1e-3) == min(found.rho[:2])
     for arguments, words in (
         ((9.0,), "9 s"),
@@ -295,7 +295,7 @@ def test_command(arm, tmp_path, monkeypatch):
     assert "--schedule" in refused("funnel", "cubesat", *goal)
 
 
-def test_bad_input(arm):
+def test_invalid_input(arm):
     robot, schedule = arm
     good = {"attitude": 1.0}
     for arguments, options, words in (

@@ -52,7 +52,7 @@ def feedback(robot, frame="hybrid"):
 
 @pytest.mark.compiled
 @pytest.mark.parametrize("name", BUNDLED)
-def test_lanes_give_what_single_runs_give(robots, name):
+def test_lanes_agree_with_single_runs(robots, name):
     robot = robots[name]
     given = START | {"*.mass": 0.1, "*.com": 0.1, "*.inertia": (-0.2, 0.2)}
     if robot.n:
@@ -118,7 +118,7 @@ def test_mimic_joints(tmp_path):
 
 
 @pytest.mark.compiled
-def test_bodies_are_their_own_beside_wheels_on_another_branch(robots):
+def test_wheels_on_another_branch_do_not_change_bodies(robots):
     """The wheel's joint stands before the joints of the arm's other branch."""
     robot = robots["dual_arm"]
     first, last = robot.joint_names[0], robot.joint_names[-1]
@@ -277,20 +277,21 @@ def test_a_campaign_is_the_same_on_any_workers_and_after_a_kill(tmp_path):
 @pytest.mark.compiled
 def test_any_executor_does_it(robots):
     robot, case = robots["planar_detumble"], {"runs": 20, "duration": 0.2, "chunk": 8}
-    here = fflin.monte_carlo(robot, feedback(robot), {"q_b": 0.05}, **case)
+    point = fflin.monte_carlo(robot, feedback(robot), {"q_b": 0.05}, **case)
     with ThreadPoolExecutor(2) as executor:
-        there = fflin.monte_carlo(
+        expected_value = fflin.monte_carlo(
             robot,
             feedback(robot),
             {"q_b": 0.05},
             executor=executor,
-            engine=here.engine,
+            engine=point.engine,
             **case,
         )
     assert all(
-        np.array_equal(getattr(here, name), getattr(there, name)) for name in ARRAYS
+        np.array_equal(getattr(point, name), getattr(expected_value, name))
+        for name in ARRAYS
     )
-    assert np.array_equal(there.replay(19).q[-1], here.q[19])
+    assert np.array_equal(expected_value.replay(19).q[-1], point.q[19])
 
 
 @pytest.mark.compiled
@@ -311,7 +312,7 @@ def test_another_campaign_does_not_go_on_in_a_file(tmp_path, robots):
     assert np.array_equal(campaign.replay(23).q[-1], campaign.q[23])
 
 
-def test_a_dispersion_does_not_change_what_another_draws(robots):
+def test_a_dispersion_does_not_change_the_draws_of_another(robots):
     robot, case = robots["planar_detumble"], {"runs": 5, "duration": 0.02}
     one = fflin.monte_carlo(robot, None, {"omega_b.x": 0.1}, **case)
     two = fflin.monte_carlo(robot, None, {"base.mass": 0.1, "omega_b": 0.1}, **case)
@@ -331,17 +332,19 @@ def test_each_kind_of_spread_has_its_distribution(robots):
     job = CampaignJob(
         robots["planar_detumble"], None, given, 0, "python", {"duration": 1.0}
     )
-    of = dict(zip(job.dispersions.names, job.dispersions.drawn(0, 4000).T, strict=True))
+    settings = dict(
+        zip(job.dispersions.names, job.dispersions.drawn(0, 4000).T, strict=True)
+    )
     for name, expected in (
         ("q_b.x", stats.norm(0.0, 0.05)),
         ("q_b.y", stats.uniform(-0.1, 0.3)),
         ("r_b.y", given["r_b.y"]),
     ):
-        assert stats.kstest(of[name], expected.cdf).pvalue > 1e-3, name
-    values, counts = np.unique(of["r_b.z"], return_counts=True)
+        assert stats.kstest(settings[name], expected.cdf).pvalue > 1e-3, name
+    values, counts = np.unique(settings["r_b.z"], return_counts=True)
     assert values.tolist() == [1.0, 2.0, 4.0]
     assert stats.chisquare(counts).pvalue > 1e-3
-    assert np.abs(np.corrcoef(list(of.values())) - np.eye(4)).max() < 0.06
+    assert np.abs(np.corrcoef(list(settings.values())) - np.eye(4)).max() < 0.06
 
 
 @pytest.mark.compiled
@@ -391,7 +394,7 @@ def test_intervals_hold_the_known_answer_as_often_as_they_say():
         campaign = fflin.monte_carlo(
             robot, policy, spread, runs=64, duration=4.0, dt=0.2, seed=seed, threads=1
         )
-        found = {
+        result = {
             "mean": (campaign.mean("r_b.x", confidence=0.9), 0.0),
             "half": (campaign.quantile("r_b.x", 0.5, confidence=0.9), 0.0),
             "most": (campaign.quantile("r_b.x", 0.9, confidence=0.9), truth.ppf(0.9)),
@@ -400,8 +403,8 @@ def test_intervals_hold_the_known_answer_as_often_as_they_say():
                 0.7,
             ),
         }
-        for name, (each, answer) in found.items():
-            held[name] += each.low <= answer <= each.high
+        for name, (item, answer) in result.items():
+            held[name] += item.low <= answer <= item.high
     # Of a binomial of 200 and 0.9, less than 165 or, of the mean, more than 194 has 1e-3.
     assert min(held.values()) >= 165
     assert held["mean"] <= 194
@@ -424,8 +427,8 @@ def test_runs_that_diverge_are_counted_and_are_in_no_figure(robots, engine):
     assert np.isfinite(campaign.quantile("q_b.x", 0.5).value)
     assert np.isfinite(list(campaign.sensitivity().values())).all()
     assert {*campaign.worst(lost)} == {*np.flatnonzero(campaign.stopped).tolist()}
-    said = str(campaign)
-    assert says(said, f"{12 - lost} ") and "nan" not in said
+    message = str(campaign)
+    assert says(message, f"{12 - lost} ") and "nan" not in message
     first = campaign.worst(1)[0]
     motion = campaign.replay(first)
     assert motion.stopped and campaign.end[first] < 4.0
@@ -522,7 +525,7 @@ def test_its_tables_have_every_figure_with_its_unit(tmp_path):
 
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("engine", ENGINES)
-def test_histories_are_those_of_the_motions(robots, engine, tmp_path):
+def test_histories_match_the_motions(robots, engine, tmp_path):
     robot = robots["ets_vii"]
     given = START | {"tau_b.x.gain": [0.0, 0.0, -60.0]}
     case = {"runs": 12, "duration": 4.0, "dt": 0.02, "engine": engine, "seed": 1}
@@ -556,15 +559,15 @@ def test_histories_are_those_of_the_motions(robots, engine, tmp_path):
 
 
 @pytest.mark.compiled
-def test_goals_are_told_and_say_what_the_worst_is(robots):
+def test_goals_appear_in_the_report_with_the_worst_run(robots):
     robot = robots["ets_vii"]
     goals = ["position < 1 mm and settle < 5 s", "attitude > 0 deg"]
     case = {"runs": 30, "duration": 6.0, "dt": 0.02, "goals": goals, "confidence": 0.9}
     campaign = fflin.monte_carlo(
         robot, feedback(robot), START, until="attitude < 2 deg", **case
     )
-    of = ["position", "settle", "attitude", "worst attitude", "worst position"]
-    assert [*influences(campaign)] == of
+    settings = ["position", "settle", "attitude", "worst attitude", "worst position"]
+    assert [*influences(campaign)] == settings
     assert "rank correlations with position: " in str(campaign)
     assert (
         campaign.goals == (*goals, "attitude < 2 deg") and campaign.about == "position"
@@ -576,24 +579,26 @@ def test_goals_are_told_and_say_what_the_worst_is(robots):
 
 
 @pytest.mark.compiled
-def test_figures_are_those_of_the_motions(campaign):
+def test_figures_match_the_motions(campaign):
     run = campaign.worst(1)[0]
     motion = campaign.replay(run)
-    of = {
+    settings = {
         name: campaign.values(name)[run]
         for name in ("attitude", "worst attitude", "position")
     }
-    assert of["attitude"] == pytest.approx(motion.attitude_error[-1], rel=1e-14)
-    assert of["worst attitude"] == pytest.approx(motion.attitude_error.max(), rel=1e-12)
-    assert of["position"] == pytest.approx(
+    assert settings["attitude"] == pytest.approx(motion.attitude_error[-1], rel=1e-14)
+    assert settings["worst attitude"] == pytest.approx(
+        motion.attitude_error.max(), rel=1e-12
+    )
+    assert settings["position"] == pytest.approx(
         np.abs(motion.error[-1, 3:6]).max(), rel=1e-12
     )
     assert campaign.values("worst tau_b.x")[run] == np.abs(motion.u[:, 0]).max()
-    assert campaign.values("worst attitude").max() == of["worst attitude"]
+    assert campaign.values("worst attitude").max() == settings["worst attitude"]
 
 
 @pytest.mark.compiled
-def test_the_time_to_settle_is_that_of_the_motions_table(robots):
+def test_the_time_to_settle_matches_the_motions_table(robots):
     robot = robots["planar_detumble"]
     campaign = fflin.monte_carlo(
         robot,
@@ -605,21 +610,21 @@ def test_the_time_to_settle_is_that_of_the_motions_table(robots):
     )
     for run in range(3):
         motion = campaign.replay(run)
-        made = {each.title: each for each in error_sizes(motion)}
+        made = {item.title: item for item in error_sizes(motion)}
         # A motion and a campaign call the kinds of error by the same names.
         assert [*made] == [*KINDS]
         for title, course in made.items():
             when = np.inf if course.settled is None else course.settled
-            found = campaign.values(f"settle {title}")[run]
-            assert found == pytest.approx(when, rel=1e-12), title
+            result = campaign.values(f"settle {title}")[run]
+            assert result == pytest.approx(when, rel=1e-12), title
     for former, name in (
         ("turning", "omega_b"),
         ("moving", "v_b"),
         ("rates", "joint rates"),
     ):
-        for of in ("", "worst ", "settle "):
+        for settings in ("", "worst ", "settle "):
             assert np.array_equal(
-                campaign.values(of + former), campaign.values(of + name)
+                campaign.values(settings + former), campaign.values(settings + name)
             )
         assert campaign.met(f"worst {former} < 1").all()
     assert np.isfinite(campaign.values("settle")).any()
@@ -646,12 +651,12 @@ def test_conditions(campaign):
         (campaign.values("worst q_b.x") > 0.05) & (campaign.values("drawn r_b.x") >= 0),
     )
     assert campaign.fraction(two).value == two.mean()
-    for text, said in (
+    for text, message in (
         ("attitude < 1 m", "deg"),
         ("attitude", "NAME < NUMBER UNIT"),
         ("attitude < x", "NAME < NUMBER UNIT"),
     ):
-        with pytest.raises(fflin.InputError, match=said):
+        with pytest.raises(fflin.InputError, match=message):
             campaign.fraction(text)
     with pytest.raises(fflin.UnknownNameError, match="attitude"):
         campaign.fraction("atitude < 1 deg")
@@ -692,11 +697,11 @@ BAD = [
 ]
 
 
-@pytest.mark.parametrize("case, said", BAD, ids=[said for _, said in BAD])
-def test_bad_input_is_one_line(robots, case, said, tmp_path, monkeypatch):
+@pytest.mark.parametrize("case, message", BAD, ids=[message for _, message in BAD])
+def test_invalid_input_is_one_line(robots, case, message, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     options = {"given": {"q_b": 0.01}, "runs": 100, "duration": 0.1} | case
-    with pytest.raises(fflin.FflinError, match=said) as caught:
+    with pytest.raises(fflin.FflinError, match=message) as caught:
         fflin.monte_carlo(
             robots["planar_detumble"], None, options.pop("given"), **options
         )
@@ -716,7 +721,7 @@ def test_a_policy_in_python_runs_in_python(robots):
     assert campaign.engine == "python" and campaign.largest_u.max() == 0.5
 
 
-def test_what_cannot_be_sent_to_workers_is_named(robots):
+def test_an_object_that_cannot_be_pickled_is_named(robots):
     def nothing(t, q, v):
         return np.zeros(9)
 
@@ -732,7 +737,7 @@ def test_what_cannot_be_sent_to_workers_is_named(robots):
 
 
 @pytest.mark.compiled
-def test_what_is_kept_does_not_grow_with_the_duration(robots):
+def test_stored_data_do_not_grow_with_the_duration(robots):
     robot = robots["planar_detumble"]
     short, long = (
         fflin.monte_carlo(
@@ -763,26 +768,26 @@ def test_warnings_are_given_once(robots):
         fflin.monte_carlo(
             robot, feedback(robot), START, runs=20, duration=0.1, limits=1e-9
         )
-    assert len([str(each.message) for each in caught]) <= 1
+    assert len([str(item.message) for item in caught]) <= 1
 
 
 @pytest.mark.compiled
-def test_a_mean_with_what_never_settled_is_refused(robots):
+def test_a_mean_over_runs_that_did_not_settle_is_refused(robots):
     robot = robots["cubesat"]
     lin = fflin.linearize(robot)
     policy = fflin.StateFeedback(lin, fflin.lqr(lin).K)
     drawn = {"q_b": 0.05, "tau_b.x.fails": (1.0, 2.0)}
-    found = fflin.monte_carlo(robot, policy, drawn, runs=8, duration=4.0, dt=0.05)
+    result = fflin.monte_carlo(robot, policy, drawn, runs=8, duration=4.0, dt=0.05)
     with pytest.raises(fflin.InputError, match=r"'settle'.*\d of 8"):
-        found.mean("settle")
+        result.mean("settle")
     with pytest.raises(fflin.InputError, match="times"):
         fflin.monte_carlo(robot, policy, {"tau_b.x.fails": 3.0}, runs=1, duration=1.0)
     noisy = {"q_b": 0.05, "q_b.x.noise": 1e-4}
-    found = fflin.monte_carlo(
+    result = fflin.monte_carlo(
         robot, policy, noisy, runs=8, duration=1.0, dt=0.05, sample=0.05
     )
-    assert "noise" in found.names and {
-        key.strip("|") for key in found.sensitivity()
+    assert "noise" in result.names and {
+        key.strip("|") for key in result.sensitivity()
     } == {*("q_b.x", "q_b.y", "q_b.z", "q_b.x.noise")}
 
 
@@ -894,7 +899,7 @@ def test_a_file_of_another_policy_or_robot_is_refused_before_compiling(
 
 
 @pytest.mark.compiled
-def test_what_no_input_pushes_is_judged_in_no_campaign_either():
+def test_uncontrolled_states_are_not_judged_in_campaigns():
     robot = fflin.load("cubesat", inputs=[fflin.BaseTorque()])
     lin = fflin.linearize(robot)
     K = np.zeros((3, 12))
@@ -927,7 +932,7 @@ def wheels_of(robot):
     )
 
 
-def test_the_table_shows_wheels_and_leaves_out_what_is_always_zero():
+def test_the_table_shows_wheels_and_omits_columns_of_zeros():
     robot = wheels_of(fflin.load("cubesat"))
     lin = fflin.linearize(robot)
     policy = fflin.StateFeedback(lin, fflin.lqr(lin).K)
@@ -944,7 +949,7 @@ def test_the_table_shows_wheels_and_leaves_out_what_is_always_zero():
     assert "attitude" in rows
 
 
-def test_what_an_earlier_call_has_written_is_told(tmp_path):
+def test_a_message_from_an_earlier_call_is_reported(tmp_path):
     pytest.importorskip("h5py")
     robot = fflin.load("planar_detumble")
     call = {

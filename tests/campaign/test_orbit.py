@@ -35,8 +35,8 @@ def test_a_campaign_flies_as_simulate_does(regulated):
 
 @pytest.mark.exhaustive
 def test_a_loop_in_orbit_settles(regulated):
-    found = fflin.validity(*regulated, samples=2, attitude=20.0)
-    assert found.outcomes == ("settled", "settled")
+    result = fflin.validity(*regulated, samples=2, attitude=20.0)
+    assert result.outcomes == ("settled", "settled")
 
 
 @pytest.mark.compiled
@@ -47,8 +47,8 @@ def test_refused(regulated):
     schedule = fflin.tvlqr(fflin.linearize_trajectory(free, along), 1.0, 1.0, 1.0)
     q, v, u = robot.neutral(), np.zeros(robot.nv), np.zeros(len(lin.u0))
     knots = [np.tile(row, (2, 1)) for row in (q, v, u)]
-    there = fflin.linearize(free)
-    policy = fflin.StateFeedback(there, fflin.lqr(there).K)
+    free_model = fflin.linearize(free)
+    policy = fflin.StateFeedback(free_model, fflin.lqr(free_model).K)
     with pytest.raises(fflin.InputError, match="compiled"):
         fflin.monte_carlo(
             robot, None, {"q_b": 0.1}, runs=2, duration=0.1, engine="compiled"

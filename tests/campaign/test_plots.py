@@ -28,7 +28,7 @@ def campaign(robots):
 
 
 def of(figure, title):
-    [axes] = [each for each in figure.axes if each.get_title() == title]
+    [axes] = [ax for ax in figure.axes if ax.get_title() == title]
     return axes
 
 
@@ -50,9 +50,9 @@ def test_bands_hold_their_share_of_the_runs_and_the_worst_are_on_top(campaign):
         at = band.get_paths()[0].vertices
         top = 1.15 * history[np.isfinite(history)].max()
         for k, t in enumerate(campaign.times):
-            here = at[np.isclose(at[:, 0], t), 1]
-            assert here.min() == pytest.approx(min(ordered[low, k], top))
-            assert here.max() == pytest.approx(min(ordered[high, k], top))
+            value = at[np.isclose(at[:, 0], t), 1]
+            assert value.min() == pytest.approx(min(ordered[low, k], top))
+            assert value.max() == pytest.approx(min(ordered[high, k], top))
 
 
 @pytest.mark.exhaustive

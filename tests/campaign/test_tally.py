@@ -59,7 +59,7 @@ def rows_of(state, rng, inputs):
     nu = fade[..., None] * rng.normal(size=(STEPS, LANES, 6 + robot.n))
     v = state.spread(nu).reshape(-1, robot.nv)
     q = np.array(
-        [pin.integrate(robot.model, robot.neutral(), 2.0 * each) for each in v]
+        [pin.integrate(robot.model, robot.neutral(), 2.0 * item) for item in v]
     )
     q[rng.random(len(q)) < 0.5, 3:7] *= -1.0  # the same attitude
     for row in q:
@@ -98,7 +98,7 @@ def defined(job, target, q, nu, u, stop):
     }
 
 
-def test_statistics_of_a_run_in_python_are_those_of_the_definition(tmp_path):
+def test_statistics_of_a_run_in_python_match_the_definition(tmp_path):
     for made, frame, follows in itertools.product(
         (turning, wheeled, flexible), FRAMES, (False, True)
     ):
@@ -111,9 +111,9 @@ def test_statistics_of_a_run_in_python_are_those_of_the_definition(tmp_path):
         }
         job = CampaignJob(robot, None, {"q_b.x": 0.01}, 0, "python", options)
         state, target = job.plant.state, job.target
-        q, nu, u = (each[:, 0] for each in rows_of(state, rng, len(job.plan.initial)))
+        q, nu, u = (item[:, 0] for item in rows_of(state, rng, len(job.plan.initial)))
         if follows:
-            star = [each[:, 0] for each in rows_of(state, rng, 0)[:2]]
+            star = [item[:, 0] for item in rows_of(state, rng, 0)[:2]]
             target = states_of(state, *star)
         elif robot.n:
             target = target + 7.0 * (np.arange(state.nx) == 6)  # more than a turn away
@@ -122,7 +122,7 @@ def test_statistics_of_a_run_in_python_are_those_of_the_definition(tmp_path):
         run = Recording(t, q, v, u, *rest, STEPS - 1, "", "python")
         job.target, job.path = (
             target,
-            [each.ravel() for each in star] if follows else [],
+            [item.ravel() for item in star] if follows else [],
         )
         outcome = job.outcome(run)
         for name, expected in defined(job, target, q, nu, u, 0.0).items():
@@ -181,7 +181,7 @@ def as_lists(value):
 @pytest.mark.parametrize("follows", [False, True])
 @pytest.mark.parametrize("frame", FRAMES)
 @pytest.mark.parametrize("made", [turning, wheeled, arm])
-def test_marks_of_lanes_are_those_of_the_definition(tmp_path, made, frame, follows):
+def test_marks_of_lanes_match_the_definition(tmp_path, made, frame, follows):
     pytest.importorskip("numba")
     robot, rng = made(tmp_path), np.random.default_rng(7)
     turn = pin.Quaternion(0.5, -0.1, 0.7, 0.3).normalized()
@@ -199,9 +199,9 @@ def test_marks_of_lanes_are_those_of_the_definition(tmp_path, made, frame, follo
     state, home = job.plant.state, job.target
     q, nu, u = rows_of(state, rng, len(job.plan.initial))
     if follows:
-        star = [each[:, 0] for each in rows_of(state, rng, 0)[:2]]
+        star = [item[:, 0] for item in rows_of(state, rng, 0)[:2]]
         home = states_of(state, *star)
-        job.target, job.path = home, [each.ravel() for each in star]
+        job.target, job.path = home, [item.ravel() for item in star]
     rows = np.concatenate((q, nu, u, np.zeros((STEPS, LANES, 9))), axis=2).transpose(
         0, 2, 1
     )
@@ -214,15 +214,15 @@ def test_marks_of_lanes_are_those_of_the_definition(tmp_path, made, frame, follo
                 lanes.add(first, rows[first:last].copy())
         ends.append(lanes.outcome(STEPS - 1, stop))
         plain = [
-            defined(job, home, *(each[:, lane] for each in (q, nu, u)), stop[lane])
+            defined(job, home, *(item[:, lane] for item in (q, nu, u)), stop[lane])
             for lane in range(LANES)
         ]
         for name in job.outcome_shapes:
-            expected = np.array([each[name] for each in plain])
-            found = ends[-1][name]
-            assert found.shape == expected.shape
+            expected = np.array([item[name] for item in plain])
+            result = ends[-1][name]
+            assert result.shape == expected.shape
             np.testing.assert_allclose(
-                found, expected, rtol=1e-12, atol=1e-10, err_msg=name
+                result, expected, rtol=1e-12, atol=1e-10, err_msg=name
             )
     assert (
         np.isfinite(ends[0]["settle"]).any() and (ends[0]["largest"][:, :2] > 0.1).all()
@@ -257,12 +257,12 @@ def test_a_stop_condition_ends_each_run_where_it_is_first_looked_at_and_met(engi
     options["histories"] = 1
     judge = lambda runs: {key: runs[key] for key in ("end", "stop")}  # noqa: E731
     job = CampaignJob(robot, policy, None, 0, engine, options, judge, halved)
-    found = flown(job, starts)
+    result = flown(job, starts)
     ends = []
     for start in starts:
         x = job.replay(start).x[::LOOK]
         met = np.linalg.norm(x[:, 3:6], axis=1) <= 0.5 * np.linalg.norm(start[3:6])
         ends.append(met.argmax() * LOOK * 0.05 if met.any() else 80.0)
-    assert found["end"] == pytest.approx(ends)
-    assert np.array_equal(found["stop"], np.where(np.array(ends) < 80.0, 3.0, 0.0))
+    assert result["end"] == pytest.approx(ends)
+    assert np.array_equal(result["stop"], np.where(np.array(ends) < 80.0, 3.0, 0.0))
     assert len({*ends}) > 2 and min(ends) < 80.0

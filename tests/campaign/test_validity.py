@@ -52,10 +52,10 @@ def arm(robots):
 def test_prediction_error_is_of_second_order(robots, arm):
     for robot, dt in ((arm, 0.0), (robots["cubesat"], 0.2)):
         lin, gain = held(robot, dt)
-        found = fflin.validity(robot, lin, gain, samples=1)
-        assert found.slope == pytest.approx(2.0, abs=0.1)
-        assert (np.diff(found.prediction_error[:5]) > 0.0).all()
-        assert found.trusted["attitude"] > 0.0
+        result = fflin.validity(robot, lin, gain, samples=1)
+        assert result.slope == pytest.approx(2.0, abs=0.1)
+        assert (np.diff(result.prediction_error[:5]) > 0.0).all()
+        assert result.trusted["attitude"] > 0.0
     # A model that is wrong to first order shows it.
     robot = robots["cubesat"]
     lin, gain = held(robot)
@@ -71,7 +71,7 @@ def test_trust_ends_where_the_error_reaches_a_tenth():
     assert _slope(0.3 * _LEVELS) == pytest.approx(2.0)
 
 
-def test_the_loop_is_that_of_aba_in_world_coordinates(robots):
+def test_the_loop_matches_aba_in_world_coordinates(robots):
     """A run against an integration of (q, v) by Pinocchio, which knows nothing of the chart."""
     robot = robots["ets_vii"]
     lin, gain = held(robot)
@@ -88,14 +88,14 @@ def test_the_loop_is_that_of_aba_in_world_coordinates(robots):
     for _ in range(800):
 
         def rate(dq, dv, q=q, v=v):
-            here, speed = pin.integrate(robot.model, q, dq), v + dv
-            state = loop.state.to_state(here, speed, near=x)
+            moved, speed = pin.integrate(robot.model, q, dq), v + dv
+            state = loop.state.to_state(moved, speed, near=x)
             u = lin.u0 - gain.K @ (state - lin.x0)
-            frame = loop.state.chart(here)
+            frame = loop.state.chart(moved)
             u = u.copy()
             u[3:6] = frame.R.T @ u[3:6]
             tau = loop.state.lift(u)
-            return speed, pin.aba(robot.model, data, here, speed, tau).copy()
+            return speed, pin.aba(robot.model, data, moved, speed, tau).copy()
 
         # The midpoint rule, for which the tangent at q is good enough.
         k, a = rate(np.zeros(robot.nv), np.zeros(robot.nv))
@@ -111,8 +111,8 @@ def test_a_run_close_to_half_a_turn_counts_as_out_of_the_chart(robots, angle, ou
     loop = Loop(robots["cubesat"], lin, gain.K)
     x = loop.displaced(np.random.default_rng(2), angle, 0.0, 0.0)
     runs_of = partial(loop.runs, False, None, 0.0, "python")
-    found = settle(runs_of, (x - lin.x0)[None], Execution())
-    assert OUTCOMES[int(found["outcome"][0])] == outcome
+    result = settle(runs_of, (x - lin.x0)[None], Execution())
+    assert OUTCOMES[int(result["outcome"][0])] == outcome
 
 
 @pytest.mark.parametrize("predicts", [True, False])
@@ -176,7 +176,7 @@ def test_same_seed_same_result_whoever_runs_it(robots):
 def test_a_run_that_ends_unsettled_may_settle_later_or_never():
     """Its error may grow, so that nothing is said of what it would do after the allowed time."""
     reach = {"attitude": 9.0, "position": 0.1, "joint": 0.0}
-    found = fflin.Validity(
+    result = fflin.Validity(
         levels=np.ones(1),
         prediction_error=np.zeros(1),
         slope=2.0,
@@ -194,27 +194,27 @@ def test_a_run_that_ends_unsettled_may_settle_later_or_never():
         frame="hybrid",
     )
     assert "; 2 did not settle in the allowed time, 1 diverged" in " ".join(
-        str(found).split()
+        str(result).split()
     )
 
 
 @pytest.mark.compiled
-def test_what_the_counts_say(robots):
+def test_counts_have_their_confidence_intervals(robots):
     """A loop that is lost far out: the runs below the first failure, and both intervals."""
     robot = robots["ets_vii"]
     lin, gain = held(robot)
-    found = fflin.validity(robot, lin, gain, attitude=174.0, samples=16)
-    failed = [i for i, outcome in enumerate(found.outcomes) if outcome != "settled"]
-    assert failed and found.inside == failed[0] > 0
-    assert found.settled == 16 - len(failed)
-    level = found.sampled[found.inside - 1]
-    assert found.holds == {
+    result = fflin.validity(robot, lin, gain, attitude=174.0, samples=16)
+    failed = [i for i, outcome in enumerate(result.outcomes) if outcome != "settled"]
+    assert failed and result.inside == failed[0] > 0
+    assert result.settled == 16 - len(failed)
+    level = result.sampled[result.inside - 1]
+    assert result.holds == {
         "attitude": 174.0 * level,
         "position": 0.5 * level,
         "joint": level,
     }
-    assert found.inside_rate == pytest.approx(0.05 ** (1.0 / found.inside))
-    assert says(str(found), f"{found.inside} of {found.inside}")
+    assert result.inside_rate == pytest.approx(0.05 ** (1.0 / result.inside))
+    assert says(str(result), f"{result.inside} of {result.inside}")
     near = fflin.validity(
         robot, lin, gain, attitude=30.0, position=0.5, joint=0.3, samples=4
     )
@@ -243,7 +243,9 @@ def test_both_engines_say_the_same(robots, name):
     )
 
 
-def test_a_linear_loop_is_foreseen_to_rounding_and_settles_when_it_says(robots):
+def test_a_linear_loop_is_predicted_to_machine_precision_and_settles_at_the_reported_time(
+    robots,
+):
     """A body that is only moved away: poles in closed form, and so the time to settle."""
     robot = robots["cubesat"]
     lin, gain = held(robot)
@@ -271,11 +273,11 @@ def test_limits_are_those_that_are_given(robots):
 
 
 @pytest.mark.compiled
-def test_what_turns_fast_is_flown_in_shorter_steps():
+def test_fast_rotations_are_simulated_with_shorter_steps():
     robot = fflin.load("canadarm2")
     lin = fflin.linearize(robot)
-    found = fflin.validity(robot, lin, fflin.lqr(lin), attitude=120.0, samples=50)
-    assert found.settled == 50
+    result = fflin.validity(robot, lin, fflin.lqr(lin), attitude=120.0, samples=50)
+    assert result.settled == 50
 
 
 def test_poles_too_far_apart_are_refused(robots):
@@ -294,8 +296,8 @@ def test_interval_is_clopper_and_pearsons():
             exact = binomtest(successes, count).proportion_ci(
                 confidence, method="exact"
             )
-            found = clopper_pearson(successes, count, confidence)[1:]
-            assert found == pytest.approx((exact.low, exact.high), rel=1e-9)
+            result = clopper_pearson(successes, count, confidence)[1:]
+            assert result == pytest.approx((exact.low, exact.high), rel=1e-9)
 
 
 @pytest.mark.compiled
@@ -305,46 +307,46 @@ def test_joints_only_hold_the_reduced_model(robots):
         inputs=[fflin.JointTorque(name) for name in robot.joint_names]
     )
     lin, gain = held(robot, reduce=True)
-    found = fflin.validity(robot, lin, gain, joint=0.5, samples=5)
-    assert found.slope == pytest.approx(2.0, abs=0.1)
-    assert found.settled == 5
+    result = fflin.validity(robot, lin, gain, joint=0.5, samples=5)
+    assert result.slope == pytest.approx(2.0, abs=0.1)
+    assert result.settled == 5
 
 
 @pytest.mark.compiled
-def test_what_cannot_be_told_is_not(robots, arm):
+def test_an_undefined_decision_is_not_reported(robots, arm):
     robot = robots["cubesat"]
     lin, gain = held(robot)
     # A body that is only moved away comes back as the linear model says, to the last digit.
-    found = fflin.validity(robot, lin, gain, attitude=0.0, samples=1)
-    assert np.isnan(found.slope) and found.trusted == found.largest
-    assert found.largest == {"attitude": 0.0, "position": 0.5, "joint": 0.0}
-    assert says(str(found), "0.5 m", "order")
+    result = fflin.validity(robot, lin, gain, attitude=0.0, samples=1)
+    assert np.isnan(result.slope) and result.trusted == result.largest
+    assert result.largest == {"attitude": 0.0, "position": 0.5, "joint": 0.0}
+    assert says(str(result), "0.5 m", "order")
     # One that is hurled away is nowhere foreseen.
     lin, gain = held(arm)
-    found = fflin.validity(arm, lin, gain, attitude=170.0, position=1e6, samples=1)
-    assert np.isnan(found.slope) and found.inside == 0
-    assert set(found.trusted.values()) == {0.0}
-    assert says(str(found), "85 deg", "5e+05 m", "0.5 rad")
-    assert "nan" not in str(found)
+    result = fflin.validity(arm, lin, gain, attitude=170.0, position=1e6, samples=1)
+    assert np.isnan(result.slope) and result.inside == 0
+    assert set(result.trusted.values()) == {0.0}
+    assert says(str(result), "85 deg", "5e+05 m", "0.5 rad")
+    assert "nan" not in str(result)
     pytest.importorskip("matplotlib")
-    fflin.plot_validity(found).draw_without_rendering()
+    fflin.plot_validity(result).draw_without_rendering()
 
 
 @pytest.mark.compiled
-def test_what_a_reduced_model_has_not_is_not_told(robots):
+def test_a_reduced_model_omits_missing_states_in_its_report(robots):
     robot = robots["ets_vii"]
     robot = robot.replace(
         inputs=[fflin.JointTorque(name) for name in robot.joint_names]
     )
     lin, gain = held(robot, reduce=True)
-    found = fflin.validity(robot, lin, gain, joint=0.5, samples=2)
-    assert found.largest == {"attitude": 0.0, "position": 0.0, "joint": 0.5}
-    assert "deg" not in str(found)
+    result = fflin.validity(robot, lin, gain, joint=0.5, samples=2)
+    assert result.largest == {"attitude": 0.0, "position": 0.0, "joint": 0.5}
+    assert "deg" not in str(result)
     with pytest.raises(fflin.InputError, match="displaced"):
         fflin.validity(robot, lin, gain, joint=0.0, samples=2)
 
 
-def test_bad_input(arm):
+def test_invalid_input(arm):
     lin, gain = held(arm)
     for arguments, words in (
         ((arm, lin, -gain.K), "stable"),
@@ -404,19 +406,19 @@ def test_jobs_are_at_most_one_for_each_core():
 
 
 @pytest.mark.compiled
-def test_progress_is_told_up_to_every_run(robots):
+def test_progress_is_reported_up_to_every_run(robots):
     robot = robots["cubesat"]
     lin, gain = held(robot)
     for executor in (None, ThreadPoolExecutor(2)):
-        told = []
+        messages = []
         more = {
             "executor": executor,
-            "progress": lambda *each, told=told: told.append(each),
+            "progress": lambda *item, messages=messages: messages.append(item),
         }
         fflin.validity(robot, lin, gain, samples=40, **more)
-        done = [each for each, _ in told]
+        done = [item for item, _ in messages]
         assert done == sorted(set(done)) and len(done) > 8
-        assert {total for _, total in told} == {done[-1]} == {28 + 40}
+        assert {total for _, total in messages} == {done[-1]} == {28 + 40}
     with pytest.raises(fflin.InputError, match="progress"):
         fflin.validity(robot, lin, gain, progress=3)
 
@@ -466,25 +468,25 @@ def test_it_shows_a_bar_on_a_terminal_and_ends_at_ctrl_c(jobs):
         finishing(process),
     ):
         os.close(theirs)
-        said = b""
-        while b"s left" not in said:
-            said += os.read(ours, 4096)
+        message = b""
+        while b"s left" not in message:
+            message += os.read(ours, 4096)
         os.killpg(process.pid, signal.SIGINT)
         with contextlib.suppress(OSError):  # Linux tells the end so
             while more := os.read(ours, 4096):
-                said += more
+                message += more
     os.close(ours)
     assert process.returncode == 130
     # The bar is taken away before the line.
-    assert said.endswith(b"\r\x1b[2Kfflin: stopped\r\n")
+    assert message.endswith(b"\r\x1b[2Kfflin: stopped\r\n")
 
 
 @pytest.mark.exhaustive
-def test_the_table_of_frames_is_what_its_command_makes():
+def test_the_table_of_frames_is_the_output_of_its_command():
     frames = runpy.run_path(str(DOCS / "scripts" / "frames.py"))
     table = (DOCS / "conventions.md").read_text(encoding="utf-8")
     design = "acceleration_lqr(lin, 1, 1, 1)"
-    found = frames["settled"](fflin.load("servicer_7dof"), design, 150.0)
+    result = frames["settled"](fflin.load("servicer_7dof"), design, 150.0)
     assert re.search(
-        rf"`{re.escape(design)}`, servicer_7dof \|.* {found} \|$", table, re.MULTILINE
+        rf"`{re.escape(design)}`, servicer_7dof \|.* {result} \|$", table, re.MULTILINE
     )

@@ -10,7 +10,7 @@ JOINTS = "\n".join(
 )
 
 
-def test_joints_only_says_what_is_conserved(tmp_path):
+def test_a_model_with_joint_torques_only_names_the_conserved_quantities(tmp_path):
     (tmp_path / "joints.toml").write_text(JOINTS)
     code, out, err = run("analyze", "ets_vii", "--inputs", "joints.toml", cwd=tmp_path)
     assert code == 0 and not err
@@ -38,7 +38,7 @@ def test_in_orbit_its_field_acts_on_all_momenta():
     assert "orbit" not in run("analyze", "cubesat")[1]
 
 
-def test_points_off_rest_are_told(tmp_path):
+def test_points_off_rest_are_reported(tmp_path):
     code, out, err = run("analyze", "ets_vii", "--velocity", "omega_b.z=0.1")
     assert code == 0 and not err
     assert (
@@ -62,7 +62,7 @@ def test_points_off_rest_are_told(tmp_path):
     assert "stabilizable" not in " ".join(out.split()).replace("not stabilizable", "")
 
 
-def test_bad_input_is_one_line():
+def test_invalid_input_is_one_line():
     assert "joint_1" in refused("analyze", "ets_vii", "--stiffness", "joint1=3")
 
 

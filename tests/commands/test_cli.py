@@ -61,14 +61,14 @@ def test_check_exits_0_on_every_bundled_robot(name):
 
 @pytest.mark.process
 def test_damping_that_is_asked_for_is_not_warned_of():
-    for option, said in (([], True), (["--damping", "urdf"], False)):
+    for option, message in (([], True), (["--damping", "urdf"], False)):
         done = finished(
             [sys.executable, "-m", "fflin", "modes", "planar_detumble", *option],
             capture_output=True,
             text=True,
             check=True,
         )
-        assert ("damping" in done.stderr) == said
+        assert ("damping" in done.stderr) == message
 
 
 @pytest.mark.process
@@ -118,7 +118,7 @@ def test_linearize_prints_readable_tables():
     assert f"{lin.B[12, 0]:.5g}" in row.split()
 
 
-def test_units_stand_above_the_tables():
+def test_units_are_above_the_tables():
     motion = ("--velocity", "joint_1=0.1", "--stiffness", "panel_left=100")
     code, out, err = run(
         "linearize", "servicer_7dof", *motion, "--output", "frame:tool"
@@ -143,7 +143,7 @@ def test_units_stand_above_the_tables():
     assert "q_m [rad], omega_b [rad/s]" in out
 
 
-def test_sampled_model_is_that_of_python(tmp_path):
+def test_sampled_model_matches_python(tmp_path):
     path = tmp_path / "m.mat"
     options = ("planar_detumble", "--dt", 0.1, "--velocity", "joint_1=0.1")
     code, _, err = run("linearize", *options, "-o", path)
@@ -204,7 +204,7 @@ def test_terminal_dims_zeros():
 
 
 @pytest.mark.parametrize("ending", [".npz", ".mat", ".json"])
-def test_linearize_saves_what_python_gives(ending, tmp_path):
+def test_linearize_saves_the_model_of_python(ending, tmp_path):
     path = tmp_path / f"m{ending}"
     options = (
         "--joint",
@@ -227,7 +227,7 @@ def test_linearize_saves_what_python_gives(ending, tmp_path):
     assert saved.frame == "local" and saved.certificate == lin.certificate
 
 
-def test_linearize_for_a_tool_saves_what_python_gives(tmp_path):
+def test_linearize_for_a_tool_saves_the_model_of_python(tmp_path):
     code, out, _ = run(
         *(
             "linearize",
@@ -268,7 +268,7 @@ def test_reference_world_keeps_the_attitude_in_the_state(tmp_path):
     assert json.loads(path.read_text())["x0"][:6] == [0.0] * 6
 
 
-def test_bad_input_is_one_line_and_leaves_nothing(tmp_path):
+def test_invalid_input_is_one_line_and_leaves_nothing(tmp_path):
     output = tmp_path / "m.npz"
     bad = tmp_path / "bad.urdf"
     bad.write_text("<robot name='r'><link")
@@ -393,15 +393,18 @@ def test_unwritable_stderr_does_not_change_the_exit_code(arguments):
     ],
 )
 def test_names_neither_split_nor_fill_the_line(arguments):
-    said = refused(
-        *(each.format("a\nb\x1b[31m" + 5000 * "c" + "d") for each in arguments)
+    message = refused(
+        *(argument.format("a\nb\x1b[31m" + 5000 * "c" + "d") for argument in arguments)
     )
     assert (
-        r"a\nb\x1b[31mc" in said and "...c" in said and "cd" in said and len(said) < 500
+        r"a\nb\x1b[31mc" in message
+        and "...c" in message
+        and "cd" in message
+        and len(message) < 500
     )
 
 
-def test_an_empty_name_is_said_to_be_empty():
+def test_an_empty_name_is_reported_to_be_empty():
     assert "empty" in refused("linearize", "cubesat", "-o", "")
     assert "empty" in refused("linearize", "cubesat", "--inputs", "")
     assert "empty" in refused("simulate", "cubesat", "--duration", "1", "--plot", "")
@@ -409,7 +412,7 @@ def test_an_empty_name_is_said_to_be_empty():
         fflin.linearize(fflin.load("cubesat")).save("")
 
 
-def test_negative_numbers_are_no_options():
+def test_negative_numbers_are_not_options():
     code, out, _ = run(
         "check", "cubesat", "--rpy", "-30", "-1e-3", "0", "--position", "-.5", 0, 0
     )
@@ -451,7 +454,7 @@ def test_passive_joints_and_gravity(tmp_path):
     assert code == 0 and "A and B are verified" in out
 
 
-def test_inputs_and_outputs_are_those_of_python(tmp_path):
+def test_inputs_and_outputs_match_python(tmp_path):
     path = tmp_path / "m.mat"
     springs = ("--stiffness", "panel_left=100", "--stiffness", "panel_right=100")
     inputs = fflin.load_inputs("servicer_7dof")
@@ -476,7 +479,7 @@ def test_inputs_and_outputs_are_those_of_python(tmp_path):
     assert code == 0 and "A and B are verified" in out
 
 
-def test_output_and_output_file_are_told_apart(tmp_path):
+def test_output_and_output_file_are_distinguished(tmp_path):
     for option in (("--output-file",), ("--output-f",), ("-o",)):
         path = tmp_path / f"m{len(option[0])}.json"
         code, _, err = run("linearize", "ets_vii", "--output=com", *option, path)
@@ -516,11 +519,11 @@ def test_warnings_of_other_packages_are_shown_as_those_of_fflin(monkeypatch, cap
     with warnings.catch_warnings():
         warnings.simplefilter("always")
         assert cli.main(["linearize", "cubesat"]) == 0
-        *_, foreign, own = capsys.readouterr().err.splitlines()
+        *_, foreign, own_line = capsys.readouterr().err.splitlines()
         outcome.append("error")
         assert cli.main(["linearize", "cubesat"]) == 2
         error = capsys.readouterr().err
-    assert own == "fflin: warning: mind this"
+    assert own_line == "fflin: warning: mind this"
     assert foreign == "fflin: warning: overflow encountered in multiply"
     assert error.endswith("fflin: warning: mind this\nfflin: error: too large\n")
 
@@ -566,7 +569,7 @@ joints = { joint_2 = 0.6 }
 """
 
 
-def test_info_shows_what_was_set_beside_the_urdf(tmp_path):
+def test_info_shows_the_settings_that_are_not_in_the_urdf(tmp_path):
     (tmp_path / "sat.toml").write_text(SETTINGS)
     code, out, err = run(
         "info", "sat.toml", "--damping", "panel_left=0.4", cwd=tmp_path
@@ -653,15 +656,15 @@ def test_warnings_of_bundled_robots_fit_a_terminal(name, capfd):
         ),
     ],
 )
-def test_plot_draws_what_the_command_found(command, tmp_path, monkeypatch):
+def test_plot_draws_the_result_of_the_command(command, tmp_path, monkeypatch):
     pytest.importorskip("matplotlib")
     code, out, _ = run(*command, "--plot", tmp_path / "a.svg")
     assert code == 0 and out.endswith(f"wrote {tmp_path / 'a.svg'}\n")
     assert (tmp_path / "a.svg").read_bytes().startswith(b"<?xml")
     assert "'.bmp'" in refused(*command, "--plot", tmp_path / "a.bmp")
     assert "No such" in (
-        said := refused(*command, "--plot", tmp_path / "no" / "a.png")
-    ) or ("folder" in said)
+        message := refused(*command, "--plot", tmp_path / "no" / "a.png")
+    ) or ("folder" in message)
     assert [path.name for path in tmp_path.iterdir()] == ["a.svg"]
 
 
@@ -696,7 +699,9 @@ def test_short_help_fits_a_screen_and_full_help_has_every_option():
     (parsers,) = cli._parser("")._subparsers._group_actions
     for name, parser in parsers.choices.items():
         options = [
-            each.option_strings[-1] for each in parser._actions if each.option_strings
+            action.option_strings[-1]
+            for action in parser._actions
+            if action.option_strings
         ]
         _, short, _ = run(name, "--help")
         _, full, _ = run(name, "--help", "all")
@@ -727,12 +732,14 @@ def test_options_that_repeat_a_robot_file_are_in_one_group():
         "funnel",
     ):
         (group,) = (x for x in parsers.choices[name]._action_groups if x.title == ROBOT)
-        assert {each.dest for each in group._group_actions} == repeated, name
+        assert {
+            group_action.dest for group_action in group._group_actions
+        } == repeated, name
 
 
 @pytest.mark.sample
 @pytest.mark.process
-def test_closed_pipe_is_no_error():
+def test_closed_pipe_is_not_an_error():
     command = f"{sys.executable} -m fflin linearize talos | head -n 1"
     done = finished(
         ["bash", "-c", command],
@@ -786,8 +793,8 @@ def test_equilibria_in_orbit_are_taken_as_panels_sag(tmp_path):
     assert (code, err) == (0, "") and "not an equilibrium" not in out
     # A rigid body's libration, in closed form.
     code, out, _ = run("modes", "cubesat", "--orbit", "400e3", "--relative-equilibrium")
-    found = fflin.relative_equilibria(fflin.load("cubesat", orbit=400e3))[0]
-    assert code == 0 and all(f"{w:.6g}" in out for w in found.poles.imag if w > 0.0)
+    result = fflin.relative_equilibria(fflin.load("cubesat", orbit=400e3))[0]
+    assert code == 0 and all(f"{w:.6g}" in out for w in result.poles.imag if w > 0.0)
     for command in ("analyze", "lqr"):
         assert run(command, *soft, "--relative-equilibrium", 5)[0] == 0
     assert "--relative-equilibrium" in run("modes", *soft, "--rpy", 5, 0, 0)[1]

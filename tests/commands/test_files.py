@@ -24,8 +24,10 @@ def commands():
 def pairs():
     """Yield (command, option that is read, option that is written) for all of them."""
     for name, actions in commands():
-        reads = [each for each in actions if each.type in (input_file, input_name)]
-        writes = [each for each in actions if isinstance(each.type, OutputFile)]
+        reads = [
+            action for action in actions if action.type in (input_file, input_name)
+        ]
+        writes = [action for action in actions if isinstance(action.type, OutputFile)]
         for read, write in itertools.product(reads, writes):
             yield pytest.param(
                 name, actions, read, write, id=f"{name} {read.dest} {write.dest}"
@@ -38,13 +40,13 @@ def said(action, value):
 
 
 @pytest.mark.parametrize("name, actions, read, write", [*pairs()])
-def test_no_output_is_what_an_option_reads(
+def test_an_output_file_is_not_an_input_file(
     name, actions, read, write, tmp_path, capsys, monkeypatch
 ):
     monkeypatch.chdir(tmp_path)
     precious, other = tmp_path / "precious.toml", tmp_path / "other.toml"
-    for each in (precious, other):
-        each.write_text(each.name)  # nothing that a command could read
+    for item in (precious, other):
+        item.write_text(item.name)  # nothing that a command could read
     (tmp_path / "symbolic.npz").symlink_to(precious)
     os.link(precious, "hard.npz")
     words = [name]
@@ -89,7 +91,9 @@ def test_every_option_that_takes_a_file_says_whether_it_is_written():
 
 
 @pytest.mark.parametrize("included", ["r.urdf", "in.toml"])
-def test_what_a_robot_file_names_is_kept_too(included, tmp_path, capsys, monkeypatch):
+def test_files_that_a_robot_file_names_are_protected(
+    included, tmp_path, capsys, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "r.urdf").write_text(
         '<robot name="r"><link name="l"><inertial><mass value="1"/>'
@@ -117,7 +121,7 @@ WRITES = {
 
 
 @pytest.mark.parametrize("name", WRITES)
-def test_a_command_replaces_files_of_its_own_kind_alone(name, tmp_path, monkeypatch):
+def test_a_command_replaces_only_files_of_the_same_kind(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     options, endings = WRITES[name]
     command = (name, *options.split(), "-o")

@@ -45,7 +45,7 @@ OWN = (
 @pytest.mark.parametrize(
     "name", mostly(BUNDLED, "cubesat", "inspector", "planar_detumble", "servicer_7dof")
 )
-def test_what_init_writes_of_a_bundled_robot_flies(tmp_path, name):
+def test_a_robot_file_from_init_can_be_simulated(tmp_path, name):
     code, out, err = run("init", name, "-o", "own.toml", cwd=tmp_path)
     assert (code, err) == (0, "") and says(out, "own.toml", "fflin simulate own.toml")
     with warnings.catch_warnings():
@@ -70,7 +70,7 @@ def test_what_init_writes_of_a_bundled_robot_flies(tmp_path, name):
 
 
 @pytest.mark.process
-def test_init_warns_of_what_its_file_leaves_open_alone(tmp_path):
+def test_init_warns_only_of_properties_that_its_file_omits(tmp_path):
     text = OWN.replace('damping="0.3"', 'damping="0.3" friction="0.1"').replace(
         "RCS_1", "thr " * 9
     )
@@ -132,10 +132,10 @@ def test_inputs_come_in_the_order_of_their_numbers(tmp_path):
     )
     (tmp_path / "own.urdf").write_text(OWN.replace("</robot>", f"{nozzles}</robot>"))
     assert run("init", "own.urdf", cwd=tmp_path)[0] == 0
-    found = re.findall(
+    result = re.findall(
         '# name = "thruster_([0-9]+)"', (tmp_path / "own.toml").read_text()
     )
-    assert found == [str(k) for k in range(1, 13)]
+    assert result == [str(k) for k in range(1, 13)]
 
 
 def test_joints_that_all_have_no_effort_keep_their_motors(tmp_path):
@@ -187,7 +187,7 @@ def test_a_file_names_its_urdf_from_where_it_lies(tmp_path):
     )
 
 
-def test_init_writes_over_nothing_unless_told(tmp_path):
+def test_init_writes_over_nothing_unless_requested(tmp_path):
     code, out, _ = run("init", "ets_vii", cwd=tmp_path)
     assert code == 0 and says(out, "ets_vii.toml")
     path = tmp_path / "ets_vii.toml"
@@ -203,7 +203,7 @@ def test_init_writes_over_nothing_unless_told(tmp_path):
         "folder": ("ets_vii", "-o", "none/b.toml"),
     }.items():
         assert words in refused("init", *arguments, cwd=tmp_path)
-    assert sorted(each.name for each in tmp_path.iterdir()) == ["ets_vii.toml"]
+    assert sorted(item.name for item in tmp_path.iterdir()) == ["ets_vii.toml"]
 
 
 SAT = """
@@ -307,7 +307,7 @@ def test_simulate_begins_and_weighs_as_the_file_says(sat):
     assert x["omega_b.z"] == 0.01 and x["qdot_m.joint_1"] == 0.2
 
 
-def test_lqr_on_the_command_line_weighs_what_the_file_says(sat):
+def test_lqr_on_the_command_line_uses_the_weights_of_the_file(sat):
     def weights(*options):
         code, out, err = run("lqr", "sat.toml", *options, cwd=sat)
         assert code == 0, err
@@ -353,7 +353,7 @@ def test_suggested_wheels_have_an_inertia_and_saturate(
     )
 
 
-def test_an_ideal_force_on_the_base_is_said_to_be_ideal(tmp_path):
+def test_an_ideal_force_on_the_base_is_reported_to_be_ideal(tmp_path):
     (tmp_path / "bus.urdf").write_text(WHEEL.format(kind="fixed", speed=0))
     assert says(
         run("init", tmp_path / "bus.urdf", cwd=tmp_path)[1], "ideal torque and force"

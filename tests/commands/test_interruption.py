@@ -36,15 +36,15 @@ def interrupted(command, instant, folder):
     command's own and not of the clock.
     """
     arguments = [sys.executable, "-X", "importtime", "-m", "fflin", *command.split()]
-    said, seen = [], -(10**6)
+    message, seen = [], -(10**6)
     with in_own_session(arguments, folder, stdout=subprocess.DEVNULL) as process:
         try:
             # It ends with the last process that has it.
             for line in process.stderr:
                 # A line of another process may begin before this one's, and end after it.
-                own = line[max(0, line.find("fflin: ")) :]
-                if own.strip() and not own.startswith("import time:"):
-                    said.append(own)
+                default = line[max(0, line.find("fflin: ")) :]
+                if default.strip() and not default.startswith("import time:"):
+                    message.append(default)
                 seen = 0 if line.endswith(" fflin.commands\n") else seen + 1
                 if seen == instant:
                     with suppress(ProcessLookupError):
@@ -53,7 +53,7 @@ def interrupted(command, instant, folder):
             with suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)
     assert seen >= instant
-    return process.returncode, said
+    return process.returncode, message
 
 
 @pytest.mark.compiled
@@ -70,13 +70,13 @@ def test_it_ends_every_command_at_every_instant(name, instant, tmp_path):
         pytest.importorskip("h5py")
         pytest.importorskip("numba")
     command = LONG[name]
-    code, said = interrupted(command, instant, tmp_path)
+    code, message = interrupted(command, instant, tmp_path)
     if command.startswith("view") and code == 0:  # Ctrl-C is the way to end it
-        assert said[-1].endswith("(Ctrl-C ends)\n")
+        assert message[-1].endswith("(Ctrl-C ends)\n")
     else:
         assert code == 130
-        assert said[-1].startswith(("fflin: stopped", "fflin: interrupted at t = "))
-    assert all(line.startswith("fflin: ") for line in said), said
+        assert message[-1].startswith(("fflin: stopped", "fflin: interrupted at t = "))
+    assert all(line.startswith("fflin: ") for line in message), message
     assert {entry.name for entry in tmp_path.iterdir()} <= {"x.h5.part", "x.npz"}
 
 

@@ -18,8 +18,8 @@ def of_modes(modes):
     return [mode.pole for mode in modes.modes]
 
 
-def complex_of(each):
-    return complex(each["real"], each["imag"])
+def complex_of(item):
+    return complex(item["real"], item["imag"])
 
 
 class Python:
@@ -140,23 +140,23 @@ def python(tmp_path_factory, brief_validity):
     fflin.lqr(fflin.linearize(robot)).save(folder / "gain.npz")
     spin = fflin.velocity(robot, {"omega_b.z": 0.05})
     fflin.simulate(robot, v0=spin, duration=0.1).trajectory().save(folder / "plan.npz")
-    there = Python(folder)
-    there.check = fflin.check(robot, there.lin)
-    there.schedule = fflin.tvlqr(there.along)
-    there.schedule.save(folder / "gains.npz")
-    there.sprung = fflin.modes(
+    session = Python(folder)
+    session.check = fflin.check(robot, session.lin)
+    session.schedule = fflin.tvlqr(session.along)
+    session.schedule.save(folder / "gains.npz")
+    session.sprung = fflin.modes(
         fflin.linearize(fflin.load(ROBOT, stiffness={"joint_1": 3.0}))
     )
     sprung = fflin.load(ROBOT, stiffness={"joint_1": 3.0})
-    there.held = fflin.equilibrium(
+    session.held = fflin.equilibrium(
         sprung, fflin.configuration(sprung, {"joint_1": 0.2})
     )
     locked = fflin.load(ROBOT, lock=["joint_2", "joint_3"])
     end = fflin.configuration(locked, {"joint_1": 0.3})
-    there.slew = fflin.plan(locked, (end, None), 20.0, knots=5)
+    session.slew = fflin.plan(locked, (end, None), 20.0, knots=5)
     goal = {"knots": 2, "samples": 2, "threads": 1, "limits": "urdf"}
-    there.funnel = fflin.funnel(robot, there.schedule, {"attitude": 1.0}, **goal)
-    return there
+    session.funnel = fflin.funnel(robot, session.schedule, {"attitude": 1.0}, **goal)
+    return session
 
 
 @pytest.mark.parametrize("command", CASES)
@@ -164,18 +164,18 @@ def test_json_has_one_schema_and_the_figures_of_python(command, python):
     words, figures = CASES[command]
     code, out, err = run(command, *words.split(), "--json", cwd=python.folder)
     assert code == 0 and "error" not in err and out.count("\n") == 1
-    said = json.loads(out, parse_constant=pytest.fail)  # NaN is no JSON
-    assert list(said)[: len(HEAD)] == HEAD
-    assert (said["fflin"], said["command"]) == (fflin.__version__, command)
-    assert said["robot"] == (None if command == "robots" else ROBOT)
-    assert said["result"] and "\n" not in said["result"]
-    for shown, there in figures(said, python):
+    message = json.loads(out, parse_constant=pytest.fail)  # NaN is no JSON
+    assert list(message)[: len(HEAD)] == HEAD
+    assert (message["fflin"], message["command"]) == (fflin.__version__, command)
+    assert message["robot"] == (None if command == "robots" else ROBOT)
+    assert message["result"] and "\n" not in message["result"]
+    for shown, session in figures(message, python):
         # Relative to the largest: two runs of an integrator differ by its rounding.
-        assert np.shape(shown) == np.shape(there)
-        assert np.abs(np.subtract(shown, there)).max() <= 1e-9 * max(
-            np.abs(there).max(), 1e-3
+        assert np.shape(shown) == np.shape(session)
+        assert np.abs(np.subtract(shown, session)).max() <= 1e-9 * max(
+            np.abs(session).max(), 1e-3
         )
-    for name in said["files"]:
+    for name in message["files"]:
         assert (python.folder / name).stat().st_size
 
 
@@ -186,8 +186,10 @@ def test_every_command_but_view_is_tried():
 
 
 def test_the_first_paragraph_of_the_text_is_the_result(python):
-    text, said = (run("lqr", ROBOT, *more)[1] for more in ((), ("--json",)))
-    assert f"lqr: {json.loads(said)['result']}" == " ".join(text.split("\n")[0].split())
+    text, message = (run("lqr", ROBOT, *more)[1] for more in ((), ("--json",)))
+    assert f"lqr: {json.loads(message)['result']}" == " ".join(
+        text.split("\n")[0].split()
+    )
 
 
 def test_an_error_leaves_stdout_empty_and_a_failed_check_prints_json(python):
@@ -198,7 +200,7 @@ def test_an_error_leaves_stdout_empty_and_a_failed_check_prints_json(python):
     assert json.loads(out)["max_error"] == worst > 0.0
 
 
-def test_what_is_not_finite_is_null():
+def test_nonfinite_values_are_null():
     from fflin.commands.cli import plain
 
     assert plain({"a": np.array([1.0, np.inf]), "_b": 1}) == {"a": [1.0, None]}
@@ -227,12 +229,12 @@ def test_info_has_the_momentum_of_the_wheels_and_the_authority_of_the_thrusters(
     (tmp_path / "sat.toml").write_text(text)
     code, out, err = run("info", "sat.toml", "--json", cwd=tmp_path)
     assert (code, err) == (0, "")
-    found = json.loads(out)
-    momentum = found["wheel_momentum"]
+    result = json.loads(out)
+    momentum = result["wheel_momentum"]
     assert momentum["wheels"] == momentum["axes"] == 3
     assert momentum["total"] == pytest.approx([1e-3, 0.0, 0.0])
     assert momentum["least"] == pytest.approx(3e-3)
-    reach = found["thruster_authority"]
+    reach = result["thruster_authority"]
     assert (reach["thrusters"], reach["every_way"]) == (12, True)
     assert reach["least_force"] == pytest.approx(4.0) and reach[
         "least_torque"

@@ -11,18 +11,18 @@ from tests.support.commands import refused, run
 
 
 @pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
-def test_what_matters_most_is_shown_and_saved(tmp_path):
+def test_the_most_important_parameters_are_shown_and_saved(tmp_path):
     point = ("--joint", "joint_2=0.6", "--velocity", "omega_b.z=0.1")
     code, out, err = run(
         *("sensitivity", "servicer_7dof", *point, "--top", 4, "-o", tmp_path / "c.mat")
     )
     assert code == 0 and not err
     head, table = out.split("parameter ")
-    _, *rows, more, said = table.splitlines()
+    _, *rows, more, message = table.splitlines()
     assert "most" in head and len(rows) == 4 and more.startswith("... and ")
-    assert all(len(line) <= 80 for line in out.splitlines()[:-1]) and said.startswith(
-        "wrote "
-    )
+    assert all(
+        len(line) <= 80 for line in out.splitlines()[:-1]
+    ) and message.startswith("wrote ")
     robot = fflin.load("servicer_7dof")
     q = fflin.configuration(robot, {"joint_2": 0.6})
     lin = fflin.linearize(robot, q, fflin.velocity(robot, {"omega_b.z": 0.1}))
@@ -83,7 +83,7 @@ def test_the_fraction_is_saved(tmp_path):
     ]
 
 
-def test_what_is_wrong_is_one_line(tmp_path):
+def test_errors_are_one_line(tmp_path):
     vary = ("uncertain", "cubesat", "--vary")
     assert "'bas.mass'" in refused(*vary, "bas.mass=0.1")
     assert "NAME=FRACTION" in refused(*vary, "base.mass")

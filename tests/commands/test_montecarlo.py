@@ -25,7 +25,9 @@ def folder(tmp_path):
     return tmp_path
 
 
-def test_it_flies_what_python_flies_and_says_it_as_text_and_json(folder, robots):
+def test_the_command_simulates_the_motion_of_python_and_reports_it_as_text_and_json(
+    folder, robots
+):
     robot = robots["planar_detumble"]
     options = (
         "--runs",
@@ -42,7 +44,7 @@ def test_it_flies_what_python_flies_and_says_it_as_text_and_json(folder, robots)
     assert code == 0 and not err
     campaign = fflin.Campaign.load(folder / "runs.npz")
     lin, turn = fflin.linearize(robot), pin.rpy.rpyToMatrix(np.radians(5.0), 0.0, 0.0)
-    there = fflin.monte_carlo(
+    expected_value = fflin.monte_carlo(
         robot,
         fflin.StateFeedback(lin, fflin.lqr(lin).K),
         fflin.load_dispersions(folder / "u.toml"),
@@ -52,7 +54,7 @@ def test_it_flies_what_python_flies_and_says_it_as_text_and_json(folder, robots)
         },
         **{"seed": 4, "duration": 0.4, "dt": 0.02, "limits": ["urdf", {"tau_b": 2.0}]},
     )
-    assert np.abs(there.x - campaign.x).max() < 1e-9
+    assert np.abs(expected_value.x - campaign.x).max() < 1e-9
     assert campaign.input_limits[:3] == (2.0,) * 3
     assert campaign.values("worst attitude").mean() > 5.0
     share = campaign.fraction("attitude < 4 deg")
@@ -63,16 +65,16 @@ def test_it_flies_what_python_flies_and_says_it_as_text_and_json(folder, robots)
     assert max(map(len, out.splitlines())) <= 80
     assert re.search(rf"^ *{campaign.worst(1)[0]} +[\d.]+ +deg", out, re.MULTILINE)
     code, out, _ = run(*command, "--worst", 2, "--json", cwd=folder)
-    said = json.loads(out)
-    assert said["worst"] == campaign.worst(2) and said["stopped"] == {}
-    assert said["goals"] == {"attitude < 4 deg": list(share)}
-    found = said["quantiles"]["worst attitude"]["0.5"]
-    assert found == list(campaign.quantile("worst attitude", 0.5))
+    message = json.loads(out)
+    assert message["worst"] == campaign.worst(2) and message["stopped"] == {}
+    assert message["goals"] == {"attitude < 4 deg": list(share)}
+    result = message["quantiles"]["worst attitude"]["0.5"]
+    assert result == list(campaign.quantile("worst attitude", 0.5))
     # of 30 runs there is no bound
-    assert said["quantiles"]["attitude"]["0.99"][2] is None
+    assert message["quantiles"]["attitude"]["0.99"][2] is None
 
 
-def test_tables_are_those_of_the_campaign(folder):
+def test_tables_match_the_campaign(folder):
     command = ("montecarlo", "planar_detumble", *SHORT, "--runs", 6)
     assert run(*command, "-o", "runs.npz", cwd=folder)[0] == 0
     fflin.Campaign.load(folder / "runs.npz").save(folder / "runs.csv")
@@ -87,7 +89,7 @@ def test_tables_are_those_of_the_campaign(folder):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         (("--runs", "0"), "--runs"),
         (("--runs", "1000000000000"), "1,000,000,000,000 rows.*memory"),
@@ -101,9 +103,9 @@ def test_tables_are_those_of_the_campaign(folder):
         (("--runs", "3", "--delay", "1e9"), "delay"),
     ],
 )
-def test_bad_input_is_one_line_and_leaves_nothing(arguments, said, folder):
+def test_invalid_input_is_one_line_and_leaves_nothing(arguments, message, folder):
     error = refused("montecarlo", "planar_detumble", *SHORT, *arguments, cwd=folder)
-    assert re.search(said, error), error
+    assert re.search(message, error), error
     assert {x.name for x in folder.iterdir()} == {"u.toml"}
 
 
@@ -135,16 +137,16 @@ def test_noise_has_a_report_and_another_campaign_is_replaced_by_force(
 
 
 @pytest.mark.parametrize(
-    ("file", "said"),
+    ("file", "message"),
     [
         ("none.toml", "none.toml"),
         ("bad.toml", "bad.toml:2.*'nosuch'"),
     ],
 )
-def test_a_bad_file_is_one_line(file, said, tmp_path):
+def test_a_bad_file_is_one_line(file, message, tmp_path):
     (tmp_path / "bad.toml").write_text("[dispersions]\nnosuch = 1\n")
     error = refused("montecarlo", "planar_detumble", file, "--runs", "3", cwd=tmp_path)
-    assert re.search(said, error), error
+    assert re.search(message, error), error
 
 
 INTERRUPTED = """
@@ -260,7 +262,7 @@ def test_the_same_command_goes_on_after_a_killed_worker(folder):
 
 
 @pytest.mark.process
-def test_a_full_disk_is_said_and_leaves_nothing(folder):
+def test_a_full_disk_is_reported_and_leaves_no_file(folder):
     pytest.importorskip("h5py")
     small = folder / "small"
     small.mkdir()

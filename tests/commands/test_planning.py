@@ -44,9 +44,9 @@ def test_a_plan_begins_at_the_trajectory_of_a_file(tmp_path):
     for name in ("first.csv", "again.csv"):
         code, out, err = run(*command, *guess, "-o", name, cwd=tmp_path)
         assert code == 0, err
-        found = re.search(r"effort (\S+), KKT residuals\s+after (\d+) iterations", out)
-        efforts.append(float(found[1]))
-        iterations.append(int(found[2]))
+        result = re.search(r"effort (\S+), KKT residuals\s+after (\d+) iterations", out)
+        efforts.append(float(result[1]))
+        iterations.append(int(result[2]))
         guess = ("--guess", "first.csv")
     assert iterations[1] < iterations[0] and efforts[1] <= efforts[0]
     code, _, err = run(
@@ -111,28 +111,28 @@ def test_an_equilibrium_has_its_inputs_and_its_stability(tmp_path):
         and np.abs(saved["q"] - held.q).max() < 1e-9
     )
     circle = fflin.load("cubesat", orbit=fflin.CircularOrbit(400e3))
-    found = fflin.relative_equilibria(circle)
-    k = next(k for k, each in enumerate(found) if each.stable is False)
+    result = fflin.relative_equilibria(circle)
+    k = next(k for k, item in enumerate(result) if item.stable is False)
     orbit = ("--orbit", 400e3, "--relative-equilibrium", k + 1)
-    said = json.loads(run("equilibrium", "cubesat", *orbit, "--json")[1])
-    assert said["stability"] == "unstable"
-    assert said["largest_real_part"] == pytest.approx(
-        found[k].poles.real.max(), rel=1e-6
+    message = json.loads(run("equilibrium", "cubesat", *orbit, "--json")[1])
+    assert message["stability"] == "unstable"
+    assert message["largest_real_part"] == pytest.approx(
+        result[k].poles.real.max(), rel=1e-6
     )
     assert "--effort" in refused("equilibrium", ROBOT, "--effort", "tau_m.joint_1=1")
 
 
-def test_an_equilibrium_beyond_the_limits_is_told():
+def test_an_equilibrium_beyond_the_limits_is_reported():
     heavy = ("equilibrium", "servicer_7dof", "--gravity", 0, 0, -9.81)
-    said = json.loads(run(*heavy, "--json")[1])
+    message = json.loads(run(*heavy, "--json")[1])
     robot = fflin.load("servicer_7dof", gravity=(0.0, 0.0, -9.81))
     u = fflin.equilibrium(robot).u
     limits = fflin.linearize(robot).limits
     names = fflin.linearize(robot).input_names
     pairs = zip(names, np.abs(u), strict=True)
     expected = [name for name, size in pairs if size > limits.get(name, np.inf)]
-    assert expected and set(said["beyond_limits"]) == set(expected)
-    assert f"beyond their limits: {said['beyond_limits'][0]}" in run(*heavy)[1]
+    assert expected and set(message["beyond_limits"]) == set(expected)
+    assert f"beyond their limits: {message['beyond_limits'][0]}" in run(*heavy)[1]
     light = run("equilibrium", "servicer_7dof", "--json")[1]
     assert json.loads(light)["beyond_limits"] == []
 
@@ -154,8 +154,10 @@ def test_predictive_control_keeps_the_limits(tmp_path):
     lin, limits = fflin.linearize(robot), ["urdf", {"tau_m": 0.1}]
     policy = fflin.mpc(lin, dt=0.2, horizon=10, limits=limits)
     q0 = fflin.configuration(robot, {"joint_1": 0.3})
-    there = fflin.simulate(robot, policy, q0=q0, duration=4.0, dt=0.05, limits=limits)
-    assert code == 0 and np.abs(motion.u - there.u).max() < 1e-9
+    expected_value = fflin.simulate(
+        robot, policy, q0=q0, duration=4.0, dt=0.05, limits=limits
+    )
+    assert code == 0 and np.abs(motion.u - expected_value.u).max() < 1e-9
     assert 0.1 - 1e-6 < np.abs(motion.u[:, 6:]).max() <= 0.1 + 1e-9
     assert "--sample" in refused(*command, "--mpc")
     assert "--allocate" in refused(*command, *mpc, "--allocate")

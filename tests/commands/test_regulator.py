@@ -97,7 +97,7 @@ def test_joints_alone_cannot_hold_the_base(capsys):
     assert code == 2 and "'cubesat'" in err
 
 
-def test_bad_input_is_one_line_and_leaves_no_file(capsys, tmp_path):
+def test_invalid_input_is_one_line_and_leaves_no_file(capsys, tmp_path):
     for words, arguments in {
         "state named 'nope'": ("--q", "nope=1"),
         "input named 'nope'": ("--r", "nope=1"),
@@ -196,8 +196,18 @@ def test_the_loop_that_lqr_reports_is_the_loop_that_is_simulated(capsys, tmp_pat
     )
     runs = []
     for options in ((), ("--gain", str(path))):
-        told = ("simulate", *robot, "--rpy", "5", "0", "0", "--duration", "2", *options)
-        assert main([*told, "-o", str(tmp_path / "run.npz"), "--force"]) == 0
+        messages = (
+            "simulate",
+            *robot,
+            "--rpy",
+            "5",
+            "0",
+            "0",
+            "--duration",
+            "2",
+            *options,
+        )
+        assert main([*messages, "-o", str(tmp_path / "run.npz"), "--force"]) == 0
         runs.append(fflin.Motion.load(tmp_path / "run.npz"))
     assert (runs[0].u == runs[1].u).all() and (runs[0].u[:, :12] >= 0.0).all()
     assert runs[0].u[:, :12].max() > 1e-4
@@ -213,17 +223,17 @@ def test_the_loop_that_lqr_reports_is_the_loop_that_is_simulated(capsys, tmp_pat
 
 def test_margins_and_allocation_are_in_json(capsys):
     assert main(["lqr", "cubesat", "--inputs", "cubesat", "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
+    result = json.loads(capsys.readouterr().out)
     robot = fflin.load("cubesat", inputs=fflin.load_inputs("cubesat"))
-    wheels = [each for each in robot.inputs if isinstance(each, fflin.ReactionWheel)]
+    wheels = [item for item in robot.inputs if isinstance(item, fflin.ReactionWheel)]
     design = robot.replace(inputs=[fflin.BaseTorque(), fflin.BaseForce(), *wheels])
     margins = fflin.lqr(fflin.linearize(design)).margins
-    assert found["allocated"] is True
-    assert found["margins"]["disk"] == pytest.approx(margins.disk, rel=1e-9)
-    assert found["margins"]["gain"] == pytest.approx(margins.gain, rel=1e-9)
+    assert result["allocated"] is True
+    assert result["margins"]["disk"] == pytest.approx(margins.disk, rel=1e-9)
+    assert result["margins"]["gain"] == pytest.approx(margins.gain, rel=1e-9)
 
 
-def test_what_the_limits_cannot_hold_in_gravity_is_said_and_not_refused(capsys):
+def test_gravity_beyond_the_limits_is_reported_and_not_refused(capsys):
     options = ("--gravity", "0", "0", "-9.81", "--equilibrium")
     with warnings.catch_warnings():
         warnings.simplefilter("always", fflin.FflinWarning)

@@ -102,13 +102,13 @@ def test_a_servicer_goes_from_urdf_to_page_campaign_and_lft_with_eight_options(
     assert sum(word.startswith("-") for word in words) <= 8
     for command in COMMANDS:
         code, _, err = run(*command.split(), cwd=tmp_path)
-        told = [line for line in err.splitlines() if "compiling" not in line]
-        told = [line for line in told if not line.startswith("fflin: about")]
-        assert (code, told) == (0, []), command
+        messages = [line for line in err.splitlines() if "compiling" not in line]
+        messages = [line for line in messages if not line.startswith("fflin: about")]
+        assert (code, messages) == (0, []), command
     robot = fflin.load(tmp_path / "servicer.toml")
     assert robot.mass == pytest.approx(600.0)
     assert len(robot.wheels) == 4 and robot.n == 7 + 2 + 4
-    assert sum(isinstance(each, fflin.Thruster) for each in robot.inputs) == 12
+    assert sum(isinstance(item, fflin.Thruster) for item in robot.inputs) == 12
     motion = fflin.Motion.load(tmp_path / "motion.npz")
     # From 6, -4 and 8 deg to the point, without a command beyond its limit.
     assert motion.attitude_error[0] > 8.0 and motion.attitude_error[-1] < 0.05
@@ -123,7 +123,7 @@ def test_a_servicer_goes_from_urdf_to_page_campaign_and_lft_with_eight_options(
     # The campaign has left machine code for this run of more than 20,000 steps.
     assert motion.engine == "compiled"
     page = (tmp_path / "motion.html").read_text(encoding="utf-8")
-    for name in (*robot.joint_names, *(each.name for each in robot.inputs[4:16])):
+    for name in (*robot.joint_names, *(item.name for item in robot.inputs[4:16])):
         assert f'"{name}"' in page, name
     campaign = fflin.Campaign.load(tmp_path / "runs.npz")
     assert len(campaign) == 8 and not campaign.stop.any()

@@ -85,7 +85,7 @@ def test_target_sampling_limits_and_delay(tmp_path):
 
 
 @pytest.mark.process
-def test_thrusts_are_allocated_or_their_cut_is_told(tmp_path):
+def test_thrusts_are_allocated_or_their_cut_is_reported(tmp_path):
     command = (
         "simulate",
         "cubesat",
@@ -187,11 +187,11 @@ def test_the_motion_is_kept_though_nobody_reads_the_table(tmp_path):
 
 
 @pytest.mark.parametrize("option", ["-o", "--plot"])
-def test_a_place_that_cannot_be_written_is_said_before_the_run(tmp_path, option):
-    there = tmp_path / "nowhere" / ("m.npz" if option == "-o" else "m.png")
-    code, out, err = run("simulate", "cubesat", option, there, cwd=tmp_path)
+def test_a_place_that_cannot_be_written_is_reported_before_the_run(tmp_path, option):
+    path = tmp_path / "nowhere" / ("m.npz" if option == "-o" else "m.png")
+    code, out, err = run("simulate", "cubesat", option, path, cwd=tmp_path)
     assert (code, out) == (2, "")
-    assert str(there) in err
+    assert str(path) in err
     assert not list(tmp_path.iterdir())
 
 
@@ -227,8 +227,8 @@ def test_a_run_that_is_interrupted_takes_no_earlier_files_place(
         cli.main(command)
     assert says(str(caught.value), "t = 0.5 s", str(path))
     assert path.read_bytes() == earlier
-    said = capsys.readouterr().out
-    assert f"wrote {new}" in said and str(path) not in said and new.is_file()
+    message = capsys.readouterr().out
+    assert f"wrote {new}" in message and str(path) not in message and new.is_file()
     page.write_text("earlier")
     with pytest.raises(KeyboardInterrupt, match=r"m\.html"):
         cli.main(["simulate", "cubesat", "--duration", "1", "--html", str(page)])
@@ -278,7 +278,7 @@ def test_joints_alone_cannot_hold_the_base_but_the_reduced_part():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         (["--plot", "loop.bmp"], "'.bmp'"),
         (["-o", "loop.xyz"], "'.xyz'"),
@@ -290,14 +290,16 @@ def test_joints_alone_cannot_hold_the_base_but_the_reduced_part():
         (["--method", "rk4"], "method"),
     ],
 )
-def test_bad_input_is_one_line_and_leaves_nothing(tmp_path, arguments, said):
-    assert said in refused(
+def test_invalid_input_is_one_line_and_leaves_nothing(tmp_path, arguments, message):
+    assert message in refused(
         "simulate", "ets_vii", "--duration", 20, *arguments, cwd=tmp_path
     )
     assert not list(tmp_path.iterdir())
 
 
-def test_inputs_are_cut_to_the_limits_of_the_robot_unless_told_otherwise(tmp_path):
+def test_inputs_are_cut_to_the_limits_of_the_robot_unless_another_limit_is_given(
+    tmp_path,
+):
     (tmp_path / "weak.toml").write_text(
         "[[input]]\ntype = 'base_torque'\nmax = 1e-3\n[[input]]\ntype = 'base_force'\n"
     )
@@ -404,7 +406,7 @@ def test_a_target_velocity_is_the_points_and_is_held(tmp_path):
     )
 
 
-def test_what_nothing_regulates_is_not_passed_over(tmp_path):
+def test_unregulated_modes_are_reported(tmp_path):
     wheels = ("cubesat", "--inputs", wheels_file(tmp_path), "--position", 1, 0, 0)
     joints = ("ets_vii", "--inputs", "joints", "--reduce", "--rpy", 30, 0, 0)
     for command, error in ((wheels, "position"), (joints, "attitude")):
@@ -414,22 +416,22 @@ def test_what_nothing_regulates_is_not_passed_over(tmp_path):
 
 
 def test_show_is_checked_before_the_run(tmp_path):
-    said = refused(
+    message = refused(
         *("simulate", "ets_vii", "--show", "q_x", "--plot", tmp_path / "a.png"),
         *("--limit", "nothing=1"),  # what the run itself would refuse
     )
-    assert "'q_x'" in said
+    assert "'q_x'" in message
 
 
-def test_an_on_off_thruster_without_samples_is_told_of_dt(tmp_path):
+def test_an_on_off_thruster_without_samples_names_dt_in_its_error(tmp_path):
     (tmp_path / "t.toml").write_text(
         'urdf = "cubesat"\n[[input]]\ntype = "base_torque"\n[[input]]\ntype = "thruster"\n'
         'frame = "base"\nposition = [0, 0, 0]\ndirection = [1, 0, 0]\nmax = 1\non_off = true\n'
     )
-    said = refused(
+    message = refused(
         "simulate", tmp_path / "t.toml", "--no-allocate", "--rpy", 9, 0, 0, "--reduce"
     )
-    assert says(said, "(--sample)")
+    assert says(message, "(--sample)")
 
 
 @pytest.mark.exhaustive
@@ -438,12 +440,12 @@ def test_a_controller_from_a_file_closes_the_loop(tmp_path, dt):
     robot = fflin.load("ets_vii", outputs=[fflin.BasePose(), fflin.JointPositions()])
     lin = fflin.linearize(robot)
     lin = lin.discretize(dt) if dt else lin
-    by = fflin.lqg(fflin.lqr(lin), fflin.kalman(lin, 1e-3, 1e-4))
+    controller = fflin.lqg(fflin.lqr(lin), fflin.kalman(lin, 1e-3, 1e-4))
     turned = {
-        "A": by.A,
-        "B": by.B,
-        "C": -by.C,
-        "D": np.zeros((len(by.C), by.B.shape[1])),
+        "A": controller.A,
+        "B": controller.B,
+        "C": -controller.C,
+        "D": np.zeros((len(controller.C), controller.B.shape[1])),
         "Ts": dt,
     }
     scipy.io.savemat(tmp_path / "K.mat", turned)
@@ -474,7 +476,7 @@ def test_a_controller_from_a_file_closes_the_loop(tmp_path, dt):
         motion.attitude_error[0] == pytest.approx(10.0)
         and motion.attitude_error[-1] < 0.05
     )
-    policy = fflin.LinearController(by, lin)
+    policy = fflin.LinearController(controller, lin)
     again = fflin.simulate(
         robot, policy, q0=motion.q[0], duration=motion.t[-1], dt=0.02
     )

@@ -84,7 +84,7 @@ def test_the_engine_can_be_chosen(tmp_path):
         (("--random", "3", "-o", "none/x.npz"), "none"),
     ],
 )
-def test_bad_input_is_one_line(arguments, message, tmp_path):
+def test_invalid_input_is_one_line(arguments, message, tmp_path):
     error = refused("sweep", "ets_vii", "-o", "out.npz", *arguments, cwd=tmp_path)
     assert re.search(message, error), error
     assert not list(tmp_path.iterdir())
@@ -133,7 +133,7 @@ sys.exit(main())
 
 @pytest.mark.process
 @pytest.mark.parametrize("workers", [(), ("--workers", "2")])
-def test_ctrl_c_leaves_what_is_finished_and_no_process(workers, tmp_path):
+def test_ctrl_c_keeps_finished_work_and_leaves_no_process(workers, tmp_path):
     """The whole group is interrupted, as a terminal does it."""
     pytest.importorskip("h5py")
     command = [

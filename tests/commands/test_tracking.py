@@ -83,7 +83,7 @@ def test_the_chain_goes_from_a_file_to_gains(flown):
     assert not schedule.verified  # as the csv is not
 
 
-def test_what_is_no_motion_is_said_and_what_is_no_trajectory_refused(flown):
+def test_an_inconsistent_motion_is_reported_and_an_invalid_trajectory_is_refused(flown):
     folder = flown[0]
     given = ("planar_detumble", "--trajectory", folder / "flown.csv")
     code, out, _ = run("check", *given, "--hold", "previous")
@@ -116,7 +116,7 @@ OFFSET = ("--offset", "yaw=1", "--offset", "q_m=0.05", "--offset", "omega_b.z=0.
 
 
 @pytest.mark.exhaustive
-def test_a_trajectory_is_followed_from_beside_it_to_files(flown):
+def test_a_trajectory_is_followed_from_next_to_it_to_files(flown):
     folder, robot, motion = flown
     code, out, err = chain(
         folder,
@@ -155,10 +155,12 @@ def test_a_trajectory_is_followed_from_beside_it_to_files(flown):
     state = fflin.StateMap(
         robot, reference=pin.XYZQUATToSE3(motion.q[0, :7]), frame="local"
     )
-    there, here = (state.to_state(each.q[0], each.v[0]) for each in (motion, run_))
+    expected_value, point = (
+        state.to_state(item.q[0], item.v[0]) for item in (motion, run_)
+    )
     e = np.zeros(18)
     e[2], e[6:9], e[11] = np.sin(np.radians(0.5)), 0.05, 0.05
-    np.testing.assert_allclose(here - there, e, atol=1e-12)
+    np.testing.assert_allclose(point - expected_value, e, atol=1e-12)
 
 
 def test_an_offset_may_be_more_than_half_a_turn(flown):
@@ -168,9 +170,9 @@ def test_an_offset_may_be_more_than_half_a_turn(flown):
         == 0
     )
     q = fflin.Motion.load(folder / "turned.npz").q[0], motion.q[0]
-    here, there = (pin.XYZQUATToSE3(each[:7]).rotation for each in q)
+    point, expected_value = (pin.XYZQUATToSE3(item[:7]).rotation for item in q)
     np.testing.assert_allclose(
-        there.T @ here, pin.rpy.rpyToMatrix(0, 0, np.radians(200)), atol=1e-9
+        expected_value.T @ point, pin.rpy.rpyToMatrix(0, 0, np.radians(200)), atol=1e-9
     )
 
 
@@ -197,7 +199,7 @@ def test_a_sampled_trajectory_of_a_mat_file_is_followed_past_its_end(flown):
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "message"),
     [
         (("--free",), "--free"),
         (("--target-joint", "joint_1=1"), "--target-joint"),
@@ -210,16 +212,18 @@ def test_a_sampled_trajectory_of_a_mat_file_is_followed_past_its_end(flown):
         (("--allocate",), "thrusters"),
     ],
 )
-def test_what_a_trajectory_already_says_is_refused(flown, options, said):
+def test_arguments_that_a_trajectory_defines_are_refused(flown, options, message):
     folder, robot, motion = flown
     if not (folder / "other.npz").exists():
         along = fflin.linearize_trajectory(robot, motion.resampled(0.5))
         fflin.tvlqr(along).save(folder / "other.npz")
     given = ("--trajectory", folder / "flown.mat")
-    assert said in refused("simulate", "planar_detumble", *given, *options, cwd=folder)
+    assert message in refused(
+        "simulate", "planar_detumble", *given, *options, cwd=folder
+    )
 
 
-def test_the_table_of_a_motion_is_no_trajectory(flown):
+def test_the_table_of_a_motion_is_not_a_trajectory(flown):
     folder, robot, _ = flown
     fflin.simulate(robot, duration=0.1, dt=0.05).save(folder / "table.csv")
     given = ("--trajectory", folder / "table.csv")
@@ -229,8 +233,8 @@ def test_the_table_of_a_motion_is_no_trajectory(flown):
 def test_gains_of_another_robot_are_refused(flown):
     folder, robot, motion = flown
     fflin.tvlqr(fflin.linearize_trajectory(robot, motion)).save(folder / "own.npz")
-    said = refused("simulate", "ets_vii", "--schedule", "own.npz", cwd=folder)
-    assert says(said, "'planar_detumble'", "'ets_vii'")
+    message = refused("simulate", "ets_vii", "--schedule", "own.npz", cwd=folder)
+    assert says(message, "'planar_detumble'", "'ets_vii'")
     assert "--trajectory" in refused("simulate", "ets_vii", "--offset", "yaw=1")
 
 
@@ -254,8 +258,10 @@ def test_a_gain_from_a_file_regulates_as_the_one_that_is_designed(tmp_path, opti
     a, b = (fflin.Motion.load(tmp_path / name) for name in ("a.npz", "b.npz"))
     np.testing.assert_allclose(b.x, a.x, atol=1e-9)
     np.testing.assert_allclose(b.linear, a.linear, atol=1e-9)
-    said = refused(*start, "c.npz", "--gain", "gain.npz", "--q", "q_b=1", cwd=tmp_path)
-    assert "--gain" in said
+    message = refused(
+        *start, "c.npz", "--gain", "gain.npz", "--q", "q_b=1", cwd=tmp_path
+    )
+    assert "--gain" in message
     other = refused("simulate", "canadarm2", "--gain", "gain.npz", cwd=tmp_path)
     assert says(other, "gain.npz", "'ets_vii'", "'canadarm2'")
 
@@ -292,7 +298,7 @@ def test_a_gain_about_the_world_feeds_back_the_state_that_it_was_designed_for(tm
 def test_gains_of_thrusters_say_that_nothing_is_allocated(tmp_path):
     thruster = '[[input]]\ntype = "thruster"\nframe = "base"\nposition = [0.1, 0, 0]\n'
     base = '[[input]]\ntype = "base_torque"\n[[input]]\ntype = "base_force"\n'
-    said = []
+    message = []
     for name, text in (
         ("with", base + thruster + "direction = [0, 1, 0]\n"),
         ("without", base),
@@ -303,5 +309,5 @@ def test_gains_of_thrusters_say_that_nothing_is_allocated(tmp_path):
         assert run("plan", *given, *options, cwd=tmp_path)[0] == 0
         code, out, _ = run("tvlqr", *given, "--trajectory", f"{name}.npz", cwd=tmp_path)
         assert code == 0
-        said.append("no allocation" in out)
-    assert said == [True, False]
+        message.append("no allocation" in out)
+    assert message == [True, False]

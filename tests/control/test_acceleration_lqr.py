@@ -55,15 +55,17 @@ def test_closed_form_solves_the_riccati_equation(robots, name):
     assert gain.residual < 1e-15
     # The general route with the accelerations as inputs, u = M a.
     B = np.eye(2 * m)[:, m:]
-    found = solve(lin.A, B, np.diag([*qp, *qv]), np.diag(ra))
+    result = solve(lin.A, B, np.diag([*qp, *qv]), np.diag(ra))
     # P agrees to what M M^-1 rounds to, which the closed form does without.
-    assert gain.P == pytest.approx(found.P, rel=1e-8, abs=1e-12 * np.abs(found.P).max())
-    expected = lin.M @ found.K
+    assert gain.P == pytest.approx(
+        result.P, rel=1e-8, abs=1e-12 * np.abs(result.P).max()
+    )
+    expected = lin.M @ result.K
     assert gain.K == pytest.approx(
         expected, rel=1e-7, abs=1e-9 * np.abs(expected).max()
     )
     # Its poles are those of the loop with the inertia divided out.
-    loop = np.linalg.eigvals(lin.A - B @ found.K)
+    loop = np.linalg.eigvals(lin.A - B @ result.K)
     for pole in gain.poles:
         near = np.abs(loop - pole).min()
         assert near < 1e-7 * abs(pole) + 1e-9
@@ -76,7 +78,7 @@ def test_its_cost_sampled_gives_a_regulator_that_tends_to_it(robots):
         fflin.lqr(lin.discretize(h), *fflin.sampled_cost(lin, h, gain.Q, gain.R))
         for h in (1e-2, 1e-3)
     ]
-    errors = [np.abs(each.K - gain.K).max() for each in held]
+    errors = [np.abs(item.K - gain.K).max() for item in held]
     assert errors[1] == pytest.approx(errors[0] / 10.0, rel=0.05)
 
 
@@ -94,7 +96,7 @@ def test_redundant_thrusters_share_the_least_forces():
     assert gain.K == pytest.approx(np.linalg.pinv(lin.B[6:]) @ lin.B[6:] @ gain.K)
 
 
-def test_what_has_no_closed_form_is_refused():
+def test_a_guess_without_a_closed_form_is_refused():
     robot = fflin.load("ets_vii")
     lin = fflin.linearize(robot)
     joints = robot.replace(

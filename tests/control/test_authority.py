@@ -23,7 +23,7 @@ def tilted(robot, **joints):
     return fflin.configuration(robot, joints, pin.SE3.Random())
 
 
-def test_mass_properties_are_those_of_the_bodies_in_base_axes():
+def test_mass_properties_match_the_bodies_in_base_axes():
     robot = fflin.load("servicer_7dof")
     q = tilted(robot, joint_2=0.7, joint_4=-1.1)
     data = robot.create_data()
@@ -40,7 +40,7 @@ def test_mass_properties_are_those_of_the_bodies_in_base_axes():
 
 
 @pytest.mark.parametrize("m", [3, 6])
-def test_the_least_reach_is_that_of_linear_programs(m):
+def test_the_least_reach_matches_linear_programs(m):
     rng = np.random.default_rng(m)
     W = rng.normal(size=(m, 3 * m)) * np.logspace(-1, 2, m)[:, None]
     # so that thrusts can cancel one another
@@ -58,16 +58,16 @@ def test_the_least_reach_is_that_of_linear_programs(m):
 
     directions = rng.normal(size=(300, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    found = np.array([reach(each) for each in directions])
-    assert found.min() >= least * (1.0 - 1e-7)
+    result = np.array([reach(item) for item in directions])
+    assert result.min() >= least * (1.0 - 1e-7)
     # Towards the nearest facet the reach is the least itself.
-    nearest = directions[found.argmin()]
+    nearest = directions[result.argmin()]
     for step in np.logspace(-0.5, -6, 60):
         tried = nearest + step * rng.normal(size=(6, 3))
-        for each in tried / np.linalg.norm(tried, axis=1, keepdims=True):
-            if (value := reach(each)) < found.min():
-                found, nearest = np.array([value]), each
-    assert found.min() == pytest.approx(least, rel=1e-3)
+        for item in tried / np.linalg.norm(tried, axis=1, keepdims=True):
+            if (value := reach(item)) < result.min():
+                result, nearest = np.array([value]), item
+    assert result.min() == pytest.approx(least, rel=1e-3)
 
 
 def test_a_box_of_thrusters_has_the_force_and_torque_of_its_pairs():
@@ -93,13 +93,15 @@ def test_a_box_of_thrusters_has_the_force_and_torque_of_its_pairs():
     assert reports[0] == reports[1]
     # It is the centre of mass that counts.
     center = np.array([0.2, -0.3, 0.1])
-    moved = [replace(each, position=tuple(each.position + center)) for each in nozzles]
+    moved = [
+        replace(nozzle, position=tuple(nozzle.position + center)) for nozzle in nozzles
+    ]
     moved = robot.replace(inputs=moved)
     assert thrusters_at(moved, center) == report
     assert thrusters_at(moved, np.zeros(3)) != report
     few = robot.replace(inputs=nozzles[:-1])
-    said = thrusters_at(few, np.zeros(3))
-    assert "cannot produce a force and a torque in every direction" in said
+    message = thrusters_at(few, np.zeros(3))
+    assert "cannot produce a force and a torque in every direction" in message
     free = robot.replace(
         inputs=[fflin.Thruster("base", x.position, x.direction) for x in nozzles]
     )
@@ -117,10 +119,10 @@ def test_wheels_add_up_in_base_axes():
     pin.framesForwardKinematics(robot.model, data, q)
     frame = data.oMf[robot.model.getFrameId("link_1")].rotation
     expected = [0.5, 0, 0] + data.oMi[1].rotation.T @ frame @ [0, 0, 3.0]
-    found = wheels_at(robot, q, v)
-    np.testing.assert_allclose(found.total, expected, atol=1e-12)
-    assert found.axes == 2 and found.least is None
-    assert "only two" in str(found)
+    result = wheels_at(robot, q, v)
+    np.testing.assert_allclose(result.total, expected, atol=1e-12)
+    assert result.axes == 2 and result.least is None
+    assert "only two" in str(result)
     three = [
         fflin.ReactionWheel(x, inertia=1e-5, max_speed=300.0)
         for x in np.eye(3).tolist()

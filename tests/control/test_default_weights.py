@@ -175,7 +175,7 @@ def test_efforts_hold_for_every_displacement_and_one_limit_binds(loops, name):
     assert max(share) == pytest.approx(1.0, rel=5e-3)
 
 
-def test_a_limit_of_zero_or_beyond_all_use_is_none(loops):
+def test_a_zero_or_huge_limit_is_ignored(loops):
     robot, lin, gain = loops("double_pendulum")
     assert not robot.model.effortLimit[6:].any() and not lin.limits.keys() & set(
         lin.input_names
@@ -239,22 +239,22 @@ def test_thrusters_springs_gravity_and_reduced_models_have_weights_too():
     assert gain.margins.disk > 0.6 and gain.margin > 0.0
 
 
-def test_a_point_that_asks_for_more_than_the_limits_is_told(loops):
+def test_a_point_that_asks_for_more_than_the_limits_is_reported(loops):
     model = loops("talos_arm")[0].model.copy()
     model.effortLimit[6:] *= 1e-2
     heavy = fflin.from_model(model, gravity=(0.0, 0.0, -3.0))
     lin = fflin.linearize(heavy, u=fflin.equilibrium(heavy).u)
     asked = dict(zip(lin.input_names, np.abs(lin.u0), strict=True))
     beyond = [name for name in asked if asked[name] > lin.limits.get(name, np.inf)]
-    said = fflin.lqr(lin).weights
+    message = fflin.lqr(lin).weights
     words = (
         "; inputs already at or beyond the URDF limit at the operating point: "
         f"{', '.join(beyond)}"
     )
-    assert beyond and said.endswith(words)
+    assert beyond and message.endswith(words)
 
 
-def test_what_the_limits_leave_beside_gravity_is_what_the_loop_may_use(loops):
+def test_the_loop_may_use_the_limits_minus_gravity(loops):
     robot, _, _ = loops("talos_arm")
     still = fflin.lqr(fflin.linearize(robot))
     heavy = robot.replace(gravity=(0.0, 0.0, -3.0))
@@ -293,7 +293,7 @@ def test_a_sampled_model_gets_the_same_cost_and_keeps_its_margins(
         )
 
 
-def test_identity_and_given_weights_are_said(loops):
+def test_identity_and_given_weights_are_reported(loops):
     _, lin, _ = loops("ets_vii")
     plain = fflin.lqr(lin, weights="identity")
     assert (plain.K == fflin.lqr(lin, 1.0, 1.0).K).all()
@@ -349,8 +349,8 @@ def test_a_gain_that_bears_little_is_warned_of_wherever_it_is_shown():
     ]
     done = finished(command, capture_output=True, text=True, check=True)
     out, err = done.stdout, done.stderr
-    told = [line for line in err.splitlines() if "disk margin" in line]
-    assert len(told) == 1 and "dt" in told[0]
+    messages = [line for line in err.splitlines() if "disk margin" in line]
+    assert len(messages) == 1 and "dt" in messages[0]
     assert "warning" not in out
 
 
@@ -359,28 +359,30 @@ def test_limits_of_thrusters_wheels_and_the_base_bind_too():
     base = [fflin.BaseTorque(max=1e-4), fflin.BaseForce(max=1.0)]
     rule = fflin.lqr(fflin.linearize(bare.replace(inputs=base))).weights
     assert re.search(r"limited by the effort of (tau|F)_b\.[xyz]$", rule)
-    found = fflin.load_inputs("cubesat")
-    weak = [replace(x, max=1e-5) if isinstance(x, fflin.Thruster) else x for x in found]
+    result = fflin.load_inputs("cubesat")
+    weak = [
+        replace(x, max=1e-5) if isinstance(x, fflin.Thruster) else x for x in result
+    ]
     gain = fflin.lqr(fflin.linearize(bare.replace(inputs=weak)))
     assert re.search(r"limited by the effort of [xyz]_(plus|minus)_", gain.weights)
 
 
-def test_displacements_that_ask_for_more_than_the_limits_are_warned_of(loops):
+def test_displacements_that_ask_for_more_than_the_limits_give_a_warning(loops):
     model = loops("talos_arm")[0].model.copy()
     model.effortLimit[6:] *= 0.1
     heavy = fflin.from_model(model, gravity=(0.0, 0.0, -9.81))
     lin = fflin.linearize(heavy, u=fflin.equilibrium(heavy).u)
-    with pytest.warns(fflin.FflinWarning) as told:
+    with pytest.warns(fflin.FflinWarning) as messages:
         gain = fflin.lqr(lin)
     assert says(gain.weights, "too small")
-    (said,) = (str(each.message) for each in told)
+    (message,) = (str(item.message) for item in messages)
     start = (
         "the input limits are too small for 'talos' to return from the displacements"
     )
     asked = re.findall(
-        r"(tau_m\.\w+) requires ([\d.]+) N m, its limit is ([\d.]+)", said
+        r"(tau_m\.\w+) requires ([\d.]+) N m, its limit is ([\d.]+)", message
     )
-    assert said.startswith(start) and asked
+    assert message.startswith(start) and asked
     for name, value, limit in asked:
         assert float(limit) == pytest.approx(lin.limits[name], rel=1e-3)
         assert float(value) > float(limit) > abs(lin.u0[lin.input_names.index(name)])
@@ -395,7 +397,7 @@ def test_displacements_that_ask_for_more_than_the_limits_are_warned_of(loops):
         ("servicer_7dof", {"stiffness": {"panel_left": 100.0, "panel_right": 100.0}}),
     ],
 )
-def test_bundled_inputs_fly_within_what_they_say_they_give(name, fields):
+def test_bundled_inputs_stay_within_their_limits(name, fields):
     pytest.importorskip("numba")
     robot = fflin.load(name, inputs=fflin.load_inputs(name), **fields)
     lin = fflin.linearize(robot)
@@ -418,7 +420,7 @@ def test_bundled_inputs_fly_within_what_they_say_they_give(name, fields):
 @pytest.mark.compiled
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("damping", [0.2, 5.0, 20.0])
-def test_damped_joints_come_back_as_soon_as_it_is_said(damping):
+def test_damped_joints_return_within_the_reported_time(damping):
     """Light joints are moved against their dampers, not against their inertia."""
     pytest.importorskip("numba")
     panels = dict.fromkeys(("panel_left", "panel_right"), 100.0)
@@ -582,7 +584,9 @@ def test_a_robot_that_is_held_in_gravity_comes_back_from_five_degrees(name):
         ("servicer_7dof", "q_m.joint_2", "joint_2"),
     ],
 )
-def test_a_robot_that_cannot_hold_its_weight_names_what_grows(name, mode, effort):
+def test_a_robot_that_cannot_hold_its_weight_names_the_growing_states(
+    name, mode, effort
+):
     robot = fflin.load(name, gravity=(0.0, 0.0, -9.81))
     lin = fflin.linearize(robot, u=fflin.equilibrium(robot).u)
     growth = np.linalg.eigvals(lin.A).real.max()
@@ -605,62 +609,65 @@ def test_largest_values_of_all_are_brysons_rule_and_of_some_are_on_its_scale(loo
         "qdot_m": 0.1,
     }
     efforts = {"tau_b": 100.0, "F_b": 100.0, "tau_m": 20.0}
-    found = fflin.lqr(lin, weights={"bryson": sizes | efforts})
-    Q, R = found.Q, found.R
+    result = fflin.lqr(lin, weights={"bryson": sizes | efforts})
+    Q, R = result.Q, result.R
     assert pytest.approx(fflin.bryson(lin, sizes), rel=1e-12) == Q.diagonal()
     assert pytest.approx(fflin.bryson(lin, efforts), rel=1e-12) == R.diagonal()
     assert np.count_nonzero(Q) == len(Q)
     # What the rule displaces the base by leaves the rule's own weight on it, on average.
-    own = np.sin(np.radians(15.0))
-    found = fflin.lqr(lin, weights={"bryson": {"q_b": own}})
-    R, rule = found.R, found.weights
+    values = np.sin(np.radians(15.0))
+    result = fflin.lqr(lin, weights={"bryson": {"q_b": values}})
+    R, rule = result.R, result.weights
     scale = R[0, 0] / gain.R[0, 0]
     assert scale * np.exp(np.log(gain.Q.diagonal()[:3]).mean()) == pytest.approx(
-        own**-2, rel=1e-9
+        values**-2, rel=1e-9
     )
     assert R == pytest.approx(scale * gain.R, rel=1e-12) and rule.endswith(
         "for this rule alone)"
     )
     # The tighter one is held, the more of every input it takes.
     norms = []
-    for size in (own, 0.1 * own, 0.01 * own):
-        found = fflin.lqr(lin, weights={"bryson": {"q_b": size}})
-        norms.append(np.linalg.norm(found.K[:, :3]))
+    for size in (values, 0.1 * values, 0.01 * values):
+        result = fflin.lqr(lin, weights={"bryson": {"q_b": size}})
+        norms.append(np.linalg.norm(result.K[:, :3]))
     assert norms[0] < norms[1] < norms[2]
 
 
 def test_a_given_weight_replaces_the_weight_of_the_rule(loops):
     _, lin, gain = loops("ets_vii")
-    own = {"q": {"q_b.x": 2.0 * gain.Q[0, 0]}}
-    found = fflin.lqr(lin, weights=own)
-    assert found.Q[0, 0] == 2.0 * gain.Q[0, 0] and (gain.R == found.R).all()
-    assert found.weights.startswith("q_b.x as given; all other weights: from")
+    values = {"q": {"q_b.x": 2.0 * gain.Q[0, 0]}}
+    result = fflin.lqr(lin, weights=values)
+    assert result.Q[0, 0] == 2.0 * gain.Q[0, 0] and (gain.R == result.R).all()
+    assert result.weights.startswith("q_b.x as given; all other weights: from")
     # As the robot's own weights, over which given ones take precedence, and which a rule replaces.
     robot = fflin.load("ets_vii").replace(
         weights={"q": {"q_b": 7.0}, "r": {"tau_b": 3.0}}
     )
     model = fflin.linearize(robot)
-    both = fflin.lqr(model, weights=own)
+    both = fflin.lqr(model, weights=values)
     assert (
-        both.Q[0, 0] == own["q"]["q_b.x"]
+        both.Q[0, 0] == values["q"]["q_b.x"]
         and both.Q[1, 1] == 7.0
         and both.R[0, 0] == 3.0
     )
-    alone = fflin.lqr(model, weights={"rule": "identity"} | own)
-    assert alone.Q.diagonal().tolist() == [own["q"]["q_b.x"], *[1.0] * (len(lin.A) - 1)]
-    for wrong, said in (
+    alone = fflin.lqr(model, weights={"rule": "identity"} | values)
+    assert alone.Q.diagonal().tolist() == [
+        values["q"]["q_b.x"],
+        *[1.0] * (len(lin.A) - 1),
+    ]
+    for wrong, message in (
         ({"Q": 1.0}, "'Q'"),
         ({"q": 1.0}, "q "),
         ({"rule": "none"}, "'none'"),
     ):
-        with pytest.raises(fflin.FflinError, match=said):
+        with pytest.raises(fflin.FflinError, match=message):
             fflin.lqr(lin, weights=wrong)
 
 
 def test_a_gain_says_which_thrusters_it_lets_pull():
     robot = fflin.load("cubesat", inputs=fflin.load_inputs("cubesat"))
     gain = fflin.lqr(fflin.linearize(robot))
-    thrusters = [each.name for each in robot.inputs if isinstance(each, fflin.Thruster)]
+    thrusters = [item.name for item in robot.inputs if isinstance(item, fflin.Thruster)]
     assert f"negative thrust ({', '.join(thrusters[:6])}" in cautions(gain)[-1]
     assert "warning: the gain commands negative thrust" in str(gain)
     assert not cautions(fflin.lqr(fflin.linearize(fflin.load("cubesat"))))

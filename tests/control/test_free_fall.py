@@ -35,20 +35,20 @@ def flights(inputs, duration=0.4, outputs=STATE):
     q, v = motion.q.copy(), motion.v.copy()
     q[:, :3] += t[:, None] * velocity + 0.5 * t[:, None] ** 2 * GRAVITY
     rotations = [pin.XYZQUATToSE3(row[:7]).rotation for row in motion.q]
-    own = np.array([R.T @ row for R, row in zip(rotations, fall, strict=True)])
-    v[:, :3] += own
+    local = np.array([R.T @ row for R, row in zip(rotations, fall, strict=True)])
+    v[:, :3] += local
     falling = robot.replace(gravity=GRAVITY)
     u = np.zeros((len(t), motion.u.shape[1]))
     along = fflin.linearize_trajectory(falling, t, q, v, u, strict=True)
     floating = fflin.linearize_trajectory(robot, t, motion.q, motion.v, u, strict=True)
-    return along, floating, own
+    return along, floating, local
 
 
-def to_floating(own):
+def to_floating(default):
     """Map from the errors of the fall to the errors in falling axes: dv' = dv - 2 V x e."""
     nx = 12 + 2 * 2
-    T = np.tile(np.eye(nx), (len(own), 1, 1))
-    T[:, 11:14, :3] = -2.0 * skew(own)
+    T = np.tile(np.eye(nx), (len(default), 1, 1))
+    T[:, 11:14, :3] = -2.0 * skew(default)
     return T
 
 
@@ -57,12 +57,12 @@ def to_floating(own):
 )
 @pytest.mark.parametrize("inputs", [INPUTS, MOTORS], ids=["thrusters", "motors"])
 def test_gains_in_free_fall_are_the_gains_without_gravity(inputs, sample):
-    along, floating, own = flights(inputs)
+    along, floating, local = flights(inputs)
     schedule, expected = (
-        fflin.tvlqr(each, sample=sample) for each in (along, floating)
+        fflin.tvlqr(item, sample=sample) for item in (along, floating)
     )
     assert schedule.weights == expected.weights
-    T = to_floating(own)
+    T = to_floating(local)
     for k, t in enumerate(along.t[:-1:2]):
         K = expected.gain(t) @ T[2 * k]
         # Both schedules interpolate P within 1e-7.
@@ -98,7 +98,7 @@ def test_a_filter_starts_in_free_fall():
     """The covariance in errors of the fall is the one in falling axes, mapped back."""
     # These outputs are the same in falling axes.
     outputs = [fflin.BasePose(), fflin.JointPositions()]
-    along, floating, own = flights(MOTORS, outputs=outputs)
+    along, floating, local = flights(MOTORS, outputs=outputs)
     noise = {
         "q_b": 0.0,
         "r_b": 0.0,
@@ -108,14 +108,14 @@ def test_a_filter_starts_in_free_fall():
         "qdot_m": 1e-4,
     }
     filtered, expected = (
-        fflin.tvkalman(each, noise, 1e-6, sample=0.04) for each in (along, floating)
+        fflin.tvkalman(item, noise, 1e-6, sample=0.04) for item in (along, floating)
     )
-    back = np.linalg.inv(to_floating(own)[0])
+    back = np.linalg.inv(to_floating(local)[0])
     P = back @ expected.P[0] @ back.T
     assert filtered.P[0] == pytest.approx(P, abs=1e-7 * np.abs(P).max())
 
 
-def test_a_robot_that_neither_rests_nor_falls_says_what_to_give():
+def test_a_robot_that_neither_rests_nor_falls_names_the_missing_argument():
     robot = fflin.load("astrobee_arm", inputs=INPUTS, gravity=GRAVITY)
     u = fflin.effort(robot, {"thruster_1": 2.0})
     motion = fflin.simulate(robot, lambda t, q, v: u, duration=0.2, dt=0.01)

@@ -92,8 +92,8 @@ def test_the_area_rule_is_the_limit_of_small_loops():
     for e in (0.04, 0.02):
         circle = centre + e * (np.cos(phase) * a + np.sin(phase) * b)
         # The base turns by the joints on the way to the circle and back, in other axes.
-        there = np.linspace(centre, circle[0], 101)
-        loop = np.vstack((there, circle, there[::-1]))
+        path = np.linspace(centre, circle[0], 101)
+        loop = np.vstack((path, circle, path[::-1]))
         errors.append(np.abs(rotation_vector(base, loop) / e**2 - rule).max())
     assert errors[0] < 0.02 * np.abs(rule).max()
     assert errors[1] < 0.6 * errors[0]
@@ -133,10 +133,10 @@ def test_the_floating_base_moves_as_in_a_simulation():
         t = run.t[::every]
         base = FloatingBase(state, (q0, v0))
         R = base.rotations(t, joints[::every])
-        found = base.motion(t, joints[::every], rates[::every], R)
-        pairs = zip(q[::every], found[0], strict=True)
+        result = base.motion(t, joints[::every], rates[::every], R)
+        pairs = zip(q[::every], result[0], strict=True)
         gaps = [pin.difference(robot.model, *pair) for pair in pairs]
-        errors.append(max(np.abs(gaps).max(), np.abs(v[::every] - found[1]).max()))
+        errors.append(max(np.abs(gaps).max(), np.abs(v[::every] - result[1]).max()))
     assert errors[0] < 1e-2 and errors[1] < 0.3 * errors[0]
 
 
@@ -165,7 +165,7 @@ def test_loops_of_a_turn_and_a_slide_reach_an_attitude_within_limits(polar, degr
     assert joints[-1] == pytest.approx(loops.path[0], abs=1e-12)
 
 
-def test_more_circles_reach_what_one_circle_within_the_limits_cannot(polar):
+def test_more_circles_reach_an_attitude_that_one_circle_cannot(polar):
     start = fflin.configuration(polar, {"slide": 0.6})
     target = pin.exp3(np.deg2rad(20.0) * np.array([0.0, 0.0, 1.0]))
     limits = np.array([[-0.5, 0.3], [0.5, 0.9]])

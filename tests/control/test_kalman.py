@@ -27,36 +27,36 @@ def test_filter_solves_its_riccati_equation(lin, dt):
         np.diag(np.linspace(1, 2, 24)) * 1e-3,
         np.diag(np.linspace(1, 3, len(lin.C))) * 1e-4,
     )
-    found = fflin.kalman(model, W, V)
-    assert found.residual < 1e-14 and found.margin > 0.0
-    A, C, P = model.A, model.C, found.P
+    result = fflin.kalman(model, W, V)
+    assert result.residual < 1e-14 and result.margin > 0.0
+    A, C, P = model.A, model.C, result.P
     if dt:
         innovation = C @ P @ C.T + V
         step = A @ (P - P @ C.T @ np.linalg.solve(innovation, C @ P)) @ A.T + W
         assert step == pytest.approx(P, rel=1e-9, abs=1e-12 * P.max())
-        assert found.L == pytest.approx(A @ found.L_update, abs=1e-12)
+        assert result.L == pytest.approx(A @ result.L_update, abs=1e-12)
         expected, _, _ = control.dlqe(A, np.eye(24), C, W, V)
     else:
-        assert found.L == pytest.approx(np.linalg.solve(V, C @ P).T)
+        assert result.L == pytest.approx(np.linalg.solve(V, C @ P).T)
         expected, _, _ = control.lqe(A, np.eye(24), C, W, V)
-    assert found.L == pytest.approx(
+    assert result.L == pytest.approx(
         expected, rel=1e-6, abs=1e-8 * np.abs(expected).max()
     )
-    poles = np.linalg.eigvals(A - found.L @ C)
+    poles = np.linalg.eigvals(A - result.L @ C)
     edge = 1.0 - np.abs(poles).max() if dt else -poles.real.max()
-    assert found.margin == pytest.approx(edge)
+    assert result.margin == pytest.approx(edge)
 
 
 def test_P_is_the_covariance_of_the_error(lin):
     """In the steady state the error e obeys de = (A - L C) e + w - L n."""
-    found = fflin.kalman(lin, {"tau_b": 1.0, "F_b": 4.0, "tau_m": 0.1}, 1e-3, G=lin.B)
-    assert found.W == pytest.approx(
+    result = fflin.kalman(lin, {"tau_b": 1.0, "F_b": 4.0, "tau_m": 0.1}, 1e-3, G=lin.B)
+    assert result.W == pytest.approx(
         lin.B @ np.diag([1] * 3 + [4] * 3 + [0.1] * 6) @ lin.B.T
     )
-    F = lin.A - found.L @ lin.C
-    noise = found.W + found.L @ found.V @ found.L.T
+    F = lin.A - result.L @ lin.C
+    noise = result.W + result.L @ result.V @ result.L.T
     covariance = sl.solve_continuous_lyapunov(F, -noise)
-    assert found.P == pytest.approx(covariance, rel=1e-6, abs=1e-9 * covariance.max())
+    assert result.P == pytest.approx(covariance, rel=1e-6, abs=1e-9 * covariance.max())
 
 
 @pytest.mark.parametrize("dt", [0.0, 0.1])
@@ -93,7 +93,7 @@ def test_a_direct_term_is_carried():
         assert np.abs(poles - pole).min() < 1e-6 * abs(pole)
 
 
-def test_what_is_not_seen_or_not_disturbed_is_named(lin):
+def test_undetectable_and_undisturbed_states_are_named(lin):
     robot = fflin.load("ets_vii")
     joints = fflin.linearize(robot.replace(outputs=[fflin.JointPositions()]))
     for model in (joints, joints.discretize(0.1)):

@@ -39,40 +39,53 @@ def matrices(lin, nz=4):
 
 
 def apart(policy, A, B, C, D, dt=0.0):
-    own = policy.system
-    pairs = zip(own[:4], (A, B, C, D), strict=True)
-    assert own.dt == dt
+    matrices_of_law = policy.system
+    pairs = zip(matrices_of_law[:4], (A, B, C, D), strict=True)
+    assert matrices_of_law.dt == dt
     return max(np.abs(a - b).max(initial=0.0) for a, b in pairs)
 
 
 def foreign(lin, dt):
     """The same system as every tool has it."""
-    own = matrices(lin)
-    record = dict(zip("ABCD", own, strict=True))
+    matrices_of_law = matrices(lin)
+    record = dict(zip("ABCD", matrices_of_law, strict=True))
     names = {"inputs": [n.replace(".", "_") for n in lin.output_names]}
     names["outputs"] = [n.replace(".", "_") for n in lin.input_names]
-    scipys = scipy.signal.dlti(*own, dt=dt) if dt else scipy.signal.lti(*own)
-    yield own, (*own, dt)
-    yield own, control.ss(*own, dt)
-    yield own, control.ss(*own, dt, **names)
-    yield own, scipys
-    yield own, record | {"Ts": dt}
-    yield own, record | {"dt": dt, "input_names": [*lin.output_names]}
-    yield own, {"K": record | {"Ts": dt}}
+    scipys = (
+        scipy.signal.dlti(*matrices_of_law, dt=dt)
+        if dt
+        else scipy.signal.lti(*matrices_of_law)
+    )
+    yield matrices_of_law, (*matrices_of_law, dt)
+    yield matrices_of_law, control.ss(*matrices_of_law, dt)
+    yield matrices_of_law, control.ss(*matrices_of_law, dt, **names)
+    yield matrices_of_law, scipys
+    yield matrices_of_law, record | {"Ts": dt}
+    yield matrices_of_law, record | {"dt": dt, "input_names": [*lin.output_names]}
+    yield matrices_of_law, {"K": record | {"Ts": dt}}
 
 
 @pytest.mark.parametrize("dt", [0.0, 0.1])
 def test_every_tools_system_is_read_as_it_is(lin, tmp_path, dt):
-    for own, given in foreign(lin, dt):
+    for matrices_of_law, given in foreign(lin, dt):
         if not isinstance(given, dict):
-            assert apart(fflin.LinearController(given, lin), *own, dt) == 0.0
+            assert (
+                apart(fflin.LinearController(given, lin), *matrices_of_law, dt) == 0.0
+            )
             continue
         savemat(tmp_path / "K.mat", given)
-        assert apart(fflin.LinearController(tmp_path / "K.mat", lin), *own, dt) == 0.0
+        assert (
+            apart(fflin.LinearController(tmp_path / "K.mat", lin), *matrices_of_law, dt)
+            == 0.0
+        )
         if "K" not in given:
             np.savez(tmp_path / "K.npz", **given)
             assert (
-                apart(fflin.LinearController(str(tmp_path / "K.npz"), lin), *own, dt)
+                apart(
+                    fflin.LinearController(str(tmp_path / "K.npz"), lin),
+                    *matrices_of_law,
+                    dt,
+                )
                 == 0.0
             )
 
@@ -82,8 +95,8 @@ def test_names_put_signals_where_they_belong(lin, tmp_path):
     A, B, C, D = matrices(lin)
     part = (A, B[:, columns], C[rows], D[np.ix_(rows, columns)])
     inputs, outputs = (
-        [of[k] for k in places]
-        for of, places in ((lin.output_names, columns), (lin.input_names, rows))
+        [source[k] for k in places]
+        for source, places in ((lin.output_names, columns), (lin.input_names, rows))
     )
     expected = [A, np.zeros_like(B), np.zeros_like(C), np.zeros_like(D)]
     expected[1][:, columns], expected[2][rows] = part[1], part[2]
@@ -121,10 +134,14 @@ def test_transfer_functions_are_realised():
         (notch, 1j * w),
         (control.c2d(notch, 0.1, "tustin"), np.exp(0.1j * w)),
     ):
-        own = fflin.LinearController(given, lin).system
-        found = own.C @ np.linalg.solve(z * np.eye(2) - own.A, own.B) + own.D
-        assert found[0, 3] == pytest.approx(given(z), rel=1e-10)
-        assert not found[:, [0, 1, 2, 4, 5]].any()
+        matrices_of_law = fflin.LinearController(given, lin).system
+        result = (
+            matrices_of_law.C
+            @ np.linalg.solve(z * np.eye(2) - matrices_of_law.A, matrices_of_law.B)
+            + matrices_of_law.D
+        )
+        assert result[0, 3] == pytest.approx(given(z), rel=1e-10)
+        assert not result[:, [0, 1, 2, 4, 5]].any()
 
 
 def test_a_gain_comes_back_as_the_state_feedback_it_was():
@@ -141,11 +158,11 @@ def test_a_gain_comes_back_as_the_state_feedback_it_was():
         (*nothing, -gain.K, True),
         (*nothing, -gain.K, 0),
     ):
-        found = fflin.simulate(
+        result = fflin.simulate(
             robot, fflin.LinearController(system, lin), x0=x0, duration=2.0
         )
-        assert np.abs(found.x - expected.x).max() < 1e-13
-        assert np.abs(found.prediction - expected.prediction).max() < 1e-12
+        assert np.abs(result.x - expected.x).max() < 1e-13
+        assert np.abs(result.prediction - expected.prediction).max() < 1e-12
     turned = fflin.LinearController(gain.K, lin, sign=-1)
     assert np.array_equal(turned.system.D, -gain.K)
 
@@ -153,14 +170,14 @@ def test_a_gain_comes_back_as_the_state_feedback_it_was():
 def test_a_compensator_comes_back_as_the_output_feedback_it_was(arm, tmp_path):
     robot, lin, *_ = arm
     sampled = lin.discretize(0.05)
-    by = fflin.lqg(fflin.lqr(sampled), fflin.kalman(sampled, 1e-4, 1e-4))
-    by.save(tmp_path / "K.mat")
+    controller = fflin.lqg(fflin.lqr(sampled), fflin.kalman(sampled, 1e-4, 1e-4))
+    controller.save(tmp_path / "K.mat")
     run = {"x0": lin.x0 + 0.02, "duration": 2.0, "dt": 0.01}
-    expected = fflin.simulate(robot, fflin.OutputFeedback(sampled, by), **run)
-    for system in (by, by.to_control(), tmp_path / "K.mat"):
+    expected = fflin.simulate(robot, fflin.OutputFeedback(sampled, controller), **run)
+    for system in (controller, controller.to_control(), tmp_path / "K.mat"):
         for model in (lin, sampled):
-            found = fflin.simulate(robot, fflin.LinearController(system, model), **run)
-            assert np.abs(found.x - expected.x).max() < 1e-13
+            result = fflin.simulate(robot, fflin.LinearController(system, model), **run)
+            assert np.abs(result.x - expected.x).max() < 1e-13
 
 
 @pytest.mark.parametrize("dt", [0.0, 0.05])
@@ -168,14 +185,16 @@ def test_estimator_and_gain_make_the_compensator(arm, dt):
     _, lin, *_ = arm
     model = lin.discretize(dt) if dt else lin
     gain, seen = fflin.lqr(model), fflin.kalman(model, 1e-3, 1e-3)
-    by, filtered = fflin.lqg(gain, seen), seen.to_control()
+    controller, filtered = fflin.lqg(gain, seen), seen.to_control()
     nu = len(lin.u0)
     K = gain.to_control()
     assert [*filtered.state_labels] == [*filtered.output_labels] == [*K.input_labels]
     assert filtered.A + filtered.B[:, :nu] @ K.D @ filtered.C == pytest.approx(
-        by.A, abs=1e-12
+        controller.A, abs=1e-12
     )
-    assert np.array_equal(filtered.B[:, nu:], by.B) and np.array_equal(K.D, by.C)
+    assert np.array_equal(filtered.B[:, nu:], controller.B) and np.array_equal(
+        K.D, controller.C
+    )
 
 
 def test_the_loop_of_a_free_body_is_the_linear_one_to_order_four():
@@ -226,21 +245,21 @@ def test_the_fastest_pole_of_a_controller_chooses_the_step(arm):
         fflin.simulate(robot, fflin.LinearController(fast, lin), duration=0.1, dt=0.05)
 
 
-def test_poles_that_grow_are_told(arm):
+def test_poles_that_grow_are_reported(arm):
     robot, lin, gain, _ = arm
     state = fflin.linearize(robot.replace(outputs=[fflin.FullState()]))
     run = {"duration": 0.1}
     stable = fflin.LinearController(gain.to_control(), state)
-    own = robot.replace(outputs=[fflin.FullState()])
-    assert not fflin.simulate(own, stable, **run).notes
+    matrices_of_law = robot.replace(outputs=[fflin.FullState()])
+    assert not fflin.simulate(matrices_of_law, stable, **run).notes
     wrong = fflin.LinearController(gain.to_control(), state, sign=-1)
-    (note,) = fflin.simulate(own, wrong, **run).notes
+    (note,) = fflin.simulate(matrices_of_law, wrong, **run).notes
     assert says(note, "unstable") and "1/s" in note
     assert says(note, "sign=-1 (--negative-feedback)")
     drifting = fflin.LinearController(
         np.zeros((len(lin.u0), len(state.y0))) + 1e-3, state
     )
-    (note,) = fflin.simulate(own, drifting, **run).notes
+    (note,) = fflin.simulate(matrices_of_law, drifting, **run).notes
     assert "unstable" in note
     zero = np.zeros((1, len(lin.y0))), np.zeros((len(lin.u0), 1)), 0.0, 0.1
     unstable = fflin.LinearController((1.25 * np.eye(1), *zero), lin)
@@ -309,7 +328,7 @@ def test_sizes_and_figures_that_do_not_fit_are_refused(lin, words, change):
         fflin.LinearController(tuple(parts.values()), lin)
 
 
-def test_what_is_no_controller_of_the_model_is_refused(lin, arm):
+def test_a_controller_of_another_model_is_refused(lin, arm):
     robot, _, gain, seen = arm
     A, B, C, D = matrices(lin)
     improper, tall = (
@@ -374,7 +393,7 @@ def test_files_that_hold_none_are_refused(lin, tmp_path):
         fflin.LinearController(tmp_path / "K.csv", lin)
 
 
-def test_outputs_are_those_of_the_model_everywhere():
+def test_outputs_match_the_model_everywhere():
     kinds = (
         *SEEN,
         fflin.FramePose("hand"),

@@ -100,7 +100,7 @@ def test_a_mode_that_the_weights_leave_out_is_not_held_by_rounding(lin, dt, seed
         fflin.lqr(lin.discretize(dt) if dt else lin, Q, 1.0)
 
 
-def test_bad_weights_are_named(lin):
+def test_invalid_weights_are_named(lin):
     indefinite = np.eye(24)
     indefinite[3, 7] = indefinite[7, 3] = 2.0
     for words, arguments in {
@@ -157,7 +157,7 @@ def test_weights_of_any_size_give_a_gain_or_one_clear_line(lin, dt):
         fflin.lqr(model, 1e308 * np.eye(nx), np.eye(nu))
 
 
-def test_what_is_no_fixed_point_is_refused_with_its_rows():
+def test_an_operating_point_that_is_not_a_fixed_point_is_refused_with_its_rows():
     robot = fflin.load("ets_vii")
     v = fflin.velocity(robot, {"omega_b.z": 0.1, "joint_1": 0.2})
     for point in (
@@ -176,7 +176,7 @@ def test_what_is_no_fixed_point_is_refused_with_its_rows():
 
 @pytest.mark.parametrize("name", [name for name in BUNDLED if name != "cubesat"])
 @pytest.mark.parametrize("dt", [0.0, 0.2])
-def test_what_the_inputs_cannot_hold_is_named(robots, name, dt):
+def test_states_that_inputs_cannot_hold_are_named(robots, name, dt):
     robot = robots[name]
     q = random_point(robot, np.random.default_rng(1))[0]
 
@@ -251,17 +251,19 @@ def test_modes_that_decay_by_themselves_are_not_blamed(dt):
     missed = fflin.controllability(torques).uncontrollable
     assert any("q_m.h1" in name for name in missed)
     assert fflin.lqr(torques, 1.0, 1.0).margin > 0.0
-    with pytest.raises(fflin.StabilizabilityError, match="angular momentum") as told:
+    with pytest.raises(
+        fflin.StabilizabilityError, match="angular momentum"
+    ) as messages:
         fflin.lqr(about(fflin.BaseForce()), 1.0, 1.0)
-    assert "q_m" not in str(told.value) and "spring" not in str(told.value)
+    assert "q_m" not in str(messages.value) and "spring" not in str(messages.value)
     pushed = about(fflin.BaseTorque(), fflin.BaseForce())
     unseen = fflin.observability(pushed).unobservable
     assert any("q_m.h1" in name for name in unseen)
     with pytest.raises(
         fflin.DetectabilityError, match=r"observe q_b\.x, .* r_b\.x"
-    ) as told:
+    ) as messages:
         fflin.kalman(pushed, 1.0, 1.0)
-    assert "q_m" not in str(told.value)
+    assert "q_m" not in str(messages.value)
     # Without dampers the modes last, and they are blamed.
     robot = panels(damping=0.0)
     with pytest.raises(fflin.StabilizabilityError, match=r"vibration.*h1"):
@@ -284,9 +286,9 @@ def test_a_spring_is_advised_only_where_it_changes_a_momentum():
     hub = fflin.load("cubesat", inputs=[fflin.BaseForce()])
     with pytest.raises(
         fflin.StabilizabilityError, match=r"angular momentum.*--reduce"
-    ) as told:
+    ) as messages:
         fflin.lqr(fflin.linearize(hub))
-    assert "spring" not in str(told.value)
+    assert "spring" not in str(messages.value)
 
 
 def test_a_largest_q_b_beyond_a_quaternion_is_refused(lin):
@@ -353,9 +355,9 @@ def disk_on_a_grid(gain):
 
 def test_margins_are_the_least_over_all_frequencies(lin, gain):
     sampled = fflin.lqr(lin.discretize(0.3), gain.Q, gain.R)
-    for each in (gain, sampled):
-        grid = disk_on_a_grid(each)
-        assert grid * 0.998 < each.margins.disk < grid * (1.0 + 1e-4)
+    for item in (gain, sampled):
+        grid = disk_on_a_grid(item)
+        assert grid * 0.998 < item.margins.disk < grid * (1.0 + 1e-4)
     # A continuous regulator of diagonal R bears half the gain, and 60 degrees.
     assert gain.margins.disk >= 1.0 and gain.margins.phase >= 53.0
     # Any gains within the margin, on all inputs at once, leave the loop stable.
@@ -428,8 +430,8 @@ def test_sampled_cost_is_the_integral_under_held_inputs(lin):
     cross = B.T @ Q @ A @ B
     Rd = R * h + B.T @ Q @ B * h**3 / 3 + (cross + cross.T) * h**4 / 8
     Rd += B.T @ AQA @ B * h**5 / 20
-    for found, expected in zip(cost, (Qd, Rd, Nd), strict=True):
-        assert found == pytest.approx(expected, rel=1e-12, abs=1e-13)
+    for result, expected in zip(cost, (Qd, Rd, Nd), strict=True):
+        assert result == pytest.approx(expected, rel=1e-12, abs=1e-13)
     # The cost of the sampled loop is the continuous cost of its motion.
     gain = fflin.lqr(lin.discretize(h), *cost)
     assert gain.residual < 1e-14
@@ -485,7 +487,7 @@ def test_files_keep_every_bit(gain, tmp_path, ending):
             fflin.Gain.load(tmp_path / f"{name}{ending}")
 
 
-def test_files_refuse_what_is_not_finite_and_unknown_endings(gain, tmp_path):
+def test_files_refuse_nonfinite_values_and_unknown_endings(gain, tmp_path):
     with pytest.raises(fflin.FileError, match=r"'\.csv'"):
         gain.save(tmp_path / "gain.csv")
     broken = replace(gain, K=np.full_like(gain.K, np.nan))
@@ -497,12 +499,12 @@ def test_files_refuse_what_is_not_finite_and_unknown_endings(gain, tmp_path):
 def test_a_gain_prints_in_80_columns(gain, lin):
     sampled = fflin.lqr(lin.discretize(0.1), gain.Q, gain.R)
     small = fflin.lqr(fflin.linearize(fflin.load("planar_detumble")), 1, 1)
-    for each in (gain, sampled, small):
-        text = str(each)
+    for item in (gain, sampled, small):
+        text = str(item)
         assert max(map(len, text.splitlines())) <= 80
-        rates = np.log(each.poles) / each.dt if each.dt else each.poles
+        rates = np.log(item.poles) / item.dt if item.dt else item.poles
         assert (
-            f"{each.residual:.1e}" in text
+            f"{item.residual:.1e}" in text
             and f"decay {-rates.real.max():.3g} 1/s" in text
         )
     assert "writes every entry" in str(gain) and "qdot_m.joint_3" in str(small)

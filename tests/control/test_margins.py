@@ -91,7 +91,7 @@ def test_a_loop_is_unstable_just_beyond_its_margins_and_no_sooner(lin):
     assert held
 
 
-def test_what_is_not_regulated_has_no_part_in_the_loops():
+def test_unregulated_states_do_not_affect_the_margins():
     robot = fflin.load("cubesat", inputs=fflin.load_inputs("cubesat"))
     lin = fflin.linearize(robot)
     gain = fflin.lqr(lin)
@@ -135,7 +135,7 @@ def swept(gain):
     most = np.pi / gain.dt if gain.dt else 1e3
     grid = np.geomspace(1e-6 * most, most, 600)
     sizes = np.linalg.norm(balance(gain, grid), 2, axis=(1, 2))
-    found = [(sizes[0], grid[0]), (sizes[-1], grid[-1])]
+    result = [(sizes[0], grid[0]), (sizes[-1], grid[-1])]
     inner = 1 + np.flatnonzero((sizes[1:-1] >= sizes[:-2]) & (sizes[1:-1] >= sizes[2:]))
     for at in sorted(inner, key=lambda at: -sizes[at])[:3]:
         peak = minimize_scalar(
@@ -143,8 +143,8 @@ def swept(gain):
             bounds=grid[[at - 1, at + 1]],
             method="bounded",
         )
-        found.append((-peak.fun, peak.x))
-    return max(found)
+        result.append((-peak.fun, peak.x))
+    return max(result)
 
 
 def beyond(gain, factors):

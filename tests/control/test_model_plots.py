@@ -22,7 +22,7 @@ pytest.importorskip("matplotlib")
         pytest.param("servicer_7dof", "servicer_7dof", marks=pytest.mark.exhaustive),
     ],
 )
-def test_the_pattern_is_that_of_a_and_b_by_groups(name, inputs):
+def test_the_pattern_matches_a_and_b_by_groups(name, inputs):
     robot = fflin.load(name)
     lin = fflin.linearize(
         robot.replace(inputs=fflin.load_inputs(inputs)) if inputs else robot
@@ -77,12 +77,12 @@ def bars(figure):
 @pytest.mark.parametrize("name", mostly(["servicer_7dof", "talos"], "servicer_7dof"))
 def test_bars_are_the_shapes_of_the_modes(name):
     robot = fflin.load(name, stiffness=20.0, damping=0.3)
-    found = fflin.modes(fflin.linearize(robot))
-    figure = fflin.plot_modes(found)
+    result = fflin.modes(fflin.linearize(robot))
+    figure = fflin.plot_modes(result)
     assert_legible(figure)
     filled, outlined = bars(figure)
-    half = len(found.state_names) // 2
-    shapes = np.array([mode.shape[:half] for mode in found.modes])
+    half = len(result.state_names) // 2
+    shapes = np.array([mode.shape[:half] for mode in result.modes])
     drawn = np.array(
         [[filled[line, i] for i in range(half)] for line in range(len(shapes))]
     )
@@ -93,7 +93,7 @@ def test_bars_are_the_shapes_of_the_modes(name):
     for place, height in outlined.items():
         assert abs(height) == pytest.approx(0.45 * abs(shapes[place]))
     labels = [label.get_text() for label in figure.axes[0].get_yticklabels()]
-    for label, mode in zip(labels, found.modes, strict=True):
+    for label, mode in zip(labels, result.modes, strict=True):
         if mode.oscillates:
             hertz = mode.frequency / (2.0 * math.pi)
             damping = f"damping {mode.damping_ratio:.2g}"
@@ -106,14 +106,14 @@ def test_units_of_a_shape_have_their_colours():
     lin = fflin.linearize(fflin.load("tiago_no_hand", stiffness=50.0))
     figure = fflin.plot_modes(fflin.modes(lin))
     legend = figure.legends[0]
-    of = {
+    settings = {
         text.get_text(): patch.get_facecolor()
         for text, patch in zip(legend.get_texts(), legend.get_patches(), strict=True)
     }
-    assert set(of) == {"[1]", "[m]", "[rad]"} and len(set(of.values())) == 3
+    assert set(settings) == {"[1]", "[m]", "[rad]"} and len(set(settings.values())) == 3
     first = figure.axes[0].patches[: len(lin.state_units) // 2]
     for bar, unit in zip(first, lin.state_units, strict=False):
-        assert bar.get_facecolor() == of[f"[{unit}]"]
+        assert bar.get_facecolor() == settings[f"[{unit}]"]
 
 
 def test_modes_that_grow_and_robots_without_modes():
@@ -126,22 +126,22 @@ def test_modes_that_grow_and_robots_without_modes():
     assert sum("grows in" in label for label in labels) == len(growing) > 0
     floating = fflin.plot_modes(fflin.modes(fflin.linearize(fflin.load("canadarm2"))))
     assert_legible(floating)
-    ((said, _),) = texts(floating)
-    assert says(said, "canadarm2", "0 vibrations", "0 real", "13 rigid-body")
+    ((message, _),) = texts(floating)
+    assert says(message, "canadarm2", "0 vibrations", "0 real", "13 rigid-body")
 
 
 @pytest.mark.parametrize("wrong", [False, True])
-def test_errors_of_a_check_stand_beside_what_they_must_not_exceed(wrong):
+def test_errors_of_a_check_are_drawn_with_their_tolerances(wrong):
     robot = fflin.load("servicer_7dof")
     lin = fflin.linearize(robot)
-    found = fflin.check(robot, replace(lin, B=1.001 * lin.B) if wrong else lin)
-    assert found.ok is not wrong
-    figure = fflin.plot_check(found)
+    result = fflin.check(robot, replace(lin, B=1.001 * lin.B) if wrong else lin)
+    assert result.ok is not wrong
+    figure = fflin.plot_check(result)
     assert_legible(figure)
     axes = figure.axes[0]
     names = [label.get_text() for label in axes.get_yticklabels()]
     lines = {(line.get_label(), line.get_marker()): line for line in axes.get_lines()}
-    shown = [row for row in found.rows if row.error]
+    shown = [row for row in result.rows if row.error]
     for row in shown:
         block = row.test in ("ABA derivatives", "differences")
         place = names.index(row.block if block else f"{row.test}: {row.block}")
@@ -155,8 +155,8 @@ def test_errors_of_a_check_stand_beside_what_they_must_not_exceed(wrong):
         )
         assert bounds.get_xdata()[at] == [row.tolerance]
     failed = next(line for (_, marker), line in lines.items() if marker == "x")
-    assert sorted(failed.get_xdata()) == sorted(row.error for row in found.failures)
-    exact = len(found.rows) - len(shown)
+    assert sorted(failed.get_xdata()) == sorted(row.error for row in result.failures)
+    exact = len(result.rows) - len(shown)
     title = axes.get_title(loc="left")
     assert f"{exact} " in title
     assert ("FAILED" if wrong else "OK") in title
@@ -172,12 +172,12 @@ def reach():
 
 
 @pytest.mark.compiled
-def test_validity_says_the_slope_that_is_drawn(reach):
+def test_validity_reports_the_slope_that_is_drawn(reach):
     figure = fflin.plot_validity(reach)
     assert_legible(figure)
     left, right = figure.axes
     curve = left.get_lines()[0]
-    x, y = (np.log(each) for each in (curve.get_xdata(), curve.get_ydata()))
+    x, y = (np.log(item) for item in (curve.get_xdata(), curve.get_ydata()))
     drawn = float(np.polyfit(x[:4], y[:4], 1)[0])
     assert drawn == pytest.approx(1.0, abs=0.1)
     assert curve.get_label() == f"relative error, ~ displacement^{drawn:.2f}"
@@ -201,17 +201,17 @@ def test_joints_that_all_turn_are_displaced_by_radians(reach, name, unit):
 
 
 @pytest.mark.compiled
-def test_validity_of_what_leaves_the_chart_can_be_drawn(tmp_path):
+def test_validity_of_runs_that_leave_the_chart_can_be_drawn(tmp_path):
     robot = fflin.load("cubesat")
     lin = fflin.linearize(robot)
     gain = fflin.acceleration_lqr(lin, 1.0, 1.0, 1.0)
-    found = fflin.validity(robot, lin, gain, attitude=170.0, samples=12)
-    figure = fflin.plot_validity(found, tmp_path / "validity.png")
+    result = fflin.validity(robot, lin, gain, attitude=170.0, samples=12)
+    figure = fflin.plot_validity(result, tmp_path / "validity.png")
     assert_legible(figure)
-    known = np.isfinite(found.prediction_error)
+    known = np.isfinite(result.prediction_error)
     curve = figure.axes[0].get_lines()[0]
     np.testing.assert_allclose(
-        curve.get_ydata()[known], 100.0 * found.prediction_error[known]
+        curve.get_ydata()[known], 100.0 * result.prediction_error[known]
     )
     assert (tmp_path / "validity.png").read_bytes().startswith(b"\x89PNG")
 
@@ -227,6 +227,6 @@ def test_validity_of_what_leaves_the_chart_can_be_drawn(tmp_path):
         ("plot_poles", "poles"),
     ],
 )
-def test_what_is_no_result_is_refused(function, expected):
+def test_an_invalid_result_is_refused(function, expected):
     with pytest.raises(fflin.InputError, match=expected):
         getattr(fflin, function)("stable" if function == "plot_poles" else 3)

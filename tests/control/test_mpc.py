@@ -25,7 +25,7 @@ WEAK = {"tau_b": 60.0, "F_b": 20.0, "tau_m": 1.0}
 
 
 def weights(lin):
-    return [fflin.bryson(lin, each) for each in WEIGHTS]
+    return [fflin.bryson(lin, weight) for weight in WEIGHTS]
 
 
 def turned(robot, degrees):
@@ -169,7 +169,7 @@ def test_within_limits_it_is_the_best(servicer, size):
     assert left <= 1e-6 * np.abs(scale * m.g).max()
 
 
-def test_what_cannot_be_kept_is_passed_by_the_least(servicer):
+def test_an_infeasible_limit_is_violated_by_the_least(servicer):
     """From a speed beyond its limit, with torques that take samples to slow it down."""
     _, lin = servicer
     limits = {
@@ -201,7 +201,7 @@ def test_what_cannot_be_kept_is_passed_by_the_least(servicer):
     assert says(ahead.notes[0], "each of 12 samples of 0.1 s: 1", "qdot_m.joint")
 
 
-def test_what_the_robot_passes_is_said_though_no_plan_does(servicer):
+def test_violations_of_the_robot_are_reported_even_if_no_plan_has_them(servicer):
     """Far from the point the inertia is another, and rates pass their limit."""
     robot, lin = servicer
     rates = np.flatnonzero([name.startswith("qdot_m") for name in lin.state_names])
@@ -233,15 +233,15 @@ def test_slews_that_break_the_regulator_are_held(servicer):
         "limits": limits,
     }
     flown, swung = (
-        fflin.simulate(robot, each, **options) for each in (policy, regulator)
+        fflin.simulate(robot, item, **options) for item in (policy, regulator)
     )
-    beyond = {each.name for each in swung.passed}
+    beyond = {item.name for item in swung.passed}
     assert (
         beyond > {"q_m.panel_left", "q_m.panel_right", "q_m.joint_3"}
         and not flown.passed
     )
     assert flown.attitude_error[-1] < 2.0 and swung.attitude_error[-1] > 10.0
-    joints = [np.abs(each.error[:, 6:15]).max(axis=0) for each in (flown, swung)]
+    joints = [np.abs(item.error[:, 6:15]).max(axis=0) for item in (flown, swung)]
     assert joints[0].max() < 0.5 and joints[1].max() > 3.0 and flown.saturated
     assert says(flown.notes[-1], "each of 20 samples of 0.25 s: 240")
     assert says(motion_report(flown), "each of 20 samples of 0.25 s: 240")
@@ -276,7 +276,7 @@ def test_along_a_trajectory_without_limits_it_is_the_schedule(planned):
         assert first == pytest.approx(-K @ e, abs=1e-9 * np.abs(K @ e).max())
     q0, v0 = policy.beside({"pitch": 3.0, "q_m": 0.05})
     options = {"q0": q0, "v0": v0, "duration": 24.0, "dt": 0.05}
-    one, other = (fflin.simulate(robot, each, **options) for each in (policy, schedule))
+    one, other = (fflin.simulate(robot, item, **options) for item in (policy, schedule))
     assert one.q == pytest.approx(other.q, abs=1e-9) and one.tracked
     assert one.prediction == pytest.approx(other.prediction, abs=1e-9)
 
@@ -299,10 +299,10 @@ def test_along_a_trajectory_it_keeps_within_limits(planned):
     q0, v0 = policy.beside({"pitch": 6.0, "q_m.joint_2": 0.01, "r_b.x": 0.1})
     options = {"q0": q0, "v0": v0, "duration": 30.0, "limits": limits, "dt": 0.05}
     flown, cut = (
-        fflin.simulate(robot, each, **options) for each in (policy, policy.schedule)
+        fflin.simulate(robot, item, **options) for item in (policy, policy.schedule)
     )
     assert not flown.passed and flown.saturated and flown.attitude_error[-1] < 0.2
-    assert "qdot_m.joint_2" in {each.name for each in cut.passed}
+    assert "qdot_m.joint_2" in {item.name for item in cut.passed}
     joint = robot.joint_names.index("joint_2")
     for t in (0.0, 3.0, 18.5):
         e = np.zeros(18)
@@ -379,7 +379,7 @@ def test_a_part_of_the_states_and_allocated_inputs_will_do():
     motion = fflin.simulate(arm, policy, q0=q0, duration=20.0, limits="urdf")
     assert np.abs(motion.error[-1, 6:15]).max() < 0.05 and not motion.passed
     cubesat = fflin.load("cubesat", inputs=fflin.load_inputs("cubesat"))
-    wheels = [each for each in cubesat.inputs if isinstance(each, fflin.ReactionWheel)]
+    wheels = [item for item in cubesat.inputs if isinstance(item, fflin.ReactionWheel)]
     bounded = [fflin.BaseTorque(max=0.05), fflin.BaseForce(max=0.05), *wheels]
     design = cubesat.replace(inputs=bounded)
     policy = fflin.Allocation(fflin.mpc(fflin.linearize(design), dt=0.5), design)
@@ -405,15 +405,15 @@ def test_campaigns_fly_it_and_the_compiled_loop_says_why_not(servicer):
         fflin.simulate(robot, policy, linear=True, **options)
 
 
-def test_a_plan_that_is_not_found_is_told_and_not_applied(servicer, monkeypatch):
+def test_a_plan_that_is_not_found_is_reported_and_not_applied(servicer, monkeypatch):
     robot, lin = servicer
     limits = ["urdf", WEAK]
     policy = fflin.mpc(lin, *weights(lin), dt=0.25, limits=limits)
     monkeypatch.setattr(predictive, "_MOST", 1)
-    with pytest.warns(fflin.FflinWarning, match="DAQP") as said:
+    with pytest.warns(fflin.FflinWarning, match="DAQP") as message:
         options = {"q0": turned(robot, 60.0), "duration": 1.0, "limits": limits}
         flown = fflin.simulate(robot, policy, **options)
-    assert len(said) == 1
+    assert len(message) == 1
     regulator = fflin.StateFeedback(policy.lin, policy.gain.K)
     cut = fflin.simulate(robot, regulator, **options)
     assert flown.u[0] == pytest.approx(cut.u[0], rel=1e-9, abs=1e-12)
@@ -421,7 +421,9 @@ def test_a_plan_that_is_not_found_is_told_and_not_applied(servicer, monkeypatch)
 
 
 @pytest.mark.exhaustive
-def test_what_it_cannot_do_is_said_in_a_line(servicer, planned, monkeypatch, tmp_path):
+def test_unsupported_uses_are_refused_in_one_line(
+    servicer, planned, monkeypatch, tmp_path
+):
     robot, lin = servicer
     _, along = planned
     weighed = weights(lin)
@@ -440,13 +442,13 @@ def test_what_it_cannot_do_is_said_in_a_line(servicer, planned, monkeypatch, tmp
         "limits is 'nosuch'": {"limits": "nosuch"},
         "both Q and R": {"R": None},
     }
-    for said, given in wrong.items():
-        with pytest.raises(fflin.FflinError, match=said):
+    for message, given in wrong.items():
+        with pytest.raises(fflin.FflinError, match=message):
             fflin.mpc(lin, **{"Q": weighed[0], "R": weighed[1], "dt": 0.1} | given)
     sampled = lin.discretize(0.1)
     assert fflin.mpc(sampled, *weighed).lin.dt == 0.1
     lin.save(tmp_path / "model.npz")
-    for said, of, dt in (
+    for message, source, dt in (
         ("sampled", sampled, 0.2),
         ("sampled", along.discretize(0.5), 0.5),
         ("dict", {}, 0.1),
@@ -454,8 +456,8 @@ def test_what_it_cannot_do_is_said_in_a_line(servicer, planned, monkeypatch, tmp
         ("moving", fflin.linearize(robot, moving=True), 0.1),
         ("0.3 s", along, 0.3),
     ):
-        with pytest.raises(fflin.InputError, match=said):
-            fflin.mpc(of, 1.0, 1.0, dt=dt)
+        with pytest.raises(fflin.InputError, match=message):
+            fflin.mpc(source, 1.0, 1.0, dt=dt)
     policy = fflin.mpc(lin, *weighed, dt=0.1)
     with pytest.raises(fflin.InputError, match=r"\(3,\)"):
         policy.matrices(np.zeros(3))

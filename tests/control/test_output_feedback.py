@@ -8,7 +8,7 @@ from tests.support.measured import FELT, POSITIONS, designed, foreseen
 
 
 @pytest.mark.parametrize("outputs", [POSITIONS, FELT], ids=["positions", "felt"])
-def test_the_linear_loop_foresees_it_to_second_order(outputs):
+def test_the_linear_loop_predicts_it_to_second_order(outputs):
     robot, lin, compensator = designed(outputs, stiffness=3.0)
     policy = fflin.OutputFeedback(lin, compensator)
     apart = []
@@ -21,7 +21,7 @@ def test_the_linear_loop_foresees_it_to_second_order(outputs):
     assert apart[0] / apart[1] == pytest.approx(2.0, abs=0.05)
 
 
-def test_it_settles_and_noise_is_what_keeps_it_from_it():
+def test_the_loop_settles_unless_there_is_noise():
     robot, lin, compensator = designed(POSITIONS)
     x0 = lin.x0.copy()
     x0[:6] += (0.05, -0.03, 0.02, 0.1, 0.05, -0.1)

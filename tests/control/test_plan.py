@@ -150,7 +150,7 @@ def test_a_tumble_ends_within_limits(hold):
 
 
 @pytest.mark.exhaustive
-def test_what_is_planned_is_flown(servicer, tmp_path):
+def test_a_planned_motion_is_simulated(servicer, tmp_path):
     """The simulator under the same inputs ends where the plan does; the file says hold and axes."""
     robot, v, goal = servicer
     motion = fflin.plan(robot, (goal, None), 20.0, v0=v, knots=41, limits=None)
@@ -215,10 +215,10 @@ def test_speeds_keep_within_limits_between_knots(one_joint, knots, spin):
     largest = largest_speeds(motion)[0]
     assert 0.97 * limit < largest <= 1.01 * limit
     assert missed(robot, motion, goal) < 1e-6
-    said = " ".join(str(motion).split())
-    assert "integrated motion exceeds" in said
-    if found := re.search(r"exceeds the limit of qdot_m\.joint_1 by (\S+) %", said):
-        assert largest >= (1.0 + 0.009 * float(found[1])) * limit
+    message = " ".join(str(motion).split())
+    assert "integrated motion exceeds" in message
+    if result := re.search(r"exceeds the limit of qdot_m\.joint_1 by (\S+) %", message):
+        assert largest >= (1.0 + 0.009 * float(result[1])) * limit
 
 
 def test_a_violation_that_is_left_is_printed_as_it_was_computed(one_joint, monkeypatch):
@@ -228,14 +228,14 @@ def test_a_violation_that_is_left_is_printed_as_it_was_computed(one_joint, monke
     monkeypatch.setattr("fflin.control.optimal.plan_search._LIMITED", np.inf)
     monkeypatch.setattr("fflin.control.plan._BETWEEN", 0.1)
     motion = fflin.plan(robot, (goal, None), 10.0, **options)
-    found = re.search(
+    result = re.search(
         r"exceeds the limit of qdot_m\.joint_1 by (\S+) %",
         " ".join(str(motion).split()),
     )
     ends = [[v[6] for _, v in between_knots(motion, k, 128)] for k in range(5)]
     fine = np.ravel(ends)[7::8]
-    assert found and float(found[1]) > 3.0
-    assert max(fine) / 0.13 - 1.0 == pytest.approx(0.01 * float(found[1]), rel=0.02)
+    assert result and float(result[1]) > 3.0
+    assert max(fine) / 0.13 - 1.0 == pytest.approx(0.01 * float(result[1]), rel=0.02)
     monkeypatch.setattr("fflin.control.plan._BETWEEN", 0.01)
     with pytest.warns(
         fflin.FflinWarning, match=r"qdot_m\.joint_1 by \S+ % at t = \S+ s"
@@ -294,7 +294,7 @@ def test_the_values_nearest_to_their_limits_are_printed(one_joint):
     robot, goal = one_joint
     limits = {"qdot_m": 0.2, "tau_b": [-30.0, 20.0], "tau_m": 25.0}
     motion = fflin.plan(robot, (goal, None), 10.0, knots=5, limits=limits)
-    *_, said = " ".join(str(motion).split()).partition(
+    *_, message = " ".join(str(motion).split()).partition(
         "nearest to their limits at the knots: "
     )
     names = fflin.linearize(robot).input_names
@@ -303,7 +303,7 @@ def test_the_values_nearest_to_their_limits_are_printed(one_joint):
     share = np.where(torque > 0.0, torque / 20.0, -torque / 30.0)
     axis, at = np.unravel_index(share.argmax(), share.shape)
     limit = 20 if torque[axis, at] > 0.0 else 30
-    assert said.split(", ") == [
+    assert message.split(", ") == [
         f"qdot_m.joint_1 {np.abs(motion.v[:, 6]).max():.3g} of 0.2 rad/s",
         f"tau_b.{'xyz'[axis]} {abs(torque[axis, at]):.3g} of {limit} N m",
         f"tau_m.joint_1 {np.abs(u['tau_m.joint_1']).max():.3g} of 25 N m",
@@ -347,17 +347,17 @@ def test_a_start_or_goal_outside_a_limit_is_refused_before_planning(
         x[state.names.index(name)] = value
     monkeypatch.setattr("fflin.control.plan.Search", None)  # the work
     limits = {"q_m": 1.0, "qdot_m": 0.2}
-    with pytest.raises(fflin.InputError, match="limit") as told:
+    with pytest.raises(fflin.InputError, match="limit") as messages:
         fflin.plan(robot, x, 10.0, limits=limits)
-    assert all(word in str(told.value) for word in words) and "\n" not in str(
-        told.value
+    assert all(word in str(messages.value) for word in words) and "\n" not in str(
+        messages.value
     )
     with pytest.raises(fflin.InputError, match="start"):
         fflin.plan(robot, (None, None), 10.0, x0=x, limits=limits)
 
 
 @pytest.mark.exhaustive
-def test_wheels_turn_a_body_and_may_keep_what_they_took(tmp_path):
+def test_wheels_rotate_a_body_and_may_keep_momentum(tmp_path):
     """Only wheels act, so that the turn's momentum is theirs, and angles of wheels are no goal."""
     wheels = [fflin.ReactionWheel(axis, inertia=1e-4, max=1e-3) for axis in np.eye(3)]
     robot = fflin.load("cubesat", inputs=wheels)
@@ -445,16 +445,16 @@ def test_starts_and_goals_are_given_in_every_form():
     q = fflin.configuration(robot, {"arm_proximal": -0.3})
     lin = fflin.linearize(robot, q)
     forms = [lin, (q, None), fflin.StateMap(robot).to_state(q, np.zeros(robot.nv))]
-    found = [fflin.plan(robot, goal, 10.0, knots=11, limits=None) for goal in forms]
-    for motion in found:
+    result = [fflin.plan(robot, goal, 10.0, knots=11, limits=None) for goal in forms]
+    for motion in result:
         assert missed(robot, motion, q) < 1e-6
-        assert motion.u == pytest.approx(found[0].u, abs=1e-9)
-    assert (found[0].q[0] == fflin.configuration(robot, {"arm_proximal": 0.2})).all()
+        assert motion.u == pytest.approx(result[0].u, abs=1e-9)
+    assert (result[0].q[0] == fflin.configuration(robot, {"arm_proximal": 0.2})).all()
 
 
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("held", [True, False])
-def test_slopes_of_intervals_are_those_of_the_flow(servicer, held):
+def test_derivatives_of_intervals_match_the_flow(servicer, held):
     robot, v, goal = servicer
     t = np.linspace(0.0, 8.0, 41)
     q, v, u = Shooting(robot, t, held).guess(
@@ -475,7 +475,7 @@ def test_slopes_of_intervals_are_those_of_the_flow(servicer, held):
     def third(z):
         """Return the third quarter's end of the second interval."""
         return tuple(
-            each[1, 48] for each in shooting.motions(*shooting.moved(q, v, z), u)[:2]
+            item[1, 48] for item in shooting.motions(*shooting.moved(q, v, z), u)[:2]
         )
 
     for i in range(nx):
@@ -496,7 +496,7 @@ def test_slopes_of_intervals_are_those_of_the_flow(servicer, held):
 
 
 @pytest.mark.parametrize("held", [True, False])
-def test_limited_values_between_knots_are_those_of_finer_motions(servicer, held):
+def test_limited_values_between_knots_match_finer_motions(servicer, held):
     """At the ends of 16 parts, by as many steps or more: errors fall with the fourth power."""
     robot, v, goal = servicer
     t = np.linspace(0.0, 4.0, 5)
@@ -516,7 +516,7 @@ def test_limited_values_between_knots_are_those_of_finer_motions(servicer, held)
     )
 
 
-def test_rows_of_motions_are_those_of_single_motions(servicer):
+def test_rows_of_motions_match_single_motions(servicer):
     """The motion flown from a start and the motions of its intervals are the same."""
     robot, v, goal = servicer
     shooting = Shooting(robot, np.linspace(0.0, 4.0, 5), False)
@@ -564,9 +564,7 @@ def reduced_gradient(robot, motion, held):
     nx, nu = shooting.state.nx, motion.u.shape[1]
     ends = shooting.jacobians(motion.q, motion.v, motion.u)[0]
     reach = np.zeros((nx, len(motion.t), nu))
-    for k, (A, B, D) in enumerate(
-        np.split(each, (nx, nx + nu), axis=1) for each in ends
-    ):
+    for k, (A, B, D) in enumerate(np.split(end, (nx, nx + nu), axis=1) for end in ends):
         reach = np.tensordot(A, reach, 1)
         reach[:, k] += B
         reach[:, k + 1] += D
@@ -598,18 +596,20 @@ def test_a_search_that_stops_early_states_its_gradient(one_joint, monkeypatch, h
         pytest.warns(fflin.FflinWarning, match="not a minimum of the effort"),
     ):
         motion = fflin.plan(robot, (goal, None), 10.0, **options)
-    found = motion.optimality
+    result = motion.optimality
     left = reduced_gradient(robot, motion, hold == "previous")
-    assert left > 0.02 and found.stationarity == pytest.approx(left, rel=1e-4)
+    assert left > 0.02 and result.stationarity == pytest.approx(left, rel=1e-4)
     assert (
-        not found.stationary and found.iterations == 1 and found.complementarity < 1e-9
+        not result.stationary
+        and result.iterations == 1
+        and result.complementarity < 1e-9
     )
     share = np.ones(11)
     share[[0, -1]] = (1.0, 0.0) if hold == "previous" else (0.5, 0.5)
-    assert found.effort == pytest.approx(
+    assert result.effort == pytest.approx(
         share @ np.square(motion.u).sum(axis=1), rel=1e-9
     )
-    assert f"stationarity {found.stationarity:.1e}" in " ".join(str(motion).split())
+    assert f"stationarity {result.stationarity:.1e}" in " ".join(str(motion).split())
     assert motion.resampled(0.5).optimality is None
 
 
@@ -618,9 +618,9 @@ def test_a_plan_of_the_closed_form_is_stationary(cube):
     robot, _ = cube
     for duration in (60.0, 4.0):
         motion = fflin.plan(robot, (turned(robot, 0.5), None), duration, knots=21)
-        found = motion.optimality
-        assert found.stationary and found.stationarity < 1e-5
-        assert found.feasibility < 1e-8 and found.complementarity < 1e-6
+        result = motion.optimality
+        assert result.stationary and result.stationarity < 1e-5
+        assert result.feasibility < 1e-8 and result.complementarity < 1e-6
         assert (np.abs(motion.u[:, 2]).max() > 1e-3 * (1.0 - 1e-9)) == (duration < 10.0)
 
 
@@ -833,7 +833,7 @@ def test_with_a_base_torque_the_base_of_a_guess_moves_to_the_goal(first_guess):
         (3.0, "guess has type float"),
     ],
 )
-def test_a_guess_that_is_no_motion_of_the_joints_is_refused(loop, guess, words):
+def test_a_guess_that_is_not_a_motion_of_the_joints_is_refused(loop, guess, words):
     robot, _ = loop
     with pytest.raises(fflin.FflinError, match=words):
         fflin.plan(robot, (None, None), 5.0, knots=5, guess=guess)
@@ -891,7 +891,7 @@ def test_a_plan_is_a_minimum_for_another_optimiser():
 
     w = (motion.u[:-1][:, acting] / size).ravel()
     start = w + 0.01 * np.random.default_rng(5).normal(size=w.size)
-    found = minimize(
+    result = minimize(
         lambda w: 0.5 * w @ w,
         start,
         jac=lambda w: w,
@@ -900,13 +900,13 @@ def test_a_plan_is_a_minimum_for_another_optimiser():
         constraints={"type": "eq", "fun": end},
         options={"maxiter": 400, "ftol": 1e-8},
     )
-    assert found.success and np.abs(end(found.x)).max() < 1e-6
+    assert result.success and np.abs(end(result.x)).max() < 1e-6
     # The midpoint rule of this simulation has an error of up to 1e-3.
-    assert 0.5 * w @ w < (1.0 + 1e-3) * found.fun
+    assert 0.5 * w @ w < (1.0 + 1e-3) * result.fun
 
 
 @pytest.mark.parametrize(
-    ("wrong", "said"),
+    ("wrong", "message"),
     [
         ({"knots": 1}, "knots"),
         ({"hold": "next"}, "'next'"),
@@ -917,9 +917,9 @@ def test_a_plan_is_a_minimum_for_another_optimiser():
         ({"x0": np.zeros(12), "q0": np.zeros(7)}, "x0"),
     ],
 )
-def test_what_is_no_plan_is_refused(cube, wrong, said):
+def test_an_invalid_plan_is_refused(cube, wrong, message):
     robot, _ = cube
-    with pytest.raises(fflin.FflinError, match=said):
+    with pytest.raises(fflin.FflinError, match=message):
         fflin.plan(robot, **{"goal": (None, None), "duration": 1.0} | wrong)
 
 
@@ -958,7 +958,7 @@ def test_progress_shows_iterations_cost_and_violation(cube, capsys):
     assert shown.endswith("\r\x1b[2K")
 
 
-def test_a_file_of_other_inputs_names_what_differs(free_floating, tmp_path):
+def test_a_file_with_other_inputs_names_the_difference(free_floating, tmp_path):
     robot, _ = free_floating
     whole = fflin.load("planar_detumble")
     path = tmp_path / "plan.npz"
@@ -966,9 +966,9 @@ def test_a_file_of_other_inputs_names_what_differs(free_floating, tmp_path):
     assert fflin.Trajectory.load(path, whole).u.shape == (4, 9)
     with pytest.raises(fflin.InputError, match=r"other inputs tau_b\.x.*F_b\.z"):
         fflin.Trajectory.load(path, robot)
-    own = np.zeros((2, robot.nv))
+    speeds = np.zeros((2, robot.nv))
     fflin.Trajectory(
-        robot, [0.0, 1.0], [robot.neutral()] * 2, own, np.zeros((2, 3))
+        robot, [0.0, 1.0], [robot.neutral()] * 2, speeds, np.zeros((2, 3))
     ).save(path)
     with pytest.raises(fflin.InputError, match=r"lacks the inputs tau_b\.x"):
         fflin.Trajectory.load(path, whole)

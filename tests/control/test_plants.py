@@ -80,7 +80,7 @@ def test_schedules_and_allocations_run_on_another_robot():
 
 def test_an_allocation_weighs_with_the_masses_that_it_knows():
     cubesat = fflin.load("cubesat", inputs=fflin.load_inputs("cubesat"))
-    thrusters = [each for each in cubesat.inputs if isinstance(each, fflin.Thruster)][
+    thrusters = [item for item in cubesat.inputs if isinstance(item, fflin.Thruster)][
         :7
     ]
     robot = fflin.load("cubesat", inputs=thrusters)
@@ -104,7 +104,7 @@ class Renamed:
         return fflin.from_model(model, name="other")
 
 
-def test_what_has_other_names_is_refused_with_the_names(nominal):
+def test_models_with_other_names_are_refused_with_the_names(nominal):
     robot, lin = nominal
     policy = fflin.StateFeedback(lin, np.zeros(lin.B.T.shape))
 

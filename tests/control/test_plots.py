@@ -43,25 +43,25 @@ def test_bode_plots_are_of_the_loops_broken_one_at_a_time(dt):
 
 
 @pytest.mark.parametrize("name", mostly(["cubesat", "canadarm2", "talos"], "cubesat"))
-def test_margins_stand_beside_the_names(name):
+def test_margins_are_next_to_the_names(name):
     gain = fflin.lqr(fflin.linearize(fflin.load(name)).discretize(0.2))
     figure = fflin.plot_loops(gain)
     assert_legible(figure)
     *_, loops = input_loops(gain)
     legend = figure.legends[0]
-    for text, each, name in zip(
+    for text, item, name in zip(
         legend.get_texts(), loops, gain.input_names, strict=True
     ):
-        low, high = each.gain
+        low, high = item.gain
         assert (
-            text.get_text() == f"{name}: {each.phase:.0f} deg, {low:.2g} to {high:.3g}"
+            text.get_text() == f"{name}: {item.phase:.0f} deg, {low:.2g} to {high:.3g}"
         )
     colors = [line.get_color() for line in legend.get_lines()]
     assert len(set(colors)) == len(colors)
     assert f"(disk margin {gain.margins.disk:.3g})" in figure.get_suptitle()
 
 
-def test_poles_of_a_loop_are_all_told_apart():
+def test_poles_of_a_loop_are_all_distinguished():
     poles = np.array([-640.0, -31.0, -1.0 + 0.3j, -1.0 - 0.3j, -0.2, -0.1])
     figure = fflin.plot_poles(poles)
     assert_legible(figure)
@@ -116,7 +116,7 @@ def test_poles_of_a_sampled_loop_are_shown_as_rates():
     assert "poles of A - B K as ln(z)/dt" in [text for text, _ in texts(figure)]
 
 
-def test_what_has_no_poles_is_one_line():
+def test_an_object_without_poles_gives_a_one_line_error():
     masked = np.ma.masked_array([-1.0, -2.0], mask=[True, False])
     for given in (3, np.zeros((3, 3)), [], {}, {"a": 5.0}, [np.nan], None):
         with pytest.raises(fflin.InputError, match="poles has type"):

@@ -73,7 +73,7 @@ def test_thrusters_that_push_every_way():
     )
 
 
-def test_what_is_limited_to_nothing_gives_nothing():
+def test_an_input_with_zero_limits_is_zero():
     u = nearest(
         np.ones((1, 3)),
         np.array([3.0]),

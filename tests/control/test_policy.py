@@ -137,7 +137,7 @@ def test_a_sample_time_is_positive(lin, K, value):
         fflin.simulate(fflin.load("planar_detumble"), Law(lin, K), duration=1.0)
 
 
-def test_what_is_no_law_is_named():
+def test_an_invalid_policy_is_named():
     robot = fflin.load("planar_detumble")
 
     class Empty(fflin.Policy):
@@ -172,7 +172,7 @@ def test_functions_are_policies_and_other_objects_are_refused():
         as_policy(3)
 
 
-def test_an_allocation_tells_what_its_policy_does(lin, K):
+def test_an_allocation_has_the_attributes_of_its_policy(lin, K):
     inner = fflin.StateFeedback(lin, K)
     robot = fflin.load("planar_detumble")
     law = fflin.Allocation(inner, robot)

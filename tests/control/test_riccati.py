@@ -58,7 +58,7 @@ def general(A, B, Q, R, N=None, dt=0.0):
     return 0.5 * (P + P.T)
 
 
-def compare_with_the_general_solution(equation, found, P, label):
+def compare_with_the_general_solution(equation, result, P, label):
     """Not behind it in the residual, and no further from it than it is from the solution."""
     A, B, Q, R, dt = (
         equation.A,
@@ -69,19 +69,19 @@ def compare_with_the_general_solution(equation, found, P, label):
     )
     trial = equation.trial(P)
     # A residual below _SOUND ends the refinement.
-    assert found.residual <= max(trial.residual, _SOUND), label
+    assert result.residual <= max(trial.residual, _SOUND), label
     # Written another way, it holds too but for the rounding of that, which is what is left of
     # either where the inertia is ill-conditioned.
-    check = relative_residual(A, B, Q, R, found.P, None, dt)
+    check = relative_residual(A, B, Q, R, result.P, None, dt)
     assert check <= 2.0 * relative_residual(A, B, Q, R, P, None, dt) + 1e-14, label
     # What they are off by, to first order, is what the two differ by.
     F = A - B @ equation.gain(P)
     lyapunov = sl.solve_discrete_lyapunov if dt else sl.solve_continuous_lyapunov
-    own = 1e-13 * np.linalg.norm(P)
-    for solution in (P, found.P):
+    tolerance = 1e-13 * np.linalg.norm(P)
+    for solution in (P, result.P):
         defect = equation.trial(solution).defect
-        own += np.linalg.norm(lyapunov(F.T, defect if dt else -defect))
-    assert np.linalg.norm(found.P - P) <= 2.5 * own, label
+        tolerance += np.linalg.norm(lyapunov(F.T, defect if dt else -defect))
+    assert np.linalg.norm(result.P - P) <= 2.5 * tolerance, label
 
 
 @pytest.mark.parametrize("name", [*BUNDLED, "tree_7", "tree_32"])
@@ -96,25 +96,25 @@ def test_residual_is_at_or_below_the_general_solvers_and_gains_agree(robots, nam
     rest = fflin.linearize(robot, random_point(robot, rng)[0])
     lin = rest.discretize(dt) if dt else rest
     for label, (Q, R) in weightings(rest, rng).items():
-        found = solve(lin.A, lin.B, Q, R, None, dt)
+        result = solve(lin.A, lin.B, Q, R, None, dt)
         equation = Riccati(lin.A, lin.B, Q, R, None, dt)
         # Under a hold the bilinear map may cost an ill-conditioned inertia the fallback.
-        assert found.method == "structured" or dt, label
+        assert result.method == "structured" or dt, label
         try:
             P = general(lin.A, lin.B, Q, R, None, dt)
         except (
             ValueError,
             np.linalg.LinAlgError,
         ):  # which of the samples depends on the processor
-            assert dt and found.residual < 1e-12, label
+            assert dt and result.residual < 1e-12, label
         else:
-            compare_with_the_general_solution(equation, found, P, label)
-        poles = np.linalg.eigvals(lin.A - lin.B @ found.K)
+            compare_with_the_general_solution(equation, result, P, label)
+        poles = np.linalg.eigvals(lin.A - lin.B @ result.K)
         scale = np.abs(poles - bool(dt)) if dt else np.abs(poles)
-        for pole in found.poles:
+        for pole in result.poles:
             nearest = np.abs(poles - pole).argmin()
             assert np.abs(poles[nearest] - pole) <= 1e-7 * scale[nearest] + 1e-12, label
-        assert np.linalg.eigvalsh(found.P)[0] > 0.0, label
+        assert np.linalg.eigvalsh(result.P)[0] > 0.0, label
 
 
 def test_half_the_eigenproblem_has_the_hamiltonians_stable_eigenvalues(robots):
@@ -154,15 +154,15 @@ def test_the_continuous_equation_of_a_sampled_model_has_the_same_P(robots):
     cost = fflin.sampled_cost(lin, 0.2, W[:24, :24], W[24:, 24:], W[:24, 24:])
     held = lin.discretize(0.2)
     equation = Riccati(held.A, held.B, *cost, held.dt)
-    found = solve(held.A, held.B, *cost, held.dt)
-    assert found.method == "structured" and found.residual < 1e-13
-    assert _bilinear(equation).trial(found.P).residual < 1e-12
+    result = solve(held.A, held.B, *cost, held.dt)
+    assert result.method == "structured" and result.residual < 1e-13
+    assert _bilinear(equation).trial(result.P).residual < 1e-12
     other = Riccati(held.A, held.B, cost.Q, cost.R, -cost.N, held.dt)
-    assert _bilinear(other).trial(found.P).residual > 1e-6
+    assert _bilinear(other).trial(result.P).residual > 1e-6
 
 
 def test_half_size_loops_are_loops_of_the_model_and_optimal_without_odd_powers(robots):
-    for lin, Q, R, (modes, own), even in loops(robots):
+    for lin, Q, R, (modes, tolerance), even in loops(robots):
         m = len(lin.A) // 2
         V, poles = modes.V, modes.values
         assert poles.real.max() < 0.0
@@ -171,10 +171,10 @@ def test_half_size_loops_are_loops_of_the_model_and_optimal_without_odd_powers(r
         assert np.abs(missing[:m]).max() < 1e-10 * np.abs(lin.A @ V).max()
         U = np.linalg.solve(lin.B[m:], missing[m:])
         cost = V.conj().T @ Q @ V + U.conj().T @ R @ U
-        assert own == pytest.approx(cost, rel=1e-6, abs=1e-9 * np.abs(cost).max())
+        assert tolerance == pytest.approx(cost, rel=1e-6, abs=1e-9 * np.abs(cost).max())
         residual = (
             Riccati(lin.A, lin.B, Q, R, None, 0.0)
-            .trial(modes.lyapunov_modal(own))
+            .trial(modes.lyapunov_modal(tolerance))
             .residual
         )
         assert (residual < 1e-11) == even
@@ -196,13 +196,13 @@ def test_springs_dampers_gravity_motion_and_cross_terms_keep_half_the_size(robot
         N = 0.3 * rng.normal(size=(nx, nu)) @ np.sqrt(R) / nx
         for dt in (0.0, 0.1):
             point = lin.discretize(dt) if dt else lin
-            found = half_size(point.A, point.B, Q, R, N, dt)
+            result = half_size(point.A, point.B, Q, R, N, dt)
             P = general(point.A, point.B, Q, R, N, dt)
             if not dt:  # a hold does not keep the double integrators of a damped system
-                assert found.method == "structured"
-            found = solve(point.A, point.B, Q, R, N, dt)
-            assert found.residual < 1e-13
-            assert found.P == pytest.approx(P, rel=1e-6, abs=1e-8 * np.abs(P).max())
+                assert result.method == "structured"
+            result = solve(point.A, point.B, Q, R, N, dt)
+            assert result.residual < 1e-13
+            assert result.P == pytest.approx(P, rel=1e-6, abs=1e-8 * np.abs(P).max())
 
 
 def test_more_inputs_than_coordinates_share_the_force_at_the_least_cost():
@@ -213,9 +213,9 @@ def test_more_inputs_than_coordinates_share_the_force_at_the_least_cost():
     lin = fflin.linearize(robot)
     assert lin.B.shape == (12, 12)
     Q, R = np.eye(12), np.diag(np.linspace(1.0, 3.0, 12))
-    found = solve(lin.A, lin.B, Q, R)
-    assert found.method == "structured"
-    assert found.P == pytest.approx(
+    result = solve(lin.A, lin.B, Q, R)
+    assert result.method == "structured"
+    assert result.P == pytest.approx(
         sl.solve_continuous_are(lin.A, lin.B, Q, R), rel=1e-9
     )
 
@@ -224,10 +224,10 @@ def test_other_systems_go_to_the_general_solver():
     rng = np.random.default_rng(11)
     for n, nu in ((5, 2), (6, 2), (6, 3)):
         A, B = rng.normal(size=(n, n)), rng.normal(size=(n, nu))
-        found = solve(A, B, np.eye(n), np.eye(nu))
+        result = solve(A, B, np.eye(n), np.eye(nu))
         assert half_size(A, B, np.eye(n), np.eye(nu)) is None
-        assert found.method == "general" and found.residual < 1e-14
-        assert found.P == pytest.approx(
+        assert result.method == "general" and result.residual < 1e-14
+        assert result.P == pytest.approx(
             sl.solve_continuous_are(A, B, np.eye(n), np.eye(nu))
         )
     with pytest.raises(np.linalg.LinAlgError):
@@ -241,10 +241,10 @@ def test_modes_that_coincide_cost_the_fallback_and_no_digits():
     Q = np.diag(np.concatenate((np.ones(6) / s**2, 2.0 * np.ones(6))))
     inverse = np.linalg.inv(lin.M)
     R = inverse @ inverse  # a cost of 1 on accelerations
-    found = solve(lin.A, lin.B, Q, R)
-    assert found.residual < 1e-13
+    result = solve(lin.A, lin.B, Q, R)
+    assert result.residual < 1e-13
     # In closed form kp = 1/s and kd = 2.
-    assert found.K @ np.vstack((np.eye(6), np.zeros((6, 6)))) == pytest.approx(
+    assert result.K @ np.vstack((np.eye(6), np.zeros((6, 6)))) == pytest.approx(
         lin.M @ np.diag(1.0 / s), rel=1e-6, abs=1e-9 * lin.M.max()
     )
 
@@ -259,15 +259,15 @@ def test_badly_scaled_weights_never_cost_the_residual(robots):
         on_accelerations = inverse @ inverse
         on_accelerations = 0.5 * (on_accelerations + on_accelerations.T)
         for R in (np.diag(10 ** rng.uniform(-4, 4, nu)), on_accelerations):
-            found = solve(lin.A, lin.B, Q, R)
+            result = solve(lin.A, lin.B, Q, R)
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 P = general(lin.A, lin.B, Q, R)
             assert (
-                found.residual
+                result.residual
                 <= Riccati(lin.A, lin.B, Q, R, None, 0.0).trial(P).residual
             )
-            assert found.poles.real.max() < 0.0
+            assert result.poles.real.max() < 0.0
 
 
 @pytest.mark.parametrize("dt", [0.0, 0.1])
@@ -282,8 +282,8 @@ def test_inputs_whose_costs_are_far_apart_are_scaled_first(robots, dt, cross):
     if not dt:
         with pytest.raises((ValueError, np.linalg.LinAlgError)):
             sl.solve_continuous_are(lin.A, lin.B, np.eye(nx), R, s=N)
-    found = solve(lin.A, lin.B, np.eye(nx), R, N, dt)
-    assert found.residual < 1e-10
+    result = solve(lin.A, lin.B, np.eye(nx), R, N, dt)
+    assert result.residual < 1e-10
 
 
 def test_lyapunov_equations_by_modes(monkeypatch):
@@ -312,18 +312,20 @@ def test_lyapunov_equations_by_modes(monkeypatch):
     )
 
 
-def test_what_is_not_stable_is_no_solution(robots):
+def test_an_unstable_solution_is_rejected(robots):
     lin = fflin.linearize(robots["cubesat"])
     for model in (lin, lin.discretize(0.1)):
         equation = Riccati(model.A, model.B, np.eye(12), np.eye(6), None, model.dt)
-        found = solve(model.A, model.B, np.eye(12), np.eye(6), None, model.dt)
-        assert _finished(equation, equation.trial(found.P), None, "general") is not None
+        result = solve(model.A, model.B, np.eye(12), np.eye(6), None, model.dt)
         assert (
-            _finished(equation, equation.trial(0.0 * found.P), None, "general") is None
+            _finished(equation, equation.trial(result.P), None, "general") is not None
+        )
+        assert (
+            _finished(equation, equation.trial(0.0 * result.P), None, "general") is None
         )
         if not model.dt:
             assert (
-                _finished(equation, equation.trial(-found.P), None, "general") is None
+                _finished(equation, equation.trial(-result.P), None, "general") is None
             )
 
 
@@ -334,13 +336,13 @@ def test_critical_damping_is_solved_by_half_the_size():
         np.kron([[0.0], [1.0]], np.eye(3)),
     )
     Q, R = np.diag([1.0] * 3 + [2.0] * 3), np.eye(3)
-    found = half_size(A, B, Q, R)
-    assert found is not None
+    result = half_size(A, B, Q, R)
+    assert result is not None
     # (s + 1)^2 = s^2 + 2 s + 1: u = -p - 2 pdot.
-    assert found.K == pytest.approx(np.kron([[1.0, 2.0]], np.eye(3)), abs=1e-13)
-    assert found.residual < 1e-15
+    assert result.K == pytest.approx(np.kron([[1.0, 2.0]], np.eye(3)), abs=1e-13)
+    assert result.residual < 1e-15
     # the root of the rounding
-    assert found.poles == pytest.approx(-np.ones(6), abs=1e-7)
+    assert result.poles == pytest.approx(-np.ones(6), abs=1e-7)
 
 
 def of_inertias(spread, m=20):
@@ -390,19 +392,19 @@ def test_an_ill_conditioned_inertia_is_solved_by_half_the_size(monkeypatch):
     monkeypatch.setattr(
         ModalMatrix, "of", lambda *given: calls.append("modes") or modes(*given)
     )
-    found = solve(A, B, Q, R)
+    result = solve(A, B, Q, R)
     assert calls.count("modes") <= 1
     assert "general" not in calls
-    assert 1e-11 < found.residual < found.rounding
+    assert 1e-11 < result.residual < result.rounding
     # Each eigenvalue s of the inertia is a double integrator with B = 1/s and unit weights, whose
     # closed-loop polynomial is z^2 + z sqrt(1/s^2 + 2/s) + 1/s.
     s = np.logspace(0.0, 7.0, 20)
     damping = np.sqrt(1.0 / s**2 + 2.0 / s)
     roots = np.array(
-        [np.roots([1.0, d, 1.0 / each]) for d, each in zip(damping, s, strict=True)]
+        [np.roots([1.0, d, 1.0 / item]) for d, item in zip(damping, s, strict=True)]
     )
     slowest = -np.abs(roots.real).min()
-    assert found.poles.real.max() == pytest.approx(slowest, rel=1e-6)
+    assert result.poles.real.max() == pytest.approx(slowest, rel=1e-6)
 
 
 def test_an_inaccurate_start_is_not_computed_again(monkeypatch):
@@ -412,8 +414,8 @@ def test_an_inaccurate_start_is_not_computed_again(monkeypatch):
 
     def poor(equation, apart=0.0):
         starts.append(apart)
-        found = structured(equation, apart)
-        return found._replace(residual=1e-3)
+        result = structured(equation, apart)
+        return result._replace(residual=1e-3)
 
     monkeypatch.setattr("fflin.control.lqr.structured", poor)
     gain = fflin.lqr(lin, np.eye(12), np.eye(6))

@@ -32,7 +32,7 @@ def speeds_of(robot):
 
 def models(others=(), axes=AXES[:4], spinning=True, dt=0.0, moving=False, **fields):
     """The models of one satellite with wheels that are joints, and with `ReactionWheel`."""
-    found = []
+    result = []
     satellite, twin = spun(axes, others=others, **fields)
     if not spinning:
         satellite = satellite.replace(wheel_joints=["wheel_*"])
@@ -40,24 +40,27 @@ def models(others=(), axes=AXES[:4], spinning=True, dt=0.0, moving=False, **fiel
         q = fflin.configuration(robot, {"arm": 0.4})
         v = fflin.velocity(robot, speeds_of(robot)) if spinning else None
         lin = fflin.linearize(robot, q, v, moving=moving)
-        found.append((robot, lin.discretize(dt) if dt else lin))
-    return found
+        result.append((robot, lin.discretize(dt) if dt else lin))
+    return result
 
 
 @pytest.mark.parametrize("others", INPUTS)
 @pytest.mark.parametrize(
     "spinning, dt", [(True, 0.1), (False, 0.0), *exhaustive((True, 0.0), (False, 0.1))]
 )
-def test_designs_are_those_of_reaction_wheels(others, spinning, dt):
+def test_designs_match_reaction_wheels(others, spinning, dt):
     (_, lin), (_, other) = models(INPUTS[others], spinning=spinning, dt=dt)
     x, u = matched(lin, other)
     assert lin.wheels == other.wheels == ("wheel_1", "wheel_2", "wheel_3", "wheel_4")
     for key, rows, columns in (("A", x, x), ("B", x, u)):
-        own, expected = getattr(lin, key)[np.ix_(rows, columns)], getattr(other, key)
-        assert np.abs(own - expected).max() < CLOSE * np.abs(expected).max()
+        converted, expected = (
+            getattr(lin, key)[np.ix_(rows, columns)],
+            getattr(other, key),
+        )
+        assert np.abs(converted - expected).max() < CLOSE * np.abs(expected).max()
     for wheel_speeds in (None, True, False):
         gain, expected = (
-            fflin.lqr(each, wheel_speeds=wheel_speeds) for each in (lin, other)
+            fflin.lqr(item, wheel_speeds=wheel_speeds) for item in (lin, other)
         )
         assert set(gain.regulated) == set(expected.regulated)
         assert not {f"q_m.{name}" for name in lin.wheels} & {*gain.regulated}
@@ -92,22 +95,22 @@ def test_the_speed_limit_of_a_wheel_without_motor_does_not_bound_the_loop():
         inputs=[*satellite.inputs[:3], fflin.JointTorque("wheel_1")],
     )
     limited = satellite.replace(limits={"qdot_m.wheel_2": 1e-3})
-    gains = [fflin.lqr(fflin.linearize(each)) for each in (satellite, limited)]
+    gains = [fflin.lqr(fflin.linearize(item)) for item in (satellite, limited)]
     assert (gains[0].K == gains[1].K).all()
 
 
 @pytest.mark.parametrize("spinning", [True, False])
-def test_filters_and_reductions_are_those_of_reaction_wheels(spinning):
+def test_filters_and_reductions_match_reaction_wheels(spinning):
     (robot, lin), (twin, other) = models((BaseTorque(),), spinning=spinning)
     x, _ = matched(lin, other)
     noise = {"omega_b": 1e-4, "q_b": 1e-6, "qdot_m": 1e-4, "q_m.arm": 1e-6}
-    filters = [fflin.kalman(each, noise, 1e-4) for each in (lin, other)]
+    filters = [fflin.kalman(item, noise, 1e-4) for item in (lin, other)]
     assert set(filters[0].estimated) == set(filters[1].estimated)
     assert "q_m.wheel_1" not in filters[0].estimated
     L, expected = filters[0].L[np.ix_(x, x)], filters[1].L
     assert np.abs(L - expected).max() < 100.0 * CLOSE * np.abs(expected).max()
     reduced = [
-        fflin.momentum_reduction(each, wheel_speeds=False) for each in (lin, other)
+        fflin.momentum_reduction(item, wheel_speeds=False) for item in (lin, other)
     ]
     assert set(reduced[0].state_names) == set(reduced[1].state_names)
     assert not any("wheel" in name for name in reduced[0].state_names)
@@ -116,7 +119,7 @@ def test_filters_and_reductions_are_those_of_reaction_wheels(spinning):
     assert np.abs(difference).max() < CLOSE * np.abs(reduced[1].A).max()
     # The reports of the operating points state the same momentum of the wheels.
     points = [
-        point_properties(each, at.q, at.v) for each, at in ((robot, lin), (twin, other))
+        point_properties(item, at.q, at.v) for item, at in ((robot, lin), (twin, other))
     ]
     assert points[0].wheel_momentum.wheels == 4
     assert points[0].wheel_momentum.total == pytest.approx(
@@ -149,8 +152,8 @@ def laws_of(lin, kind):
         pytest.param("outputs", 0.2, "compiled", marks=pytest.mark.compiled),
     ],
 )
-def test_motions_and_reports_are_those_of_reaction_wheels(kind, dt, engine):
-    found = []
+def test_motions_and_reports_match_reaction_wheels(kind, dt, engine):
+    result = []
     for robot, lin in models(
         (BaseTorque(),), axes=AXES[:3], dt=dt if kind != "mpc" else 0.0
     ):
@@ -166,8 +169,8 @@ def test_motions_and_reports_are_those_of_reaction_wheels(kind, dt, engine):
             engine=engine,
             linear=False,
         )
-        found.append((lin, motion))
-    (lin, motion), (other, twin) = found
+        result.append((lin, motion))
+    (lin, motion), (other, twin) = result
     x, _ = matched(lin, other)
     at = [
         i
@@ -182,7 +185,7 @@ def test_motions_and_reports_are_those_of_reaction_wheels(kind, dt, engine):
     assert motion.wheels == twin.wheels
     assert motion.wheel_inertias == pytest.approx(twin.wheel_inertias, rel=1e-12)
     # Energies and rounding errors at the end of the report differ in their last digits.
-    report, expected = (str(each).partition("energy:")[0] for each in (motion, twin))
+    report, expected = (str(item).partition("energy:")[0] for item in (motion, twin))
     assert report == expected and "\nwheel speeds" in report
 
 
@@ -273,7 +276,7 @@ def test_a_joint_spins_above_a_speed(factor, flown):
     ],
     ids=lambda value: value.split()[-1] if isinstance(value, str) else "",
 )
-def test_a_joint_that_cannot_spin_freely_is_no_wheel(changes, why):
+def test_a_joint_that_cannot_spin_freely_is_not_a_wheel(changes, why):
     """It cannot be named, and its spin is no steady motion."""
     robot = hub_with_wheel(**changes)
     with pytest.raises(fflin.InputError, match=why):
@@ -349,31 +352,31 @@ def test_batches_keep_the_wheels_of_each_point(ending, tmp_path):
     if ending == "h5":
         pytest.importorskip("h5py")
     robot, _ = spun(AXES[:2])
-    v = [fflin.velocity(robot, each) for each in ({}, {"wheel_2": 30.0})]
+    v = [fflin.velocity(robot, item) for item in ({}, {"wheel_2": 30.0})]
     batch = fflin.sweep(robot, [robot.neutral()] * 2, v)
     batch.save(tmp_path / f"b.{ending}")
     for read in (None, robot):
-        found = fflin.LinearBatch.load(tmp_path / f"b.{ending}", read)
-        assert [each.wheels for each in found] == [(), ("wheel_2",)]
+        result = fflin.LinearBatch.load(tmp_path / f"b.{ending}", read)
+        assert [item.wheels for item in result] == [(), ("wheel_2",)]
     named = robot.replace(wheel_joints=["wheel_1"])
     batch = fflin.sweep(named, [robot.neutral()] * 2, v)
     batch.save(tmp_path / f"n.{ending}")
-    found = fflin.LinearBatch.load(tmp_path / f"n.{ending}")
-    assert [each.wheels for each in found] == [("wheel_1",), ("wheel_1", "wheel_2")]
+    result = fflin.LinearBatch.load(tmp_path / f"n.{ending}")
+    assert [item.wheels for item in result] == [("wheel_1",), ("wheel_1", "wheel_2")]
 
 
-def test_the_gain_in_the_coordinates_of_tools_is_that_of_reaction_wheels():
+def test_the_gain_in_the_coordinates_of_tools_matches_reaction_wheels():
     (_, lin), (_, other) = models((BaseTorque(),))
     gain, expected = fflin.lqr(lin), fflin.lqr(other)
     for tool in ("pinocchio", "mujoco", "drake"):
-        own, twin = gain.to(tool), expected.to(tool)
-        names, others = own.model.state_names, twin.model.state_names
+        converted, twin = gain.to(tool), expected.to(tool)
+        names, others = converted.model.state_names, twin.model.state_names
         x = [names.index(name) for name in others]
         _, u = matched(lin, other)
-        K = own.K[np.ix_(u, x)]
+        K = converted.K[np.ix_(u, x)]
         assert np.abs(K - twin.K).max() < 100.0 * CLOSE * np.abs(twin.K).max()
         angles = [i for i, name in enumerate(names) if "wheel" in name][:4]
-        assert not own.K[:, angles].any()
+        assert not converted.K[:, angles].any()
 
 
 def test_campaigns_do_not_count_the_angles_of_wheels():
@@ -383,14 +386,14 @@ def test_campaigns_do_not_count_the_angles_of_wheels():
     kind = dict(zip(state.names, kinds_of(state, robot.wheels_at(v)), strict=True))
     assert kind["q_m.wheel_1"] == -1 and kind["qdot_m.wheel_1"] == 0
     assert list(KINDS)[kind["q_m.arm"]] == "joints"
-    found = []
-    for each in (robot, twin):
-        speeds = fflin.velocity(each, speeds_of(each))
-        lin = fflin.linearize(each, v=speeds)
+    result = []
+    for item in (robot, twin):
+        speeds = fflin.velocity(item, speeds_of(item))
+        lin = fflin.linearize(item, v=speeds)
         law = fflin.StateFeedback(lin, fflin.lqr(lin).K)
-        found.append(
+        result.append(
             fflin.monte_carlo(
-                each,
+                item,
                 law,
                 {"q_m.arm": 0.1},
                 runs=4,
@@ -401,7 +404,7 @@ def test_campaigns_do_not_count_the_angles_of_wheels():
                 seed=3,
             )
         )
-    assert found[0].largest == pytest.approx(found[1].largest, rel=1e-6, abs=1e-9)
+    assert result[0].largest == pytest.approx(result[1].largest, rel=1e-6, abs=1e-9)
 
 
 def test_speed_limits_of_wheels_are_enforced():
@@ -467,7 +470,7 @@ def test_a_wheel_without_a_motor_keeps_its_momentum():
     )
 
 
-def test_the_wrist_of_a_moving_arm_is_no_wheel():
+def test_the_wrist_of_a_moving_arm_is_not_a_wheel():
     # The last link of ets_vii is symmetric about its joint, which has no limits.
     robot = fflin.load("ets_vii")
     wrist = robot.joint_names[-1]

@@ -74,8 +74,8 @@ def test_combined_variables_keep_their_limits_where_these_cost_more_than_to_exce
     more = sp.csr_array(rng.normal(size=(4, (N + 1) * (NX + NU))))
     rows = sp.vstack((qp["rows"], more))
 
-    def values(found):
-        return more @ np.hstack(found[:2]).ravel()
+    def values(result):
+        return more @ np.hstack(result[:2]).ravel()
 
     before = values(solved())
     high = before - 0.01 * np.abs(before)
@@ -96,8 +96,8 @@ def test_combined_variables_keep_their_limits_where_these_cost_more_than_to_exce
 
 
 def test_scales_change_nothing_and_hard_bounds_may_leave_nothing():
-    for found, known in zip(solved(), solved(scale=np.ones(NX + NU)), strict=True):
-        assert found == pytest.approx(known, abs=1e-6)
+    for result, known in zip(solved(), solved(scale=np.ones(NX + NU)), strict=True):
+        assert result == pytest.approx(known, abs=1e-6)
     limits = problem()["limits"].copy()
     limits[1, 2, 0] = -0.3  # below the lower limit
     assert solved(limits=limits) is None
@@ -107,7 +107,7 @@ def test_scales_change_nothing_and_hard_bounds_may_leave_nothing():
     assert beyond[0] > beyond[1] + 0.1 and np.abs(free[1]).max() <= 0.2
 
 
-def test_without_the_solver_it_is_said_how_to_install_it(monkeypatch):
+def test_without_the_solver_the_error_names_the_package(monkeypatch):
     monkeypatch.setitem(sys.modules, "piqp", None)
     with pytest.raises(MissingPackageError, match=r"'fflin\[mpc\]'"):
         solved()

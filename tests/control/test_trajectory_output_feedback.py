@@ -79,7 +79,7 @@ def fly(robot, along, policy, e, **options):
     return np.array(rows), np.array(estimates)
 
 
-def test_the_linear_loop_foresees_it_to_second_order(loop):
+def test_the_linear_loop_predicts_it_to_second_order(loop):
     robot, along, gains, seen = loop
     assert seen.D.any() and np.ptp(seen.C, axis=0).max() > 0.1
     policy, apart = fflin.TrajectoryOutputFeedback(along, gains, seen), []
@@ -130,10 +130,10 @@ def test_the_errors_of_the_estimate_are_as_large_as_the_filter_says():
         off = (e - z)[..., None]
         return (off * np.linalg.solve(seen.P[:-1], off)).sum(axis=(1, 2))
 
-    found = np.sum([nees(seed) for seed in range(runs)], axis=0)
+    result = np.sum([nees(seed) for seed in range(runs)], axis=0)
     low, high = chi2.ppf((1e-3, 1.0 - 1e-3), runs * nx)
-    assert low < found.min() and found.max() < high
-    assert found.mean() == pytest.approx(runs * nx, rel=0.05)
+    assert low < result.min() and result.max() < high
+    assert result.mean() == pytest.approx(runs * nx, rel=0.05)
 
 
 def test_it_goes_on_at_rest_where_the_trajectory_ends(loop):
@@ -152,9 +152,9 @@ def test_it_goes_on_at_rest_where_the_trajectory_ends(loop):
         for k, (A, B, C, D) in enumerate(
             zip(gains.A, gains.B, seen.C, seen.D, strict=False)
         ):
-            by = policy.terms(k * SAMPLE)
-            u = by.C @ z
-            z = by.A @ z + by.B @ (C @ e + D @ u)
+            terms = policy.terms(k * SAMPLE)
+            u = terms.C @ z
+            z = terms.A @ z + terms.B @ (C @ e + D @ u)
             e = A @ e + B @ u
             rows.append(e)
         apart.append(np.abs(flown.error[::8] - rows).max() / size)
@@ -188,12 +188,12 @@ def test_held_inputs_follow_linear_ones_by_their_mean(monkeypatch):
     # By their value at the sample it is off by half a sample, of first order.
     monkeypatch.setattr(fflin.TrajectoryFeedback, "ahead", 0.0)
     late = fflin.simulate(robot, fflin.TrajectoryFeedback(along, gains), dt=STEP)
-    for each in (run, seen_state):
-        assert np.abs(each.error[::at]).max() < 0.5 * np.abs(late.error[::at]).max()
+    for item in (run, seen_state):
+        assert np.abs(item.error[::at]).max() < 0.5 * np.abs(late.error[::at]).max()
 
 
 @pytest.mark.exhaustive
-def test_what_does_not_fit_is_refused(loop):
+def test_a_mismatched_argument_is_refused(loop):
     robot, along, gains, seen = loop
     make = fflin.TrajectoryOutputFeedback
     with pytest.raises(fflin.InputError, match="FilterSchedule"):

@@ -65,7 +65,7 @@ def test_of_samples_it_promises_the_covariance_and_no_other_gain_has_less(moving
     W, V = noise_of(moving)
     nx = moving.B.shape[1]
     W = W if G else np.linspace(0.01, 0.02, nx)
-    by = moving.B if G else np.tile(np.eye(nx), (41, 1, 1))
+    input_matrices = moving.B if G else np.tile(np.eye(nx), (41, 1, 1))
     schedule = fflin.tvkalman(moving, W, V, moving.B if G else None, 0.1, sample=0.1)
     assert (schedule.dt, len(schedule.t), schedule.residual < 1e-13) == (0.1, 5, True)
     linearizer = fflin.Linearizer(moving.robot, moving=True)
@@ -75,7 +75,7 @@ def test_of_samples_it_promises_the_covariance_and_no_other_gain_has_less(moving
 
     def rate(t, P):
         t = min(t, moving.t[-1])
-        (through,) = moving.between(t, by)
+        (through,) = moving.between(t, input_matrices)
         change = linearizer(*moving.point(t)).A @ P
         return change + change.T + through * W @ through.T
 
@@ -141,7 +141,7 @@ def test_filters_are_kept(moving, tmp_path, ending):
     assert repr(schedule).startswith(start)
 
 
-def test_what_is_wrong_is_told(moving):
+def test_errors_are_reported(moving):
     for words, (traj, *arguments), sample in (
         ("LinearTraj", (moving[0], 1, 1), 0.1),
         ("sampled", (moving.discretize(0.1), 1, 1), 0.1),

@@ -165,7 +165,7 @@ def test_inputs_that_soon_reach_less_are_solved_in_shorter_steps():
         return np.array((0.0 * S, S, 0.0 * S + 1e-6))
 
     times, values = solve_back(at, np.array([0.0, 1.0]), 1e3 * np.eye(1))
-    found = solve_ivp(
+    result = solve_ivp(
         lambda t, P: np.exp(12.0 * (1.0 - t)) * P * P - 1e-6,
         (1.0, 0.0),
         [1e3],
@@ -175,13 +175,14 @@ def test_inputs_that_soon_reach_less_are_solved_in_shorter_steps():
     )
     single = transitions(*(at(np.array([c])) for c in GAUSS), np.ones(1))[:, 0]
     assert (
-        np.abs(stepped_back(single, 1e3 * np.eye(1)) / found.y[0, -1] - 1.0).max() > 0.1
+        np.abs(stepped_back(single, 1e3 * np.eye(1)) / result.y[0, -1] - 1.0).max()
+        > 0.1
     )
     assert times[0] == 0.0
-    assert values[0, 0, 0] == pytest.approx(found.y[0, -1], rel=1e-5)
+    assert values[0, 0, 0] == pytest.approx(result.y[0, -1], rel=1e-5)
 
 
-def test_schedules_are_kept_and_bad_input_is_told(moving, tmp_path):
+def test_schedules_are_kept_and_bad_input_is_reported(moving, tmp_path):
     Q, R = weights(moving)
     schedule = fflin.tvlqr(moving, Q, R, {"q_b": 5.0})
     for ending in ("npz", "mat", "json"):
@@ -262,7 +263,7 @@ def test_held_inputs_have_the_cost_that_is_promised_and_no_other_is_less(tumblin
 
 
 @pytest.mark.exhaustive
-def test_held_inputs_at_rest_are_those_of_the_sampled_regulator():
+def test_held_inputs_at_rest_match_the_sampled_regulator():
     robot, traj = resting("ets_vii", 200.0)
     Q, R = weights(traj)
     lin = fflin.linearize(robot, moving=True)
@@ -314,7 +315,7 @@ def test_at_a_steady_end_wheels_spin_on():
 
 @pytest.mark.exhaustive
 @pytest.mark.filterwarnings("ignore:t, q, v, u are not a motion")
-def test_a_steady_end_leaves_out_what_inputs_cannot_hold(tumbling):
+def test_a_steady_end_omits_states_that_inputs_cannot_hold(tumbling):
     robot, traj = tumbling
     robot = robot.replace(inputs=robot.inputs[2:])
     traj = fflin.linearize_trajectory(robot, traj.t, traj.q, traj.v, traj.u[:, 6:])
@@ -333,7 +334,7 @@ def test_a_steady_end_leaves_out_what_inputs_cannot_hold(tumbling):
 
 
 @pytest.mark.exhaustive
-def test_weights_are_those_of_lqr(tumbling):
+def test_weights_match_lqr(tumbling):
     _, traj = tumbling
     with pytest.raises(fflin.InputError, match="Q and R"):
         fflin.tvlqr(traj, 1.0)
@@ -415,16 +416,16 @@ def test_knots_need_not_be_close_for_the_motion_between_them():
     robot = fflin.load("planar_detumble")
     t, u = np.linspace(0.0, 1.0, 41), np.zeros((41, 9))
     u[:, 6:] = np.outer(np.sin(np.pi * t) ** 2, (4.0, -2.0, 1.0))
-    u = np.array([np.interp(t, t[::4], each) for each in u[::4].T]).T
+    u = np.array([np.interp(t, t[::4], item) for item in u[::4].T]).T
     run = fflin.simulate(
-        *(robot, lambda time, q, v: [np.interp(time, t, each) for each in u.T]),
+        *(robot, lambda time, q, v: [np.interp(time, t, item) for item in u.T]),
         v0=fflin.velocity(robot, {"omega_b.y": 0.3, "joint_1": 0.4, "joint_3": -0.5}),
         **{"duration": 1.0, "dt": 0.0125, "every": 2},
     )
     fine = fflin.linearize_trajectory(robot, t, run.q, run.v, u)
     coarse = fflin.linearize_trajectory(robot, t[::4], run.q[::4], run.v[::4], u[::4])
     Q, R = weights(fine)
-    all_, few = (fflin.tvlqr(each, Q, R, 1.0) for each in (fine, coarse))
+    all_, few = (fflin.tvlqr(item, Q, R, 1.0) for item in (fine, coarse))
     assert few.P[0] == pytest.approx(
         all_.P[0], rel=0.0, abs=1e-5 * np.abs(all_.P[0]).max()
     )

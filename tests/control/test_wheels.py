@@ -52,7 +52,7 @@ def attitude(lin):
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_the_gain_is_that_of_the_single_body(layout):
+def test_the_gain_matches_the_single_body(layout):
     axes = LAYOUTS[layout]
     lin = fflin.linearize(wheeled(axes))
     Q, R = (
@@ -107,7 +107,7 @@ def test_orthogonal_wheels_have_the_textbooks_closed_form():
 
 
 @pytest.mark.parametrize("layout", mostly(LAYOUTS, "pyramid", "skew"))
-def test_the_motion_is_that_of_the_rigid_body_under_the_textbooks_law(layout):
+def test_the_motion_matches_the_rigid_body_under_the_textbooks_law(layout):
     """With the wheels' inertia taken out of it and their momentum carried along; H is kept."""
     axes = LAYOUTS[layout]
     robot = wheeled(axes)
@@ -237,11 +237,11 @@ def test_the_speed_of_a_wheel_limits_the_loop(spin):
 
 
 @pytest.mark.parametrize(
-    "axis", [ORTHOGONAL[0], *exhaustive(*((each,) for each in ORTHOGONAL[1:]))]
+    "axis", [ORTHOGONAL[0], *exhaustive(*((item,) for item in ORTHOGONAL[1:]))]
 )
 def test_a_large_wheel_turns_against_the_rest_of_the_robot(axis):
     """Its speed per momentum is that of both, the carrier free: a fifth more than of it alone."""
-    added = [ReactionWheel(each, inertia=3e-3, max_speed=0.05) for each in ORTHOGONAL]
+    added = [ReactionWheel(item, inertia=3e-3, max_speed=0.05) for item in ORTHOGONAL]
     robot = fflin.load("cubesat").replace(inputs=added)
     lin = fflin.linearize(robot)
     gain = fflin.lqr(lin)
@@ -258,8 +258,8 @@ def test_a_large_wheel_turns_against_the_rest_of_the_robot(axis):
 
 
 @pytest.mark.parametrize("spin", [-1.0, 3.0])
-def test_a_wheel_that_is_at_its_limit_is_told_and_quickens_nothing(spin):
-    added = [ReactionWheel(each, inertia=J, max_speed=1.0) for each in ORTHOGONAL]
+def test_a_wheel_that_is_at_its_limit_is_reported_and_quickens_nothing(spin):
+    added = [ReactionWheel(item, inertia=J, max_speed=1.0) for item in ORTHOGONAL]
     robot = body().replace(inputs=added)
     still = fflin.lqr(fflin.linearize(robot))
     spun = fflin.lqr(fflin.linearize(robot, v=fflin.velocity(robot, {"wheel_2": spin})))
@@ -344,7 +344,7 @@ def test_four_wheels_turn_against_each_other_on_request():
     assert np.abs(motion.v[-1] - idle).max() < 1e-6
 
 
-def test_what_is_not_regulated_is_said(tmp_path):
+def test_unregulated_states_are_reported(tmp_path):
     lin = fflin.linearize(wheeled(ORTHOGONAL))
     gain = fflin.lqr(lin)
     assert says(str(gain), "not regulated: r_b.x, r_b.y, r_b.z, q_m.wheel_1")
@@ -366,7 +366,7 @@ def test_what_is_not_regulated_is_said(tmp_path):
     assert replace(whole, regulated=()).margins == whole.margins
 
 
-def test_what_cannot_be_held_is_refused():
+def test_an_equilibrium_that_inputs_cannot_hold_is_refused():
     for count, words in (
         (1, "angular momentum y/z"),
         (2, "angular momentum z"),
@@ -381,7 +381,7 @@ def test_what_cannot_be_held_is_refused():
         fflin.lqr(fflin.linearize(idle))
 
 
-def test_damping_of_wheels_is_said_to_be_why_nothing_is_held():
+def test_damping_of_wheels_is_reported_to_be_why_nothing_is_held():
     """Their speeds stay in the model with it, and the momentum of all that no input changes."""
     names = [f"wheel_{k}" for k in (1, 2, 3)]
     lin = fflin.linearize(
@@ -393,9 +393,9 @@ def test_damping_of_wheels_is_said_to_be_why_nothing_is_held():
         for weights in ((), (1.0, 1.0)):
             with pytest.raises(fflin.StabilizabilityError, match=words):
                 fflin.lqr(model, *weights)
-    with pytest.raises(fflin.StabilizabilityError) as told:
+    with pytest.raises(fflin.StabilizabilityError) as messages:
         fflin.lqr(fflin.linearize(wheeled(ORTHOGONAL[:1])))
-    assert "damping" not in str(told.value)
+    assert "damping" not in str(messages.value)
     helped = wheeled(ORTHOGONAL, others=[BaseTorque()]).replace(
         damping={"wheel_1": 1e-7}
     )
@@ -436,23 +436,23 @@ def test_the_closed_form_holds_too():
         assert gain.P == pytest.approx(same.P, abs=1e-7 * np.abs(gain.P).max())
 
 
-def test_a_filter_estimates_what_is_regulated():
+def test_a_filter_estimates_the_regulated_states():
     robot = wheeled(AXES[:3]).replace(
         outputs=[fflin.BasePose(), fflin.JointVelocities()]
     )
     lin = fflin.linearize(robot).discretize(0.1)
     gain = fflin.lqr(lin)
-    found = fflin.kalman(lin, {"wheel": 1e-4}, 1e-6, G=lin.B)
-    assert found.estimated == gain.regulated and found.residual < 1e-11
-    at = [lin.state_names.index(name) for name in found.estimated]
-    assert not np.delete(found.L, at, axis=0).any()
-    seen = [i for i, name in enumerate(lin.output_names) if found.L[:, i].any()]
+    result = fflin.kalman(lin, {"wheel": 1e-4}, 1e-6, G=lin.B)
+    assert result.estimated == gain.regulated and result.residual < 1e-11
+    at = [lin.state_names.index(name) for name in result.estimated]
+    assert not np.delete(result.L, at, axis=0).any()
+    seen = [i for i, name in enumerate(lin.output_names) if result.L[:, i].any()]
     assert len(seen) == 3  # the attitude, and neither position nor the wheels' speeds
-    loop = np.linalg.eigvals((lin.A - found.L @ lin.C)[np.ix_(at, at)])
+    loop = np.linalg.eigvals((lin.A - result.L @ lin.C)[np.ix_(at, at)])
     assert np.sort(np.abs(loop)) == pytest.approx(
-        np.sort(np.abs(found.poles)), abs=1e-9
+        np.sort(np.abs(result.poles)), abs=1e-9
     )
-    compensator = fflin.lqg(gain, found)
+    compensator = fflin.lqg(gain, result)
     assert compensator.state_names == gain.regulated and compensator.A.shape == (6, 6)
     q0 = fflin.configuration(
         robot, base=pin.SE3(pin.rpy.rpyToMatrix(0.3, 0.1, 0), np.ones(3))

@@ -62,10 +62,10 @@ def test_check_holds_with_all_that_acts(name, frame, turned):
     robot, q, v, u = flying(frame, 1, name)
     reference = random_pose(np.random.default_rng(2), 100.0) if turned else None
     lin = fflin.linearize(robot, q, v, u, frame=frame, reference=reference)
-    found = fflin.check(robot, lin)
-    assert found.ok, found
+    result = fflin.check(robot, lin)
+    assert result.ok, result
     assert {
-        row.block.split(", ")[-1] for row in found.rows if row.block.startswith("B")
+        row.block.split(", ")[-1] for row in result.rows if row.block.startswith("B")
     } == {*("tau_b]", "F_b]", "tau_m]", "thrust]")}
 
 
@@ -83,10 +83,10 @@ def test_check_holds_on_random_trees_with_thrusters(frame):
         inputs=thrusters, stiffness=3.0, damping=0.2, gravity=(0, 0, -9.81)
     )
     q, v, _ = random_point(random_tree(np.random.default_rng(3), 7), rng)
-    found = fflin.check(
+    result = fflin.check(
         robot, fflin.linearize(robot, q, v, rng.normal(size=7), frame=frame)
     )
-    assert found.ok, found
+    assert result.ok, result
 
 
 def test_check_holds_where_joints_mimic_others():
@@ -102,10 +102,10 @@ def test_check_holds_where_joints_mimic_others():
     )
     q, v, _ = random_point(fflin.load("panda"), np.random.default_rng(4))
     for frame in FRAMES:
-        found = fflin.check(
+        result = fflin.check(
             robot, fflin.linearize(robot, q, v, [3.0, 1, 2, 3], frame=frame)
         )
-        assert found.ok, found
+        assert result.ok, result
 
 
 @pytest.mark.parametrize("thruster", THRUSTERS)
@@ -126,7 +126,7 @@ def test_thruster_column_is_the_work_of_its_force(thruster):
     assert generalised @ nu == pytest.approx(power, rel=1e-11)
 
 
-def test_thrust_slope_by_the_closed_form():
+def test_thrust_derivative_by_the_closed_form():
     """M^-1 sum dB/dq u, with dJ_j/dq_l = J_j x J_l for l on a deeper supporting joint, else 0."""
     robot = fflin.load("servicer_7dof", inputs=THRUSTERS[2:])
     bare = fflin.load("servicer_7dof")
@@ -235,15 +235,15 @@ def test_two_panel_frequencies_of_a_free_hub():
         model.appendBodyToJoint(index, panel, pin.SE3.Identity())
     robot = fflin.from_model(model, stiffness=k)
     poles = np.linalg.eigvals(fflin.linearize(robot).A)
-    found = np.unique(np.round(np.abs(poles.imag[poles.imag > 0.1]), 9))
+    result = np.unique(np.round(np.abs(poles.imag[poles.imag > 0.1]), 9))
     # Panel about its hinge: J + m a^2. Flapping together the hub moves against them along z,
     # turning together it rolls against them.
-    own = J + m * a**2
-    flap = own - 2 * (m * a) ** 2 / (hub + 2 * m)
+    panel_inertia = J + m * a**2
+    flap = panel_inertia - 2 * (m * a) ** 2 / (hub + 2 * m)
     arm = 0.5 + a
     total = I + 2 * (J + m * arm**2)
-    roll = own - 2 * (J + m * a * arm) ** 2 / total
-    assert found == pytest.approx(np.sort(np.sqrt([k / flap, k / roll])), rel=1e-9)
+    roll = panel_inertia - 2 * (J + m * a * arm) ** 2 / total
+    assert result == pytest.approx(np.sort(np.sqrt([k / flap, k / roll])), rel=1e-9)
 
 
 def test_urdf_damping_is_taken_when_asked_for():
@@ -296,7 +296,7 @@ def test_hovering_quadrotor_is_held_by_thrust():
     assert fflin.check(robot, lin).ok
 
 
-def test_bad_fields_are_told():
+def test_invalid_fields_are_reported():
     robot = fflin.load("servicer_7dof")
     cases = {
         "'tol'": {"inputs": [fflin.Thruster("tol", (0, 0, 0), (1, 0, 0))]},

@@ -42,24 +42,26 @@ def grasped(name, seed=0, speed=0.2):
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
 def test_momentum_is_kept_and_energy_lost(name):
-    *_, found = grasped(name)
-    size = np.abs(found.momentum).max()
-    assert np.abs(found.momentum_after - found.momentum).max() < 1e-13 * size
-    assert found.energy_lost > 0.0
-    assert fflin.check(found.robot, fflin.linearize(found.robot, found.q, found.v)).ok
+    *_, result = grasped(name)
+    size = np.abs(result.momentum).max()
+    assert np.abs(result.momentum_after - result.momentum).max() < 1e-13 * size
+    assert result.energy_lost > 0.0
+    assert fflin.check(
+        result.robot, fflin.linearize(result.robot, result.q, result.v)
+    ).ok
 
 
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
 def test_the_weld_is_closed_and_the_impulse_changes_both(name):
-    robot, frame, payload, options, found = grasped(name)
-    whole = found.robot
+    robot, frame, payload, options, result = grasped(name)
+    whole = result.robot
     data = whole.create_data()
-    pin.forwardKinematics(whole.model, data, found.q, found.v)
+    pin.forwardKinematics(whole.model, data, result.q, result.v)
     pin.updateFramePlacements(whole.model, data)
     local = pin.ReferenceFrame.LOCAL
     grasp, held = (
-        whole.model.getFrameId(each, pin.FrameType.BODY) for each in (frame, "payload")
+        whole.model.getFrameId(item, pin.FrameType.BODY) for item in (frame, "payload")
     )
     relative = data.oMf[grasp].actInv(data.oMf[held])
     assert relative.isApprox(options["placement"], 1e-12)
@@ -70,29 +72,29 @@ def test_the_weld_is_closed_and_the_impulse_changes_both(name):
     names = [name for name in robot.model.names if name not in ("universe",)]
     v = np.concatenate(
         [
-            found.v[(j := whole.model.joints[whole.model.getJointId(name)]).idx_v :][
+            result.v[(j := whole.model.joints[whole.model.getJointId(name)]).idx_v :][
                 : j.nv
             ]
             for name in names
         ]
     )
-    own = robot.create_data()
-    pin.computeJointJacobians(robot.model, own, options["q"])
-    pin.updateFramePlacements(robot.model, own)
+    default = robot.create_data()
+    pin.computeJointJacobians(robot.model, default, options["q"])
+    pin.updateFramePlacements(robot.model, default)
     J = pin.getFrameJacobian(
-        robot.model, own, robot.model.getFrameId(frame, pin.FrameType.BODY), local
+        robot.model, default, robot.model.getFrameId(frame, pin.FrameType.BODY), local
     )
     J = options["placement"].toActionMatrixInverse() @ J
-    M = pin.crba(robot.model, own, options["q"])
+    M = pin.crba(robot.model, default, options["q"])
     M = np.triu(M) + np.triu(M, 1).T
-    change = M @ (v - options["v"]) - J.T @ found.impulse
+    change = M @ (v - options["v"]) - J.T @ result.impulse
     assert np.abs(change).max() < 1e-9 * np.abs(M @ options["v"]).max()
     if isinstance(payload, pin.Inertia):
         before = pin.Motion(np.array(options["payload_v"]))
         impulse = payload * before - payload * pin.Motion(twist.vector)
         assert (
-            np.abs(impulse.vector - found.impulse).max()
-            < 1e-10 * np.abs(found.impulse).max()
+            np.abs(impulse.vector - result.impulse).max()
+            < 1e-10 * np.abs(result.impulse).max()
         )
 
 
@@ -103,7 +105,7 @@ def test_it_is_the_limit_of_a_stiff_grasp():
     q, v, _ = random_point(robot, rng, speed=0.05)
     payload = pin.Inertia(200.0, np.zeros(3), np.diag([30.0, 40.0, 50.0]))
     twist = 0.05 * rng.standard_normal(6)
-    found = fflin.capture(robot, "tool", payload, q=q, v=v, payload_v=twist)
+    result = fflin.capture(robot, "tool", payload, q=q, v=v, payload_v=twist)
     data, model = robot.create_data(), robot.model
     tool = model.frames[model.getFrameId("tool")]
     free = pin.Model()
@@ -152,42 +154,42 @@ def test_it_is_the_limit_of_a_stiff_grasp():
         return state[1]
 
     slow, fast = after(4e4), after(8e4)
-    errors = [np.abs(each - found.v).max() for each in (slow, fast)]
-    jump = np.abs(found.v - v).max()
+    errors = [np.abs(item - result.v).max() for item in (slow, fast)]
+    jump = np.abs(result.v - v).max()
     assert errors[1] < 0.02 * jump and 1.7 < errors[0] / errors[1] < 2.3
-    assert np.abs(2.0 * fast - slow - found.v).max() < 0.1 * errors[1]
+    assert np.abs(2.0 * fast - slow - result.v).max() < 0.1 * errors[1]
 
 
 def test_the_names_of_the_payload_have_its_prefix():
     robot, payload = fflin.load("ets_vii"), fflin.load("servicer_7dof")
     payload = payload.replace(stiffness={"panel_left": 80.0})
-    found = fflin.capture(robot, "tool", payload, prefix="client")
-    assert found.robot.stiffness == {"client.panel_left": 80.0}
-    assert "client.joint_1" in found.robot.joint_names
-    assert found.robot.inputs == robot.inputs and found.energy_lost == 0.0
-    S = fflin.sensitivity(fflin.linearize(found.robot))
+    result = fflin.capture(robot, "tool", payload, prefix="client")
+    assert result.robot.stiffness == {"client.panel_left": 80.0}
+    assert "client.joint_1" in result.robot.joint_names
+    assert result.robot.inputs == robot.inputs and result.energy_lost == 0.0
+    S = fflin.sensitivity(fflin.linearize(result.robot))
     assert S.parameters["client.link_3.mass"].value == pytest.approx(9.5)
-    again = fflin.capture(found.robot, "client.tool", DEBRIS)
+    again = fflin.capture(result.robot, "client.tool", DEBRIS)
     assert again.robot.mass == pytest.approx(robot.mass + payload.mass + 500.0)
 
 
-def test_a_body_that_was_caught_has_parameters_of_its_own():
+def test_a_captured_payload_has_separate_parameters():
     robot = fflin.load("servicer_7dof")
-    found = fflin.capture(robot, "tool", DEBRIS)
-    S = fflin.sensitivity(fflin.linearize(found.robot))
+    result = fflin.capture(robot, "tool", DEBRIS)
+    S = fflin.sensitivity(fflin.linearize(result.robot))
     assert S.parameters["payload.mass"].value == 500.0
     assert S.parameters["link_7.mass"].value == pytest.approx(6.0)
-    of = fflin.uncertain(found.robot, {"payload.density": 0.1})
-    heavier = of.at({"payload.density": 1.1})
+    uncertain = fflin.uncertain(result.robot, {"payload.density": 0.1})
+    heavier = uncertain.at({"payload.density": 1.1})
     again = fflin.capture(
         robot, "tool", pin.Inertia(550.0, DEBRIS.lever, 1.1 * DEBRIS.inertia)
     )
-    B, wanted = (fflin.linearize(each).B for each in (heavier, again.robot))
+    B, wanted = (fflin.linearize(item).B for item in (heavier, again.robot))
     assert np.abs(B - wanted).max() < 1e-12 * np.abs(wanted).max()
 
 
 @pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
-def test_what_is_wrong_is_one_line():
+def test_errors_are_one_line():
     robot, other = fflin.load("ets_vii"), fflin.load("cubesat")
     cases = [
         (lambda: fflin.capture(robot, "claw", DEBRIS), "claw"),
@@ -206,10 +208,10 @@ def test_what_is_wrong_is_one_line():
             "gravity",
         ),
     ]
-    for call, said in cases:
+    for call, message in cases:
         with pytest.raises(fflin.FflinError) as error:
             call()
-        assert said in str(error.value) and "\n" not in str(error.value)
+        assert message in str(error.value) and "\n" not in str(error.value)
 
 
 def test_a_robot_grasps_its_twin():
@@ -217,11 +219,11 @@ def test_a_robot_grasps_its_twin():
     q, v, _ = random_point(robot, np.random.default_rng(1), speed=0.1)
     others = [fflin.load("ets_vii"), robot, robot.replace(damping=0.0)]
     first, *same = (
-        fflin.capture(robot, "tool", each, q=q, payload_q=q, payload_v=v)
-        for each in others
+        fflin.capture(robot, "tool", other, q=q, payload_q=q, payload_v=v)
+        for other in others
     )
-    for found in same:
-        assert (found.v == first.v).all() and (found.momentum == first.momentum).all()
+    for result in same:
+        assert (result.v == first.v).all() and (result.momentum == first.momentum).all()
 
 
 def test_momentum_that_a_payload_stores_is_not_lost_in_silence():
@@ -250,22 +252,22 @@ def test_all_of_a_payload_hangs_where_it_was_on_its_base(tmp_path):
         random_pose(np.random.default_rng(1), 70.0),
         fflin.configuration(held, {"b": 0.4}),
     )
-    found = fflin.capture(robot, "tool", held, placement=at, payload_q=q)
-    whole = found.robot
+    result = fflin.capture(robot, "tool", held, placement=at, payload_q=q)
+    whole = result.robot
     assert whole.limits == robot.limits
     assert [(f.joint.name, f.multiplier, f.offset) for f in whole.followers] == [
         ("payload.a", -2.0, 0.3)
     ]
     assert (np.sort(whole.model.armature)[-2:] == (0.3, 0.4)).all()
     placed = []
-    for each, point, start in ((held, q, "base"), (whole, found.q, "payload")):
-        data = each.create_data()
-        pin.framesForwardKinematics(each.model, data, point)
+    for item, point, start in ((held, q, "base"), (whole, result.q, "payload")):
+        data = item.create_data()
+        pin.framesForwardKinematics(item.model, data, point)
         names = [
             start,
-            *(f"{start}.{x}" if each is whole else x for x in ("base", "la", "lb")),
+            *(f"{start}.{x}" if item is whole else x for x in ("base", "la", "lb")),
         ]
-        first, *rest = (data.oMf[each.model.getFrameId(name)] for name in names)
+        first, *rest = (data.oMf[item.model.getFrameId(name)] for name in names)
         placed.append([first.actInv(one) for one in rest])
     for one, other in zip(*placed, strict=True):
         assert one.isApprox(other, 1e-12)

@@ -36,17 +36,17 @@ def test_a_base_at_the_reference_has_the_values_of_every_expression(shape):
         assert (matrices[0] - matrices[1] == 0.0).all()
 
 
-def test_slope_of_the_quaternion_kinematics_by_complex_step():
+def test_derivative_of_the_quaternion_kinematics_by_complex_step():
     rng = np.random.default_rng(1)
     q_b, w = np.array([0.3, -0.5, 0.2]), rng.normal(size=3)
-    found = tilted(q_b).rate_over_q_b(w, skew(w))
+    result = tilted(q_b).rate_over_q_b(w, skew(w))
     for k in range(3):
         eps = q_b + 1e-30j * np.eye(3)[k]
         rate = 0.5 * (np.sqrt(1.0 - eps @ eps) * w + np.cross(eps, w))
-        assert found[:, k] == pytest.approx(rate.imag / 1e-30, rel=1e-14)
+        assert result[:, k] == pytest.approx(rate.imag / 1e-30, rel=1e-14)
 
 
-def test_rows_are_turned_where_they_stand_and_there_and_back():
+def test_rows_are_rotated_in_place_and_back():
     chart = tilted(np.array([0.3, -0.5, 0.2]))
     x = np.arange(40.0).reshape(8, 5)
     parts = (slice(3, 6),)

@@ -28,26 +28,28 @@ def kinetic(robot, q, v):
 @pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
 def test_momentum_is_kept_and_energy_lost(name):
     robot, q, v = point(name)
-    found = fflin.jam(robot, CASES[name], q=q, v=v)
-    size = np.abs(found.momentum).max()
-    assert np.abs(found.momentum_after - found.momentum).max() < 1e-13 * size
-    lost = kinetic(robot, q, v) - kinetic(found.robot, found.q, found.v)
-    assert found.energy_lost == pytest.approx(lost, rel=1e-9) and lost > 0.0
-    assert fflin.check(found.robot, fflin.linearize(found.robot, found.q, found.v)).ok
+    result = fflin.jam(robot, CASES[name], q=q, v=v)
+    size = np.abs(result.momentum).max()
+    assert np.abs(result.momentum_after - result.momentum).max() < 1e-13 * size
+    lost = kinetic(robot, q, v) - kinetic(result.robot, result.q, result.v)
+    assert result.energy_lost == pytest.approx(lost, rel=1e-9) and lost > 0.0
+    assert fflin.check(
+        result.robot, fflin.linearize(result.robot, result.q, result.v)
+    ).ok
 
 
 def test_the_other_joints_are_free_and_the_impulse_is_on_the_jammed_one():
     robot, q, v = point("servicer_7dof")
-    found = fflin.jam(robot, "joint_3", q=q, v=v)
-    after = np.insert(found.v, 8, 0.0)  # joint_3 is the third
+    result = fflin.jam(robot, "joint_3", q=q, v=v)
+    after = np.insert(result.v, 8, 0.0)  # joint_3 is the third
     M = pin.crba(robot.model, robot.create_data(), q)
     change = (np.triu(M) + np.triu(M, 1).T) @ (after - v)
-    assert change[8] == pytest.approx(found.impulse[0])
+    assert change[8] == pytest.approx(result.impulse[0])
     assert np.abs(np.delete(change, 8)).max() < 1e-12 * abs(change[8])
-    assert found.event == "joint_3 jammed"
-    assert "tau_m.joint_3" not in fflin.linearize(found.robot).input_names
+    assert result.event == "joint_3 jammed"
+    assert "tau_m.joint_3" not in fflin.linearize(result.robot).input_names
     again = fflin.load("servicer_7dof", lock={"joint_3": float(q[9])})
-    one, other = (fflin.linearize(each, found.q) for each in (found.robot, again))
+    one, other = (fflin.linearize(item, result.q) for item in (result.robot, again))
     assert (
         one.state_names == other.state_names and np.abs(one.B - other.B).max() < 1e-15
     )
@@ -56,7 +58,7 @@ def test_the_other_joints_are_free_and_the_impulse_is_on_the_jammed_one():
 def test_it_is_the_limit_of_a_stiff_brake():
     """The joint's speed decays as exp(-t d/I): what is left of the way halves with 1/d."""
     robot, q, v = point("ets_vii", speed=0.05)
-    found = fflin.jam(robot, "joint_2", q=q, v=v)
+    result = fflin.jam(robot, "joint_2", q=q, v=v)
 
     def after(brake):
         time = 2e4 / brake
@@ -65,10 +67,10 @@ def test_it_is_the_limit_of_a_stiff_brake():
         return fflin.simulate(braked, None, **options).v[-1]
 
     slow, fast = (np.delete(after(brake), 7) for brake in (2e7, 4e7))
-    errors = [np.abs(each - found.v).max() for each in (slow, fast)]
-    jump = np.abs(found.v - np.delete(v, 7)).max()
+    errors = [np.abs(item - result.v).max() for item in (slow, fast)]
+    jump = np.abs(result.v - np.delete(v, 7)).max()
     assert errors[1] < 0.02 * jump and 1.8 < errors[0] / errors[1] < 2.2
-    assert np.abs(2.0 * fast - slow - found.v).max() < 0.1 * errors[1]
+    assert np.abs(2.0 * fast - slow - result.v).max() < 0.1 * errors[1]
 
 
 def test_a_wheel_that_seizes_gives_its_momentum_to_its_carrier():
@@ -76,15 +78,15 @@ def test_a_wheel_that_seizes_gives_its_momentum_to_its_carrier():
     robot = fflin.load("cubesat", inputs=[*wheels, fflin.BaseTorque()])
     robot = robot.replace(gravity=(0.0, 0.0, -1.0))
     v = fflin.velocity(robot, {"wheel_2": 300.0, "wheel_3": 10.0})
-    found = fflin.jam(robot, "wheel_2", v=v)
-    assert list(found.robot.wheels) == ["wheel_1", "wheel_3"]
-    assert found.robot.gravity == (0.0, 0.0, -1.0)
+    result = fflin.jam(robot, "wheel_2", v=v)
+    assert list(result.robot.wheels) == ["wheel_1", "wheel_3"]
+    assert result.robot.gravity == (0.0, 0.0, -1.0)
     body = robot.model.inertias[1].inertia + 1e-3 * np.diag([1.0, 1.0, 1.0])
-    assert found.v[4] == pytest.approx(0.3 / body[1, 1]) and found.impulse[0] < 0.0
-    assert np.abs(found.momentum_after - found.momentum).max() < 1e-15
+    assert result.v[4] == pytest.approx(0.3 / body[1, 1]) and result.impulse[0] < 0.0
+    assert np.abs(result.momentum_after - result.momentum).max() < 1e-15
 
 
-def test_fields_lose_what_is_of_the_joint():
+def test_fields_lose_the_entries_of_the_jammed_joint():
     robot = fflin.load(
         "ets_vii",
         stiffness=2.0,
@@ -109,7 +111,7 @@ def test_fields_lose_what_is_of_the_joint():
 
 
 @pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
-def test_what_mimics_a_joint_stops_with_it(tmp_path):
+def test_mimic_joints_stop_with_their_leader(tmp_path):
     mimic = '<mimic joint="b" multiplier="-2" offset="0.3"/>'
     document = MIMIC.format(
         links=LINKS, a="revolute", b="revolute", parent="base", mimic=mimic
@@ -118,16 +120,16 @@ def test_what_mimics_a_joint_stops_with_it(tmp_path):
     robot = fflin.load(tmp_path / "r.urdf")
     q = fflin.configuration(robot, {"b": 0.4})
     v = fflin.velocity(robot, {"b": 0.5, "omega_b.z": 0.1})
-    found = fflin.jam(robot, "b", q=q, v=v)
-    assert found.robot.n == 0 and not found.robot.followers
-    size = np.abs(found.momentum).max()
-    assert np.abs(found.momentum - found.momentum_after).max() < 1e-13 * size
-    assert found.energy_lost == pytest.approx(
-        kinetic(robot, q, v) - kinetic(found.robot, found.q, found.v)
+    result = fflin.jam(robot, "b", q=q, v=v)
+    assert result.robot.n == 0 and not result.robot.followers
+    size = np.abs(result.momentum).max()
+    assert np.abs(result.momentum - result.momentum_after).max() < 1e-13 * size
+    assert result.energy_lost == pytest.approx(
+        kinetic(robot, q, v) - kinetic(result.robot, result.q, result.v)
     )
 
 
-def test_what_was_caught_may_jam_too():
+def test_joints_of_the_payload_may_jam_too():
     robot, payload = fflin.load("ets_vii"), fflin.load("servicer_7dof")
     caught = fflin.capture(robot, "tool", payload)
     left = fflin.jam(caught.robot, "payload.panel_left", q=caught.q, v=caught.v)
@@ -140,7 +142,7 @@ def test_what_was_caught_may_jam_too():
 @pytest.mark.parametrize(
     "payload", [pin.Inertia(5.0, np.zeros(3), np.eye(3)), "cubesat"]
 )
-def test_a_link_of_what_was_caught_never_stands_for_a_whole_body(payload):
+def test_a_link_of_the_payload_never_replaces_a_whole_body(payload):
     """A model of other origin has no links, so the body that grasps keeps its own name."""
     model = fflin.load("planar_detumble").model
     robot = fflin.from_model(model)
@@ -148,24 +150,24 @@ def test_a_link_of_what_was_caught_never_stands_for_a_whole_body(payload):
     caught = fflin.capture(robot, "hand", held).robot
     bodies = zip(caught.model.names, caught.model.inertias, strict=True)
     masses = {name: body.mass for name, body in bodies if body.mass}
-    found = {name: piece.mass for name, piece in caught.pieces.items()}
-    assert [*found] == ["base", *[*masses][1:]]
-    assert [*found.values()] == [*masses.values()]
+    result = {name: piece.mass for name, piece in caught.pieces.items()}
+    assert [*result] == ["base", *[*masses][1:]]
+    assert [*result.values()] == [*masses.values()]
     heavier = caught.with_mass_properties({"joint_3": {"mass": 100.0}})
-    assert heavier.mass == pytest.approx(caught.mass + 100.0 - found["joint_3"])
+    assert heavier.mass == pytest.approx(caught.mass + 100.0 - result["joint_3"])
 
 
-def test_a_joint_of_what_was_caught_keeps_the_spring_of_its_own_name():
+def test_a_joint_of_the_payload_keeps_its_spring():
     robot = fflin.load("ets_vii", stiffness=3.0)
     caught = fflin.capture(robot, "tool", robot.replace(stiffness=4.0))
     left = fflin.jam(caught.robot, "joint_2", q=caught.q, v=caught.v).robot
     assert left.stiffness["payload.joint_2"] == 4.0 and "joint_2" not in left.stiffness
 
 
-def test_what_is_wrong_is_one_line():
+def test_errors_are_one_line():
     robot = fflin.load("ets_vii")
     only = robot.replace(inputs=[fflin.JointTorque("joint_1")])
-    for call, said in [
+    for call, message in [
         (lambda: fflin.jam(robot, "elbow"), "elbow"),
         (lambda: fflin.jam(robot, []), "joints"),
         (lambda: fflin.jam("ets_vii", "joint_1"), "fflin.Robot"),
@@ -174,4 +176,4 @@ def test_what_is_wrong_is_one_line():
     ]:
         with pytest.raises(fflin.FflinError) as error:
             call()
-        assert said in str(error.value) and "\n" not in str(error.value)
+        assert message in str(error.value) and "\n" not in str(error.value)

@@ -98,7 +98,7 @@ def test_bound_on_rounding_holds(name):
         assert error.max() < np.finfo(float).eps * coupling
 
 
-def test_slide_beyond_its_bound_costs_no_digit():
+def test_slide_beyond_its_bound_loses_no_accuracy():
     robot = fflin.load("tiago_no_hand")
     (slide,) = [joint.name for joint in robot.joints if joint.prismatic]
     lin = fflin.linearize(robot, fflin.configuration(robot, {slide: 50.0}))
@@ -110,7 +110,7 @@ def test_slide_beyond_its_bound_costs_no_digit():
     )
 
 
-def test_far_base_costs_no_digit():
+def test_far_base_loses_no_accuracy():
     robot = fflin.load("servicer_7dof")
     orbit = pin.SE3(pin.exp3(np.array([0.3, -0.9, 0.4])), np.array([7e6, -2e6, 1e6]))
     far = fflin.linearize(robot, fflin.configuration(robot, {"joint_2": 0.4}, orbit))
@@ -205,15 +205,15 @@ def test_mimic_joints_leave_one_degree_of_freedom(types, parent, tmp_path):
     for frame in ("hybrid", "local", "world"):
         v = S @ rng.normal(size=7)
         moving = fflin.linearize(robot, q, v, rng.normal(size=7), frame=frame)
-        found = fflin.check(robot, moving)
-        assert found.ok, found
+        result = fflin.check(robot, moving)
+        assert result.ok, result
         # Kinetic energy of the independent velocities is that of all.
         nu = moving.x0[7:]
         energy = pin.computeKineticEnergy(robot.model, robot.model.createData(), q, v)
         assert 0.5 * nu @ moving.M @ nu == pytest.approx(energy, rel=1e-13)
 
 
-def test_what_does_not_follow_its_leader_is_refused():
+def test_an_invalid_mimic_joint_is_refused():
     robot = fflin.load("panda")
     q = robot.neutral()
     follower = robot.followers[0].joint
@@ -233,7 +233,7 @@ def test_singular_m_of_mimic_joints_is_refused():
         fflin.linearize(fflin.load("romeo"))
 
 
-def test_what_mimics_a_locked_joint_is_welded_where_it_follows(tmp_path):
+def test_mimic_joints_of_a_locked_leader_are_welded(tmp_path):
     document = MIMIC.format(
         links=LINKS,
         a="revolute",

@@ -74,11 +74,11 @@ def rows_of(robot, count, seed=0):
 
 
 @pytest.mark.parametrize("name", ROBOTS)
-def test_sums_are_those_of_pinocchio(name):
+def test_sums_match_pinocchio(name):
     robot = ROBOTS[name]()
     model, data = robot.model, robot.create_data()
     q, v = rows_of(robot, 20)
-    found = integrals(robot, q, v)
+    result = integrals(robot, q, v)
     # Each sum has at most some hundred terms, whose rounding errors add up to far less than this.
     tolerance = 1e-13
     for i in range(len(q)):
@@ -91,13 +91,13 @@ def test_sums_are_those_of_pinocchio(name):
             momentum[3:] += data.oMi[joint].rotation @ stored
         center = data.com[0]
         polar = 0.5 * np.trace(data.Ig.inertia) + robot.mass * center @ center
-        assert found.energy[i] == pytest.approx(energy, rel=tolerance)
+        assert result.energy[i] == pytest.approx(energy, rel=tolerance)
         size = np.sqrt(2.0 * energy * robot.mass) * (1.0 + np.sqrt(polar / robot.mass))
-        assert np.abs(found.momentum[i] - momentum).max() < tolerance * size
-        assert np.abs(found.center[i] - center).max() < tolerance * np.sqrt(
+        assert np.abs(result.momentum[i] - momentum).max() < tolerance * size
+        assert np.abs(result.center[i] - center).max() < tolerance * np.sqrt(
             polar / robot.mass
         )
-        assert found.polar[i] == pytest.approx(polar, rel=tolerance)
+        assert result.polar[i] == pytest.approx(polar, rel=tolerance)
 
 
 @pytest.mark.parametrize("name", ["canadarm2", "every kind of joint"])

@@ -44,11 +44,11 @@ def test_a_body_is_pulled_as_its_mass_points(frame):
         for m, x in zip(masses, points, strict=True)
     ]
     torque = sum(np.cross(x, pull) for x, pull in zip(points, pulls, strict=True))
-    found = field.wrenches(data)[1]
+    result = field.wrenches(data)[1]
     assert np.allclose(
-        found.linear, sum(pulls), rtol=0, atol=1e-13 * np.abs(pulls).max()
+        result.linear, sum(pulls), rtol=0, atol=1e-13 * np.abs(pulls).max()
     )
-    assert np.allclose(found.angular, torque, rtol=0, atol=1e-13 * np.abs(pulls).max())
+    assert np.allclose(result.angular, torque, rtol=0, atol=1e-13 * np.abs(pulls).max())
 
 
 @pytest.mark.parametrize(

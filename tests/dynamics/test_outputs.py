@@ -178,13 +178,13 @@ def assert_derivatives(robot, q, v, a, *, gravity=GRAVITY, tolerance=1e-9):
         differences(lambda d: y(q, v + d, a), robot.nv),
         differences(lambda d: y(q, v, a + d), robot.nv),
     )
-    here = y(q, v, a)
-    for rows in np.arange(len(here)).reshape(-1, 3):
-        scale = max(np.abs(here[rows]).max(), 1.0)
+    value = y(q, v, a)
+    for rows in np.arange(len(value)).reshape(-1, 3):
+        scale = max(np.abs(value[rows]).max(), 1.0)
         if sensing.names[rows[0]] == "momentum.angular.x":
             # Summed in the world it is the difference of two that hold the linear momentum.
             scale += robot.mass * np.linalg.norm(v[:3])
-        assert np.abs(sensed.y[rows] - here[rows]).max() < 1e-12 * scale
+        assert np.abs(sensed.y[rows] - value[rows]).max() < 1e-12 * scale
         for got, difference in zip(sensed[1:], expected, strict=True):
             size = max(np.abs(difference[rows]).max(), scale)
             worst = np.abs(got[rows] - difference[rows]).max() / size
@@ -333,7 +333,7 @@ def test_laws(name):
     assert not feeling.evaluate(data, q, v, a).by_q[:, :6].any()
 
 
-def test_free_fall_is_not_felt():
+def test_accelerometers_do_not_measure_free_fall():
     """Under gravity and no forces an accelerometer reads what it reads without either."""
     robot = ROBOTS["servicer_7dof"]()
     q, v, _ = point(robot, np.random.default_rng(4))
@@ -349,7 +349,7 @@ def test_free_fall_is_not_felt():
 
 @pytest.mark.parametrize("degrees", mostly([0.0, 1e-6, 90.0, 160.0], 1e-6, 160.0))
 @pytest.mark.parametrize("name", mostly(ROBOTS, "ets_vii", "moved_root", "tree_2"))
-def test_derivatives_are_those_of_the_nonlinear_outputs(name, degrees):
+def test_derivatives_match_the_nonlinear_outputs(name, degrees):
     robot = ROBOTS[name]()
     q, v, a = point(robot, np.random.default_rng(int(degrees)), degrees)
     assert_derivatives(robot, q, v, a)
@@ -371,7 +371,7 @@ def test_derivatives_at_orbital_speed(name):
 
 
 @pytest.mark.parametrize("name", ROBOTS)
-def test_orbit_costs_no_digits(name):
+def test_orbit_loses_no_accuracy(name):
     """Where the base is and how fast it moves along changes what it must, and no digit more."""
     robot = ROBOTS[name]().replace(gravity=GRAVITY)
     rng = np.random.default_rng(7)
@@ -379,7 +379,7 @@ def test_orbit_costs_no_digits(name):
     sensing = Sensing(state, all_measured(robot))
     q, v, a = point(robot, rng)
     v[:3] = 0.0
-    here = sensing.evaluate(robot.create_data(), q, v, a)
+    value = sensing.evaluate(robot.create_data(), q, v, a)
     away, speed = rng.normal(size=(2, 3))
     away *= ORBIT / np.linalg.norm(away)
     speed *= SPEED / np.linalg.norm(speed)
@@ -398,9 +398,9 @@ def test_orbit_costs_no_digits(name):
     for row in range(0, len(sensing.names), 3):
         rows, kind = slice(row, row + 3), sensing.names[row].split(".")[-2]
         y, by_q, by_v = (
-            here.y[rows].copy(),
-            here.by_q[rows].copy(),
-            here.by_v[rows].copy(),
+            value.y[rows].copy(),
+            value.by_q[rows].copy(),
+            value.by_v[rows].copy(),
         )
         scale = 1.0
         relative = "/" in sensing.names[row]
@@ -412,7 +412,7 @@ def test_orbit_costs_no_digits(name):
             by_q[:, 3:6] -= drift[kind] * R @ skew(speed)
             scale = drift[kind] * SPEED
         elif kind == "acceleration":
-            by_v[:, 3:6] -= here.by_a[rows, :3] @ skew(speed)
+            by_v[:, 3:6] -= value.by_a[rows, :3] @ skew(speed)
             scale = SPEED
         assert (
             np.abs(far.y[rows] - y).max() < 1e-15 * scale * 4 + 1e-14 * np.abs(y).max()
@@ -426,18 +426,18 @@ def test_orbit_costs_no_digits(name):
             < 1e-15 * scale * 8 + tolerance
         )
         assert np.abs(far.by_v[rows, :6] - by_v[:, :6]).max() < 1e-15 * scale * 8
-        assert (far.by_a[rows] == here.by_a[rows]).all()
+        assert (far.by_a[rows] == value.by_a[rows]).all()
 
 
 def test_own_reference_is_the_base():
     robot = ROBOTS["dual_arm"]().replace(gravity=GRAVITY)
     q, v, a = point(robot, np.random.default_rng(8))
     base = pin.XYZQUATToSE3(q[:7])
-    own = Sensing(StateMap(robot), all_measured(robot), own_reference=True)
-    told = Sensing(StateMap(robot, reference=base), all_measured(robot))
+    default = Sensing(StateMap(robot), all_measured(robot), own_reference=True)
+    messages = Sensing(StateMap(robot, reference=base), all_measured(robot))
     pairs = zip(
-        own.evaluate(robot.create_data(), q, v, a),
-        told.evaluate(robot.create_data(), q, v, a),
+        default.evaluate(robot.create_data(), q, v, a),
+        messages.evaluate(robot.create_data(), q, v, a),
         strict=True,
     )
     for got, expected in pairs:
@@ -519,7 +519,7 @@ def test_a_link_comes_before_a_joint_of_its_name():
         (["tool"], fflin.InputError, "'tool'"),
     ],
 )
-def test_what_cannot_be_is_refused(outputs, error, message):
+def test_an_impossible_value_is_refused(outputs, error, message):
     with pytest.raises(error, match=message):
         Sensing(StateMap(fflin.load("servicer_7dof")), outputs)
 

@@ -76,7 +76,7 @@ def test_root_joint_placed_in_the_world_is_part_of_the_pose():
 
 
 @pytest.mark.parametrize("frame", FRAMES)
-def test_velocity_frames_are_what_they_say(frame):
+def test_velocity_frames_agree_with_their_definitions(frame):
     robot = fflin.load("astrobee_arm")
     rng = np.random.default_rng(5)
     reference = random_pose(rng, 60.0)
@@ -123,7 +123,7 @@ def test_names_and_units_follow_pinocchios_joint_order():
     assert lin.input_units[3:] == ("N", "N", "N", "N", "N m")
 
 
-def test_turn_of_exactly_pi_is_refused_with_what_happens():
+def test_a_rotation_of_exactly_pi_is_refused_with_the_reason():
     robot = fflin.load("cubesat")
     q = np.array([0, 0, 0, 1.0, 0, 0, 0])
     state = fflin.StateMap(robot)
@@ -195,12 +195,12 @@ def test_random_trees_round_trip():
         assert v_again == pytest.approx(v, abs=1e-14)
 
 
-def test_it_says_of_which_robot_it_is():
+def test_repr_names_the_robot():
     shown = repr(fflin.StateMap(fflin.load("cubesat"), frame="world"))
     assert shown == "StateMap('cubesat', nx=12, frame='world')"
 
 
-def test_bad_arguments_name_what_is_wrong():
+def test_invalid_arguments_are_named_in_the_error():
     robot = fflin.load("ets_vii")
     state = fflin.StateMap(robot)
     q = fflin.configuration(robot)

@@ -40,7 +40,7 @@ def test_feedback_reads_the_state_whose_angles_are_near(name, frame):
 
 
 @pytest.mark.parametrize("name", ["ets_vii", "servicer_7dof", "tiago_dual"])
-def test_a_small_error_of_a_joint_keeps_its_digits(name):
+def test_a_small_error_of_a_joint_keeps_its_accuracy(name):
     robot, rng = fflin.load(name), np.random.default_rng(2)
     state, at = fflin.StateMap(robot, frame="local"), slice(6, 6 + robot.n)
     for size in (1e-9, 1e-8, 1e-3, 2.0):
@@ -78,8 +78,8 @@ def test_rates_tell_the_turns_between_rows():
         for a in angles
     ]
     v = np.hstack((np.zeros((5, 6)), rates))
-    found = state_history(state, np.array(q), v, t=t)[:, state.groups.q_m]
-    np.testing.assert_allclose(found, angles, atol=1e-12)
+    result = state_history(state, np.array(q), v, t=t)[:, state.groups.q_m]
+    np.testing.assert_allclose(result, angles, atol=1e-12)
 
 
 def test_cf4_is_the_published_scheme():
@@ -113,7 +113,7 @@ def test_cf4_is_the_published_scheme():
     assert times[:4] == times[4:8]
 
 
-def test_a_policy_may_keep_what_it_is_given():
+def test_a_policy_may_keep_its_arguments():
     robot = fflin.load("servicer_7dof")
     _, v0 = anywhere(robot, np.random.default_rng(8))
     kept = []
@@ -247,3 +247,17 @@ def test_loop_about_a_bent_point_comes_to_it_and_differs_in_second_order(sample)
     end = run(0.02, 60.0)
     assert np.abs(end.error[-1]).max() < 1e-6
     np.testing.assert_allclose(end.u[-1], lin.u0, atol=1e-3)
+
+
+def test_the_error_from_a_moving_reference_has_the_difference_of_the_velocities():
+    """The reference itself has no error, and an error of the velocities is read back."""
+    robot = fflin.load("servicer_7dof")
+    state = fflin.StateMap(robot, frame="local")
+    rng = np.random.default_rng(2)
+    q = fflin.configuration(robot, {"joint_1": 0.4})
+    v_star, change = rng.normal(size=(2, robot.nv))
+    assert not moving_error(state, q, v_star, q, v_star).any()
+    error = moving_error(state, q, v_star, q, v_star + change)
+    expected = state.velocities(change)
+    np.testing.assert_allclose(error[-len(expected) :], expected, atol=1e-14)
+    assert not error[: -len(expected)].any()

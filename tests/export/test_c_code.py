@@ -48,11 +48,13 @@ def tracking():
 
 def mixed():
     """A compensator with a direct term, and outputs among which are continuous joints."""
-    robot, lin, by = compensated(
+    robot, lin, controller = compensated(
         fflin.load("cubesat", inputs=fflin.load_inputs("cubesat"))
     )
     D = np.random.default_rng(1).normal(size=lin.D.T.shape) * ~lin.D.any(axis=1)
-    return robot, fflin.LinearController((by.A, by.B, by.C, D, lin.dt), lin)
+    return robot, fflin.LinearController(
+        (controller.A, controller.B, controller.C, D, lin.dt), lin
+    )
 
 
 @functools.cache
@@ -75,8 +77,8 @@ def law(kind):
         robot, policy, _ = between_gains(fflin.load("servicer_7dof"))
         return robot, policy
     if kind == "lqg":
-        robot, lin, by = compensated(fflin.load("servicer_7dof"))
-        return robot, fflin.OutputFeedback(lin, by)
+        robot, lin, controller = compensated(fflin.load("servicer_7dof"))
+        return robot, fflin.OutputFeedback(lin, controller)
     if kind == "mixed":
         return mixed()
     robot, _, schedule = tracking()
@@ -101,16 +103,16 @@ FLOATS = ("wheels", "lqg", "schedule")
     ],
 )
 def test_the_code_compiles_and_agrees(kind, real, compiler, tmp_path):
-    robot, by = law(kind)
-    folder = fflin.write_c(by, tmp_path, robot=robot, real=real)
-    code, said = outcome(folder, compiler)
-    assert (code, said) == (0, "all cases agree, 0 differences\n")
+    robot, controller = law(kind)
+    folder = fflin.write_c(controller, tmp_path, robot=robot, real=real)
+    code, message = outcome(folder, compiler)
+    assert (code, message) == (0, "all cases agree, 0 differences\n")
 
 
 @pytest.mark.parametrize("kind", ["hybrid", "lqg", "schedule"])
 def test_limits_are_reached_and_told(kind, tmp_path):
-    robot, by = law(kind)
-    folder = fflin.write_c(by, tmp_path, robot=robot, limits=0.05)
+    robot, controller = law(kind)
+    folder = fflin.write_c(controller, tmp_path, robot=robot, limits=0.05)
     assert outcome(folder, COMPILERS[0])[0] == 0
     source = (folder / "controller_test.c").read_text()
     statuses = re.findall(r", ([01])\}", source)
@@ -141,23 +143,23 @@ def test_limits_are_reached_and_told(kind, tmp_path):
     ],
 )
 def test_the_test_program_finds_a_changed_line(kind, change, tmp_path):
-    robot, by = law(kind)
-    folder = fflin.write_c(by, tmp_path, robot=robot)
+    robot, controller = law(kind)
+    folder = fflin.write_c(controller, tmp_path, robot=robot)
     source = (folder / "controller.c").read_text()
     assert source.count(change[0]) >= 1
     (folder / "controller.c").write_text(source.replace(*change))
-    code, said = outcome(folder, COMPILERS[0])
+    code, message = outcome(folder, COMPILERS[0])
     assert code == 1
-    assert re.search(r"case \d+: .+ is \S+, expected ", said)
+    assert re.search(r"case \d+: .+ is \S+, expected ", message)
 
 
 def test_the_header_names_every_entry(tmp_path):
-    robot, by = law("hybrid")
-    fflin.write_c(by, tmp_path, name="arm", real="float")  # which is replaced
-    header = (fflin.write_c(by, tmp_path, name="arm") / "arm.h").read_text()
+    robot, controller = law("hybrid")
+    fflin.write_c(controller, tmp_path, name="arm", real="float")  # which is replaced
+    header = (fflin.write_c(controller, tmp_path, name="arm") / "arm.h").read_text()
     for name in (
-        *by.lin.state_names,
-        *by.lin.input_names,
+        *controller.lin.state_names,
+        *controller.lin.input_names,
         robot.urdf_sha256,
         fflin.__version__,
     ):
@@ -166,19 +168,21 @@ def test_the_header_names_every_entry(tmp_path):
 
 
 def test_the_code_has_no_state_and_calls_sqrt_alone(tmp_path):
-    by = law("grid")[1]
-    source = (fflin.write_c(by, tmp_path) / "controller.c").read_text()
+    controller = law("grid")[1]
+    source = (fflin.write_c(controller, tmp_path) / "controller.c").read_text()
     header = (tmp_path / "controller.h").read_text()
     assert (
-        f"K interpolated linearly over {', '.join(by.table()[0])}, constant outside"
+        f"K interpolated linearly over {', '.join(controller.table()[0])}, constant outside"
         in header
     )
     assert not re.search(r"^static (?!const|int|void)", source, re.MULTILINE)
     called = set(
         re.findall(r"\b(\w+)\(", re.sub(r"/\*.*?\*/", "", source, flags=re.DOTALL))
     )
-    own = set(re.findall(r"^(?:static )?(?:int|void) (\w+)\(", source, re.MULTILINE))
-    assert called - own <= {"sqrt", "if", "for"}
+    default = set(
+        re.findall(r"^(?:static )?(?:int|void) (\w+)\(", source, re.MULTILINE)
+    )
+    assert called - default <= {"sqrt", "if", "for"}
 
 
 FLIGHTS = {
@@ -197,14 +201,14 @@ FLIGHTS = {
 def test_a_simulation_with_the_code_is_the_simulation_without(kind, tmp_path):
     if kind in ("hybrid", "local", "world"):  # sampled
         robot = fflin.load("servicer_7dof")
-        by = about(robot, kind, dt=0.1)
+        controller = about(robot, kind, dt=0.1)
     elif kind == "wheels":
         robot, _ = law(kind)
         lin = fflin.linearize(robot)
-        by = fflin.StateFeedback(lin, fflin.lqr(lin).K)
+        controller = fflin.StateFeedback(lin, fflin.lqr(lin).K)
     else:
-        robot, by = law(kind)
-    code = fflin.CLaw(fflin.write_c(by, tmp_path, robot=robot))
+        robot, controller = law(kind)
+    code = fflin.CLaw(fflin.write_c(controller, tmp_path, robot=robot))
     joints = dict.fromkeys(robot.joint_names[-1:], 0.2)
     turned = POSE * pin.SE3(
         pin.rpy.rpyToMatrix(0.1, 0.2, 0.3), np.array([0.02, 0.0, 0.1])
@@ -217,7 +221,7 @@ def test_a_simulation_with_the_code_is_the_simulation_without(kind, tmp_path):
     options = {"q0": q0, "duration": 1.0, "dt": 0.01, "engine": "python"} | FLIGHTS[
         kind
     ]
-    one, other = (fflin.simulate(robot, each, **options) for each in (by, code))
+    one, other = (fflin.simulate(robot, item, **options) for item in (controller, code))
     scale = 1.0 + np.abs(one.u).max()
     assert np.abs(one.q - other.q).max() < 1e-12
     assert np.abs(one.v - other.v).max() < 1e-12
@@ -251,14 +255,18 @@ def test_a_law_from_a_file_needs_its_robot(tmp_path):
         ({"law": "compensator"}, "continuous, expected a sampled"),
     ],
 )
-def test_what_cannot_be_written_is_refused(change, match, tmp_path):
-    robot, by = law("hybrid")
+def test_a_law_that_cannot_be_exported_is_refused(change, match, tmp_path):
+    robot, controller = law("hybrid")
     if change.get("law") == "continuous":
         robot, along, _ = tracking()
         change = {"law": fflin.tvlqr(along), "robot": robot}
     if change.get("law") == "compensator":
-        change = {"law": fflin.lqg(fflin.lqr(by.lin), fflin.kalman(by.lin, 1e-3, 1e-4))}
-    options = {"law": by} | change
+        change = {
+            "law": fflin.lqg(
+                fflin.lqr(controller.lin), fflin.kalman(controller.lin, 1e-3, 1e-4)
+            )
+        }
+    options = {"law": controller} | change
     with pytest.raises(fflin.InputError, match=match):
         fflin.write_c(options.pop("law"), tmp_path / "none", **options)
     assert not (tmp_path / "none").exists()
@@ -328,20 +336,20 @@ def test_a_law_is_not_written_for_another_robot_of_the_same_name(kind, saved, tm
     robot = fflin.load(path)
     if kind == "compensator":
         lin = fflin.linearize(robot).discretize(0.1)
-        by = fflin.lqg(fflin.lqr(lin), fflin.kalman(lin, 1e-3, 1e-4))
+        controller = fflin.lqg(fflin.lqr(lin), fflin.kalman(lin, 1e-3, 1e-4))
     else:
         v0 = fflin.velocity(robot, {"joint_1": 0.1})
         motion = fflin.simulate(robot, v0=v0, duration=2.0, every=20)
-        by = fflin.tvlqr(
+        controller = fflin.tvlqr(
             fflin.linearize_trajectory(robot, motion.trajectory()), sample=0.1
         )
     if saved:
-        by.save(tmp_path / "by.npz")
-        by = type(by).load(tmp_path / "by.npz")
+        controller.save(tmp_path / "by.npz")
+        controller = type(controller).load(tmp_path / "by.npz")
     for options in ({}, {"robot": fflin.load("ets_vii")}):
         with pytest.raises(fflin.InputError, match="another URDF or other masses than"):
-            fflin.write_c(by, tmp_path / "none", **options)
-    folder = fflin.write_c(by, tmp_path / "c", robot=robot)
+            fflin.write_c(controller, tmp_path / "none", **options)
+    folder = fflin.write_c(controller, tmp_path / "c", robot=robot)
     assert robot.urdf_sha256 in (folder / "controller.h").read_text()
     assert not (tmp_path / "none").exists()
 
@@ -381,16 +389,19 @@ def test_files_of_another_law_or_edited_ones_are_refused(ending, tmp_path):
 def test_a_folder_holds_several_laws_and_none_is_lost(tmp_path):
     robot = fflin.load("planar_detumble")
     lin = fflin.linearize(robot).discretize(0.1)
-    gain, by = fflin.lqr(lin), fflin.lqg(fflin.lqr(lin), fflin.kalman(lin, 1e-3, 1e-4))
+    gain, controller = (
+        fflin.lqr(lin),
+        fflin.lqg(fflin.lqr(lin), fflin.kalman(lin, 1e-3, 1e-4)),
+    )
     fflin.write_c(gain, tmp_path)
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
-    for law in (by, fflin.lqr(fflin.linearize(fflin.load("cubesat")))):
+    for law in (controller, fflin.lqr(fflin.linearize(fflin.load("cubesat")))):
         with pytest.raises(
             fflin.InputError, match=r"controller\.h exists and does not belong to"
         ):
             fflin.write_c(law, tmp_path)
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
-    fflin.write_c(fflin.OutputFeedback(lin, by), tmp_path, name="filter")
+    fflin.write_c(fflin.OutputFeedback(lin, controller), tmp_path, name="filter")
     fflin.write_c(fflin.lqr(lin, 2.0, 1.0), tmp_path)  # the same gain, tuned again
     with pytest.raises(
         fflin.FileError, match="contains the laws controller, filter; choose one"
@@ -405,41 +416,41 @@ def test_a_folder_holds_several_laws_and_none_is_lost(tmp_path):
 
 @pytest.mark.parametrize("ending", ["c", "h"])
 def test_edited_code_is_not_overwritten(ending, tmp_path):
-    by = law("no joints")[1]
-    fflin.write_c(by, tmp_path)
+    controller = law("no joints")[1]
+    fflin.write_c(controller, tmp_path)
     path = tmp_path / f"controller.{ending}"
     path.write_text(f"{path.read_text()}/* reviewed */\n")
-    before = {each: each.read_bytes() for each in tmp_path.iterdir()}
+    before = {item: item.read_bytes() for item in tmp_path.iterdir()}
     with pytest.raises(fflin.InputError, match="or the code was edited"):
-        fflin.write_c(by, tmp_path)
-    assert {each: each.read_bytes() for each in tmp_path.iterdir()} == before
+        fflin.write_c(controller, tmp_path)
+    assert {item: item.read_bytes() for item in tmp_path.iterdir()} == before
 
 
 def test_a_schedule_is_written_again_over_itself(tmp_path):
-    robot, by = law("schedule")
+    robot, controller = law("schedule")
     for _ in range(2):
-        fflin.write_c(by, tmp_path, robot=robot)
+        fflin.write_c(controller, tmp_path, robot=robot)
     assert "in C99: GainSchedule\n" in (tmp_path / "controller.h").read_text()
 
 
 def test_folders_that_cannot_be_used_are_one_line(tmp_path, monkeypatch):
-    by = law("no joints")[1]
+    controller = law("no joints")[1]
     (tmp_path / "file").touch()
-    for folder, said in (
+    for folder, message in (
         ("a" * 300, "File name too long"),
         ("file/c", "Not a directory"),
     ):
-        with pytest.raises(fflin.FileError, match=said):
-            fflin.write_c(by, tmp_path / folder)
-        with pytest.raises(fflin.FileError, match=said):
+        with pytest.raises(fflin.FileError, match=message):
+            fflin.write_c(controller, tmp_path / folder)
+        with pytest.raises(fflin.FileError, match=message):
             fflin.CLaw(tmp_path / folder)
-    fflin.write_c(by, tmp_path / "c")
+    fflin.write_c(controller, tmp_path / "c")
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "none"))
     with any_wording(), pytest.raises(fflin.InputError, match="'cc' made no library"):
         fflin.CLaw(tmp_path / "c")  # the name of the temporary folder is random
 
 
-def test_what_fails_leaves_no_folder(tmp_path, monkeypatch):
+def test_a_failure_leaves_no_folder(tmp_path, monkeypatch):
     def full(*_):
         raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -455,16 +466,18 @@ def test_what_fails_leaves_no_folder(tmp_path, monkeypatch):
 def test_invalid_arguments_give_the_inputs_at_the_target_and_a_state_of_zeros(
     real, tmp_path
 ):
-    robot, by = law("hybrid")
-    code = fflin.CLaw(fflin.write_c(by, tmp_path, real=real, limits=0.5))
+    robot, controller = law("hybrid")
+    code = fflin.CLaw(fflin.write_c(controller, tmp_path, real=real, limits=0.5))
     library = _compiled(tmp_path / "controller.c", "cc")
     kind = np.float64 if real == "double" else np.float32
-    good = measured(StateMap(robot), by.lin.q, by.lin.v).astype(kind)
-    u0, seen = np.clip(by.lin.u0, -0.5, 0.5), set()
+    good = measured(StateMap(robot), controller.lin.q, controller.lin.v).astype(kind)
+    u0, seen = np.clip(controller.lin.u0, -0.5, 0.5), set()
     for index, value in product(
         range(len(good)), (np.nan, np.inf, -np.inf, np.finfo(kind).max)
     ):
-        given, x, u = (np.full(len(each), 7.0, kind) for each in (good, by.lin.x0, u0))
+        given, x, u = (
+            np.full(len(item), 7.0, kind) for item in (good, controller.lin.x0, u0)
+        )
         given[:] = good
         given[index] = value
         status = library.controller_state(given.ctypes, x.ctypes)
@@ -482,8 +495,8 @@ def test_invalid_arguments_give_the_inputs_at_the_target_and_a_state_of_zeros(
 
 
 def test_copies_of_the_code_fly_as_the_code(tmp_path):
-    robot, by = law("no joints")
-    code = fflin.CLaw(fflin.write_c(by, tmp_path))
+    robot, controller = law("no joints")
+    code = fflin.CLaw(fflin.write_c(controller, tmp_path))
     q = fflin.configuration(robot, {}, POSE)
     u = code.bind(robot)(0.0, q, np.zeros(robot.nv))
     for other in (copy.deepcopy(code), pickle.loads(pickle.dumps(code))):
@@ -495,31 +508,33 @@ def about_neutral(tmp_path_factory):
     """A robot, its regulator about the neutral pose, and the C code of the regulator."""
     robot = fflin.load("cubesat")
     lin = fflin.linearize(robot)
-    by = fflin.StateFeedback(lin, fflin.lqr(lin).K)
-    code = fflin.CLaw(fflin.write_c(by, tmp_path_factory.mktemp("neutral")))
-    return robot, by, code
+    controller = fflin.StateFeedback(lin, fflin.lqr(lin).K)
+    code = fflin.CLaw(fflin.write_c(controller, tmp_path_factory.mktemp("neutral")))
+    return robot, controller, code
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
 @pytest.mark.parametrize("axis", [*np.eye(4)[:3].tolist(), [0.6, 0.8, 0.0, 0.0]])
 def test_half_a_turn_is_decided_as_in_python(axis, side, about_neutral):
     """Both ways back are equally short: the sign of the quaternion decides, in C as in Python."""
-    robot, by, code = about_neutral
+    robot, controller, code = about_neutral
     q, v = np.append(np.zeros(3), side * np.array(axis)), np.zeros(robot.nv)
-    u, other = code.bind(robot)(0.0, q, v), by.bind(robot)(0.0, q, v)
+    u, other = code.bind(robot)(0.0, q, v), controller.bind(robot)(0.0, q, v)
     assert np.abs(u).max() > 0.0
     assert u == pytest.approx(other, rel=1e-14, abs=1e-14 * np.abs(other).max())
 
 
-def test_units_of_a_compensator_are_those_of_its_robot(tmp_path):
+def test_units_of_a_compensator_match_its_robot(tmp_path):
     robot = fflin.load("planar_detumble")
     lin = fflin.linearize(robot).discretize(0.1)
-    by = replace(
+    controller = replace(
         fflin.lqg(fflin.lqr(lin), fflin.kalman(lin, 1e-3, 1e-4)), robot="of my own"
     )
     with pytest.raises(fflin.InputError, match="robot="):
-        fflin.write_c(by, tmp_path / "none")
-    header = (fflin.write_c(by, tmp_path, robot=robot) / "controller.h").read_text()
+        fflin.write_c(controller, tmp_path / "none")
+    header = (
+        fflin.write_c(controller, tmp_path, robot=robot) / "controller.h"
+    ).read_text()
     assert "u[0]  tau_b.x [N m]" in header
     assert "omega_b.z [rad/s]" in header
     assert "[unknown]" not in header

@@ -25,13 +25,15 @@ def main():
         np.savez_compressed(PATH, **record())
         print(f"{PATH}: {PATH.stat().st_size / 1024:.0f} kB")
         return 0
-    golden, said = kept(), []
+    golden, message = kept(), []
     engines = ENGINES if find_spec("numba") else ENGINES[:1]
     for engine in [options.engine] if options.engine else engines:
         for case in cases():
-            said += [f"{engine}: {line}" for line in differences(case, engine, golden)]
-    print("\n".join(said) or "as in the record")
-    return int(bool(said))
+            message += [
+                f"{engine}: {line}" for line in differences(case, engine, golden)
+            ]
+    print("\n".join(message) or "as in the record")
+    return int(bool(message))
 
 
 sys.exit(main())

@@ -63,7 +63,7 @@ def _models(name):
         outputs=[fflin.FullState(), fflin.CenterOfMass(), fflin.Momentum()]
     )
     q, v, u = random_point(robot, np.random.default_rng(1))
-    found = {}
+    result = {}
     for frame in ("hybrid", "local", "world"):
         lin = fflin.linearize(robot, q, v, u, frame=frame)
         names = ("A", "B", "f0", "C", "D") if frame == "hybrid" else ("A", "B", "f0")
@@ -72,10 +72,10 @@ def _models(name):
             value = getattr(lin, key)
             # The upper rows of A and B are of the chart alone.
             value = value if frame == "hybrid" or key == "f0" else value[nv:, :nv]
-            found[f"{frame} {key}"] = value
-            found[f"{_TOLERANCE}{frame} {key}"] = _condition(lin)
+            result[f"{frame} {key}"] = value
+            result[f"{_TOLERANCE}{frame} {key}"] = _condition(lin)
     lin = fflin.linearize(robot)
-    found["K"] = (K := fflin.lqr(lin).K)
+    result["K"] = (K := fflin.lqr(lin).K)
     rng = np.random.default_rng(2)
 
     def changed(x):
@@ -85,20 +85,20 @@ def _models(name):
     other = replace(lin, A=changed(lin.A), B=changed(lin.B))
     other = fflin.lqr(other, changed(gain.Q.diagonal()), changed(gain.R.diagonal())).K
     apart = (np.abs(other - K) / np.abs(K).max(axis=1, keepdims=True)).max()
-    found[f"{_TOLERANCE}K"] = TIGHT + 64.0 * EPS * float(apart) / 1e-9
-    return found
+    result[f"{_TOLERANCE}K"] = TIGHT + 64.0 * EPS * float(apart) / 1e-9
+    return result
 
 
 def _flown(robot, policy, engine, **options):
     """Rows of a motion, and why it ended."""
     motion = fflin.simulate(robot, policy, **{"linear": False} | options, engine=engine)
     rows = np.linspace(0, len(motion.t) - 1, _ROWS + 1).astype(int)[1:]
-    found = {
+    result = {
         key: getattr(motion, key)[rows] for key in ("t", "q", "v", "x", "u", "momentum")
     }
     largest = np.abs(motion.u).max(axis=0)
     return {
-        **found,
+        **result,
         "rows": len(motion.t),
         "largest u": largest,
         "stopped": motion.stopped.split(" at ")[0],
@@ -113,10 +113,10 @@ def _policy(make, name, engine):
     method = "semi_implicit_euler" if POLICIES.index(make) % 3 == 2 else "cf4"
     free = fflin.simulate(robot, policy, **{"linear": False} | given, method=method)
     most = 2.0 ** math.floor(math.log2(0.5 * np.abs(free.u).max()))
-    found = _flown(robot, policy, engine, **given, method=method, limits=most)
+    result = _flown(robot, policy, engine, **given, method=method, limits=most)
     if make is shared:
-        found[f"{_TOLERANCE}u"] = found[f"{_TOLERANCE}largest u"] = 1e-7 / 1e-14 * EPS
-    return found
+        result[f"{_TOLERANCE}u"] = result[f"{_TOLERANCE}largest u"] = 1e-7 / 1e-14 * EPS
+    return result
 
 
 def _forces(engine):
@@ -174,7 +174,7 @@ def _stops(engine):
     K, x0 = coarse(fflin.lqr(lin).K), displaced(lin, degrees=60.0)
     tumbling = x0.copy()
     tumbling[6 + robot.n : 9 + robot.n] = 1.0
-    found = {}
+    result = {}
     for name, gain, start in (("diverged", -K, x0), ("left", 0.0 * K, tumbling)):
         policy = fflin.StateFeedback(lin, gain)
         options = SimulationOptions(
@@ -182,11 +182,11 @@ def _stops(engine):
         )
         plan = Plan(options).replace(within_chart=True)
         run = go(plan) if engine == "python" else recorded(plan)
-        found |= {
+        result |= {
             f"{name} stopped": run.stopped.split(" at ")[0],
             f"{name} rows": len(run.t),
         }
-    return found
+    return result
 
 
 def _campaign(engine):
@@ -229,7 +229,7 @@ def _campaign(engine):
         },
         **{"goals": ["attitude < 4 deg"], "engine": engine, "threads": 1},
     )
-    found = {
+    result = {
         key: getattr(campaign, key)
         for key in ("errors", "largest", "settle", "stop", "end")
     }
@@ -240,7 +240,7 @@ def _campaign(engine):
     more = {
         key: getattr(campaign, key)[::16] for key in ("error_history", "input_history")
     }
-    return {**found, **some, **more, "met": campaign.met("attitude < 4 deg")}
+    return {**result, **some, **more, "met": campaign.met("attitude < 4 deg")}
 
 
 _JOINTS = ("joint_1", "joint_2", "joint_3")
@@ -248,7 +248,7 @@ _JOINTS = ("joint_1", "joint_2", "joint_3")
 
 def _sweep(engine):
     """Points at rest and in motion, of both kinds of joints."""
-    found = {}
+    result = {}
     for name in ("planar_detumble", "canadarm2"):
         robot = fflin.load(name)
         rng = np.random.default_rng(4)
@@ -259,10 +259,10 @@ def _sweep(engine):
         for kind, given in (("rest", (q,)), ("motion", (q, v, u))):
             batch = fflin.sweep(robot, *given, threads=1)
             for key in ("A", "B", "f0"):
-                found[f"{name} {kind} {key}"] = np.array(getattr(batch, key)[:2])
+                result[f"{name} {kind} {key}"] = np.array(getattr(batch, key)[:2])
                 worst = max(_condition(batch[index]) for index in range(2))
-                found[f"{_TOLERANCE}{name} {kind} {key}"] = worst
-    return found
+                result[f"{_TOLERANCE}{name} {kind} {key}"] = worst
+    return result
 
 
 def _funnel(engine):
@@ -283,9 +283,9 @@ def _funnel(engine):
         },
         **{"engine": engine, "threads": 1},
     )
-    found = {key: getattr(reach, key) for key in ("t", "tried", "rho", "rate")}
+    result = {key: getattr(reach, key) for key in ("t", "tried", "rho", "rate")}
     return {
-        **found,
+        **result,
         "outcomes": reach.outcomes.astype(int),
         "inside": reach.inside.astype(int),
     }
@@ -336,7 +336,7 @@ def cases():
                 make, name, engine
             )
     whole = (_forces, _pulses, _stops, _campaign, _sweep, _funnel, _validity)
-    return made | {each.__name__[1:]: each for each in whole}
+    return made | {item.__name__[1:]: item for item in whole}
 
 
 def figures(case, engine):
@@ -365,38 +365,38 @@ def kept():
 
 def differences(case, engine, golden):
     """Say what of a case differs from the record, a line for each figure."""
-    found = figures(case, engine)
-    names = [key for key in found if not key.startswith(_TOLERANCE)]
-    own = {key.partition("/")[2] for key in golden if key.partition("/")[0] == case}
-    said = [f"{case}/{key}: on one side alone" for key in sorted(own ^ set(names))]
-    for key in sorted(own & set(names)):
-        tolerance = float(found.get(_TOLERANCE + key, 0.0))
+    result = figures(case, engine)
+    names = [key for key in result if not key.startswith(_TOLERANCE)]
+    keys = {key.partition("/")[2] for key in golden if key.partition("/")[0] == case}
+    message = [f"{case}/{key}: on one side alone" for key in sorted(keys ^ set(names))]
+    for key in sorted(keys & set(names)):
+        tolerance = float(result.get(_TOLERANCE + key, 0.0))
         least = 1.0 if tolerance else _LEAST_ROW
         tolerance = tolerance or TIGHT
-        apart = _apart(found[key], golden[f"{case}/{key}"], least)
+        apart = _apart(result[key], golden[f"{case}/{key}"], least)
         if not apart <= tolerance:
-            said.append(
+            message.append(
                 f"{case}/{key}: {apart:.2g} apart, expected at most {tolerance:.2g}"
             )
-    return said
+    return message
 
 
-def _apart(found, expected, least):
+def _apart(result, expected, least):
     """How far figures are apart, relative to the largest of their row; infinite of decisions.
 
     A row counts as at least a share of the largest entry.
     """
-    if found.shape != expected.shape or found.dtype.kind != expected.dtype.kind:
+    if result.shape != expected.shape or result.dtype.kind != expected.dtype.kind:
         return math.inf
-    if found.dtype.kind != "f":
-        return 0.0 if np.array_equal(found, expected) else math.inf
+    if result.dtype.kind != "f":
+        return 0.0 if np.array_equal(result, expected) else math.inf
     finite = np.isfinite(expected)
-    if not np.array_equal(found[~finite], expected[~finite], equal_nan=True):
+    if not np.array_equal(result[~finite], expected[~finite], equal_nan=True):
         return math.inf
-    if not np.isfinite(found[finite]).all():
+    if not np.isfinite(result[finite]).all():
         return math.inf
     values = np.where(finite, expected, 0.0)
     size = np.abs(np.atleast_1d(values)).max(axis=-1, keepdims=True, initial=0.0)
     size = np.maximum(size, least * size.max(initial=0.0))
-    distance = np.abs(np.where(finite, found, 0.0) - values)
+    distance = np.abs(np.where(finite, result, 0.0) - values)
     return float((distance / np.where(size > 0.0, size, 1.0)).max(initial=0.0))

@@ -35,11 +35,11 @@ def test_machine_code_gives_the_figures_of_the_record(golden, case):
     assert not differences(case, "compiled", golden)
 
 
-def test_the_record_notices_what_is_changed(golden):
+def test_the_golden_record_detects_changes(golden):
     case = "policies state planar_detumble"
-    found = figures(case, "python")
+    result = figures(case, "python")
     for key, change in (("q", 1.0 + 1e-11), ("rows", 2), ("stopped", None)):
-        value = np.asarray("diverged") if change is None else found[key] * change
+        value = np.asarray("diverged") if change is None else result[key] * change
         assert len(differences(case, "python", golden | {f"{case}/{key}": value})) == 1
     short = {key: value for key, value in golden.items() if key != f"{case}/u"}
     assert len(differences(case, "python", short)) == 1

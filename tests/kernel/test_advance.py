@@ -77,7 +77,9 @@ def advanced(plan, about=None, every=1, cuts=()):
     clock, pieces = np.zeros(1, dtype=int), []
     for last in (*cuts, times.steps):
         rows, first = np.zeros((times.steps, width)), clock[0]
-        loop.advance(parts, clock, last, every, rows.ravel(), np.zeros(robot.tree.size))
+        loop.advance(
+            parts, clock, last, every, rows.ravel(), np.zeros(robot.tree.offsets.size)
+        )
         count = -(-clock[0] // every) - -(-first // every) if every else 0
         assert not rows[count:].any()
         pieces.append(rows[:count])
@@ -94,30 +96,30 @@ def advanced(plan, about=None, every=1, cuts=()):
 def both(plan, tolerance=1e-10):
     """Compare the kernel's loop with the loop in Python, whose mechanics are Pinocchio's."""
     plan = plan.replace(times=plan.times._replace(every=1))
-    expected, found = go(plan), advanced(plan)
+    expected, result = go(plan), advanced(plan)
     if expected.stopped.startswith("diverged"):
         # the end of a diverged run is not recorded
-        found = [rows[:-1] for rows in found]
+        result = [rows[:-1] for rows in result]
     names = ("q", "v", "u", "momentum", "center")
-    for name, value in zip(names, found, strict=True):
+    for name, value in zip(names, result, strict=True):
         other = getattr(expected, name)
         assert value.shape == other.shape, name
         size = np.maximum(1.0, np.abs(other).max(axis=0))
         # Thrusters with the same effect differ only in rows of 1e-7, which amplify rounding errors.
         limit = 1e-8 if name == "u" and tolerance > 1e-10 else tolerance
         assert (np.abs(value - other) <= limit * size).all(), name
-    return found, expected.stopped
+    return result, expected.stopped
 
 
 @pytest.mark.parametrize(
     "make",
     [
-        *(each for each in POLICIES if each is not followed_outputs),
+        *(item for item in POLICIES if item is not followed_outputs),
         *exhaustive(followed_outputs),
     ],
     ids=lambda make: make.__name__,
 )
-def test_the_mechanics_are_those_of_pinocchio_under_every_policy(robots, make):
+def test_the_mechanics_match_pinocchio_under_every_policy(robots, make):
     robot, policy, options = make(plain(robots["ets_vii"]))
     x0 = displaced(fflin.linearize(robot), degrees=20.0)
     options = {"x0": x0, "dt": 0.02} | options
@@ -171,7 +173,7 @@ def test_gains_between_grid_points_agree_with_pinocchio_in_all_cells_and_outside
         assert np.abs(u).max() > 1e-3
 
 
-def test_a_gyroscope_measures_the_rotation_in_the_axes_of_its_own_frame():
+def test_a_gyroscope_measures_the_rotation_in_the_axes_of_its_frame():
     """The command is D omega, with omega in the axes of a frame that is turned in its link."""
     rng = np.random.default_rng(1)
     model = random_tree(rng, 3).model.copy()
@@ -338,8 +340,8 @@ def diverged(lin):
 ENDS = [(left, "left the chart", 1e-10), (diverged, "diverged", 1e-6)]
 
 
-@pytest.mark.parametrize(("how", "said", "tolerance"), ENDS)
-def test_a_run_ends_at_the_same_step_as_in_the_python_engine(how, said, tolerance):
+@pytest.mark.parametrize(("how", "message", "tolerance"), ENDS)
+def test_a_run_ends_at_the_same_step_as_in_the_python_engine(how, message, tolerance):
     robot = plain(fflin.load("planar_detumble"))
     lin = fflin.linearize(robot)
     x0, gain = how(lin)
@@ -348,7 +350,7 @@ def test_a_run_ends_at_the_same_step_as_in_the_python_engine(how, said, toleranc
         within_chart=True
     )
     (q, *_), stopped = both(plan, tolerance)
-    assert stopped.startswith(said) and 3 < len(q) < 400
+    assert stopped.startswith(message) and 3 < len(q) < 400
 
 
 @pytest.mark.parametrize("sign", [1.0, *exhaustive(-1.0)])

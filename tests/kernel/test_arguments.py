@@ -53,27 +53,27 @@ VALUE = Outer(
 )
 
 
-def test_every_kind_of_field_is_read_where_it_stands():
+def test_every_kind_of_field_is_read_from_its_words():
     opened = opener(OUTER)
 
     @numba.njit
     def read(words):
-        of = opened(words)
+        fields = opened(words)
         whole = (
-            of.count,
-            of.table[1, 2],
-            of.indices[1],
-            len(of.inner.values),
-            of.table.shape[1],
+            fields.count,
+            fields.table[1, 2],
+            fields.indices[1],
+            len(fields.inner.values),
+            fields.table.shape[1],
         )
         real = (
-            of.reals[1],
-            of.lanes[1, 7],
-            of.inner.share,
-            of.more.share,
-            of.more.values[2],
+            fields.reals[1],
+            fields.lanes[1, 7],
+            fields.inner.share,
+            fields.more.share,
+            fields.more.values[2],
         )
-        return whole, real, (of.on, of.flags[1], of.flags[2])
+        return whole, real, (fields.on, fields.flags[1], fields.flags[2])
 
     value, words, _ = laid_out(VALUE, OUTER)
     whole, real, flags = read(words)
@@ -83,14 +83,14 @@ def test_every_kind_of_field_is_read_where_it_stands():
     assert flags == (True, False, True)
 
 
-def test_what_is_written_in_compiled_code_stands_in_the_arrays():
+def test_compiled_code_writes_to_the_arrays():
     opened = opener(OUTER)
 
     @numba.njit
     def write(words):
-        of = opened(words)
-        of.lanes[0, 3] = of.more.values[0] = 9.0
-        of.indices[0] = of.count
+        fields = opened(words)
+        fields.lanes[0, 3] = fields.more.values[0] = 9.0
+        fields.indices[0] = fields.count
 
     value, words, fresh = laid_out(VALUE, OUTER)
     write(words)
@@ -131,7 +131,7 @@ def twice(x):
     return 2.0 * square(x)
 
 
-def test_parts_are_compiled_with_what_calls_them():
+def test_parts_are_compiled_with_their_callers():
     one, other = translated(square), translated(twice)
 
     @numba.njit

@@ -55,8 +55,8 @@ def test_compilation_is_announced_once_for_all_threads(
         return kernel_code.kernel("derivatives", "derive")
 
     with ThreadPoolExecutor(4) as threads:
-        found = [threads.submit(ask) for _ in range(4)]
-    assert all(each.result() is compiled for each in found)
+        result = [threads.submit(ask) for _ in range(4)]
+    assert all(item.result() is compiled for item in result)
     assert not caplog.records
     compiled.compile("double")
     (tmp_path / f"derivatives.derive-1.{kernel_code.VERSION}.nbi").write_bytes(b"")
@@ -72,12 +72,12 @@ def test_compilation_is_announced_once_for_all_threads(
 def test_a_thread_that_waits_for_another_names_no_process(
     compiled, caplog, tmp_path, monkeypatch
 ):
-    began, told, asked = Event(), Event(), []
+    began, messages, asked = Event(), Event(), []
 
     def compile(signature):
         asked.append(signature)
         began.set()
-        assert told.wait(5.0)
+        assert messages.wait(5.0)
 
     monkeypatch.setattr(kernel_code, "_SILENCE", 0.01)
     compiled.compile = compile
@@ -88,7 +88,7 @@ def test_a_thread_that_waits_for_another_names_no_process(
         second = threads.submit(made.compile, "long")
         with pytest.raises(StillWaits):
             second.result(0.2)
-        told.set()
+        messages.set()
         first.result(), second.result()
     assert asked == ["double", "long"]
     assert not any("waiting" in record.message for record in caplog.records)
@@ -198,7 +198,7 @@ def test_one_set_of_machine_code_serves_every_robot_policy_and_option(robots, na
     fflin.monte_carlo(
         robots[name], None, {"q_b": 0.1}, runs=1, duration=0.1, engine="compiled"
     )
-    assert [len(each.signatures) for each in (advance, take)] == [1, 1]
+    assert [len(item.signatures) for item in (advance, take)] == [1, 1]
 
 
 def test_a_terminal_shows_the_seconds_of_a_compilation(monkeypatch):
@@ -222,9 +222,9 @@ def test_code_that_cannot_be_stored_is_compiled_and_told_once(
 ):
     compiled.stats.cache_path = None
     kernel_code._said_unstored.clear()
-    found = kernel_code.kernel("derivatives", "derive")
-    found.compile("double")
-    found.compile("long")
+    result = kernel_code.kernel("derivatives", "derive")
+    result.compile("double")
+    result.compile("long")
     kernel_code._said_unstored.clear()
     assert signatures == ["double", "long"]
     (record,) = caplog.records
@@ -241,10 +241,10 @@ def test_numba_without_a_writable_folder_compiles_without_storing(monkeypatch):
     monkeypatch.setattr(caching.CompileResultCacheImpl, "_locator_classes", [])
     machine_code.translated.cache_clear()
     try:
-        found = machine_code.translated(derivatives.derive, "compiled")
+        result = machine_code.translated(derivatives.derive, "compiled")
     finally:
         machine_code.translated.cache_clear()
-    assert found.stats.cache_path is None
+    assert result.stats.cache_path is None
 
 
 @pytest.mark.parametrize("engine", [None, "compiled"])

@@ -53,7 +53,7 @@ def pulsed(on_off, most, least):
 
 
 @pytest.mark.parametrize("delay", [0, 1, 4, 7])
-def test_the_impulse_of_a_held_sample_is_that_of_its_clipped_command(delay):
+def test_the_impulse_of_a_held_sample_matches_its_clipped_command(delay):
     rng = np.random.default_rng(delay)
     low, high, initial = (
         np.array([-1.0, -0.5]),
@@ -70,7 +70,7 @@ def test_the_impulse_of_a_held_sample_is_that_of_its_clipped_command(delay):
 
 
 @pytest.mark.parametrize("on_off", [False, True])
-def test_pulses_fire_the_impulse_of_the_commands_but_for_what_is_left(on_off):
+def test_pulses_fire_the_impulse_of_the_commands_minus_the_remainder(on_off):
     rng = np.random.default_rng(3)
     most, least = 2.0, 0.15
     commands = rng.uniform(0.0, 1.0, size=(40, 1))
@@ -330,11 +330,11 @@ def test_loops_that_are_compiled_agree_with_the_functions_of_numpy_that_they_rep
     }
     for function, arguments in given.items():
         ends = []
-        for each in (function, vec.IN_PLACE[function]):
+        for item in (function, vec.IN_PLACE[function]):
             copies = [
                 np.array(value) if np.ndim(value) else value for value in arguments
             ]
-            result = each(*copies)
+            result = item(*copies)
             ends.append(np.hstack([*copies, 0.0 if result is None else result]))
         assert ends[0] == pytest.approx(ends[1], abs=1e-14)
         assert (ends[0] != np.hstack([*arguments, 0.0])).any()

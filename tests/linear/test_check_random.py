@@ -146,7 +146,7 @@ def output_words(state):
 
 
 @pytest.mark.parametrize("seeds", SEEDS, ids=lambda seeds: f"{seeds[0]}-{seeds[-1]}")
-def test_correct_models_are_verified_and_errors_of_1e_6_are_found(seeds):
+def test_correct_models_are_verified_and_errors_of_1e_6_are_detected(seeds):
     for seed in seeds:
         case = random_case(seed)
         lin = case.linearize()

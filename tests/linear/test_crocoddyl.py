@@ -89,16 +89,18 @@ def test_along_a_trajectory_it_is_the_conversion_of_each_knot(flight, tool):
 def test_gains_of_a_schedule_command_the_same_inputs(flight):
     robot = flight.robot
     schedule = fflin.tvlqr(flight, sample=0.05)
-    there = schedule.to("crocoddyl", robot)
+    converted = schedule.to("crocoddyl", robot)
     policy = fflin.TrajectoryFeedback(flight, schedule).bind(robot)
     small = 1e-5 * np.random.default_rng(2).normal(size=2 * robot.nv)
     for k in (0, 2):
-        q = pin.integrate(robot.model, there.q[k], small[: robot.nv])
-        v = there.v[k] + small[robot.nv :]
-        e = np.concatenate((pin.difference(robot.model, there.q[k], q), v - there.v[k]))
-        feedback = there.K[k] @ e
+        q = pin.integrate(robot.model, converted.q[k], small[: robot.nv])
+        v = converted.v[k] + small[robot.nv :]
+        e = np.concatenate(
+            (pin.difference(robot.model, converted.q[k], q), v - converted.v[k])
+        )
+        feedback = converted.K[k] @ e
         # q_b is the sine of half the angle, so both errors are equal to second order.
-        got = there.u[k] - policy(0.05 * k, q, v)
+        got = converted.u[k] - policy(0.05 * k, q, v)
         assert got == pytest.approx(feedback, abs=1e-4 * np.abs(feedback).max())
 
 

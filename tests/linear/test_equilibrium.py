@@ -26,14 +26,14 @@ def sprung(name, rng, **fields):
 
 
 @pytest.mark.parametrize("name", BUNDLED)
-def test_what_is_balanced_is_a_fixed_point(name):
+def test_a_balanced_robot_is_at_a_fixed_point(name):
     rng = np.random.default_rng(1)
     robot, q = sprung(name, rng)
-    found = fflin.equilibrium(robot, q)
-    lin = fflin.linearize(robot, q, u=found.u)
+    result = fflin.equilibrium(robot, q)
+    lin = fflin.linearize(robot, q, u=result.u)
     assert not fflin.linearize(robot, q).is_equilibrium()
     # Balanced to the rounding of M^-1 times the forces.
-    assert np.abs(lin.f0).max() < 1e-11 * np.abs(np.linalg.solve(lin.M, found.u)).max()
+    assert np.abs(lin.f0).max() < 1e-11 * np.abs(np.linalg.solve(lin.M, result.u)).max()
     assert lin.is_equilibrium(1e-8)
     # With one force for each coordinate it is their negative: of a spring, K (q - rest).
     floating = robot.replace(gravity=(0, 0, 0))
@@ -47,7 +47,7 @@ def test_what_is_balanced_is_a_fixed_point(name):
 
 
 @pytest.mark.parametrize("frame", FRAMES)
-def test_axes_are_those_of_the_frame_and_reference(frame):
+def test_axes_match_the_frame_and_reference(frame):
     rng = np.random.default_rng(2)
     robot, q = sprung("ets_vii", rng)
     for reference in (None, pin.SE3.Identity(), random_pose(rng, 100.0)):
@@ -133,7 +133,7 @@ def test_least_norm_against_every_active_set(trials):
     assert balanced >= trials // 4 and refused >= trials // 12 and bound >= trials // 6
 
 
-def test_refusal_names_what_is_left():
+def test_the_error_names_the_remaining_modes():
     heavy = fflin.load("servicer_7dof", gravity=(0, 0, -9.81), passive=["joint_2"])
     with pytest.raises(fflin.EquilibriumError, match=r"tau_m.joint_2 -?\d+ N m"):
         fflin.equilibrium(heavy)
@@ -149,13 +149,13 @@ def test_refusal_names_what_is_left():
         fflin.equilibrium(heavy.replace(inputs=[fflin.BaseTorque(), down]))
 
 
-def test_what_is_needed_is_shown_with_units():
+def test_required_inputs_are_shown_with_units():
     robot = fflin.load("servicer_7dof", gravity=(0.0, 0.0, -9.81))
-    found = fflin.equilibrium(robot)
-    lines = str(found).splitlines()
+    result = fflin.equilibrium(robot)
+    lines = str(result).splitlines()
     assert lines[0].startswith("u: ") and max(map(len, lines)) <= 80
-    assert f"F_b.z = {9.81 * robot.mass:.6g} N" in str(found) and "tau_b.x" not in str(
-        found
+    assert f"F_b.z = {9.81 * robot.mass:.6g} N" in str(result) and "tau_b.x" not in str(
+        result
     )
     assert str(fflin.equilibrium(fflin.load("cubesat"))) == "u: all zero"
 
@@ -163,8 +163,8 @@ def test_what_is_needed_is_shown_with_units():
 def test_nothing_to_balance_takes_nothing():
     """Exactly zero, also where no input could do anything, or rounding asks for something."""
     robot = fflin.load("ets_vii", inputs=[fflin.JointTorque("joint_1")])
-    found = fflin.equilibrium(robot)
-    assert found.u.shape == (1,) and not found.u.any() and not found.residual.any()
+    result = fflin.equilibrium(robot)
+    assert result.u.shape == (1,) and not result.u.any() and not result.residual.any()
     rest = dict.fromkeys(robot.joint_names, 0.3)
     sprung = robot.replace(stiffness=1e3, rest=rest)
     slightly = {joint: 0.1 + 0.2 for joint in rest}  # 0.30000000000000004
@@ -233,8 +233,8 @@ def test_passive_joints_sag_under_gravity(seed):
         robot.model.gravity.linear = np.zeros(3)
         soft = [robot.joint_names.index(name) for name in names]
         spring = 50.0 * tree.mass * at[soft]
-        there = [robot.joint(name).idx_v for name in names]
-        assert -spring == pytest.approx(pull[there], abs=1e-11 * np.abs(pull).max())
+        indices = [robot.joint(name).idx_v for name in names]
+        assert -spring == pytest.approx(pull[indices], abs=1e-11 * np.abs(pull).max())
         assert held.sag[soft] == pytest.approx(
             at[soft] - [joints[name] for name in names]
         )
@@ -242,7 +242,7 @@ def test_passive_joints_sag_under_gravity(seed):
         assert np.array_equal(at[stiff], state.joint_positions(q)[stiff])
 
 
-def test_springs_that_give_no_hold_are_told():
+def test_springs_that_give_no_hold_are_reported():
     """A pendulum that stands on a spring weaker than its weight, and beside it."""
     for gravity, words in ((20.0, "hold"), (1e5, "hold|settle")):
         robot = fflin.load(
@@ -303,7 +303,7 @@ def test_steady_motion_of_random_trees(seed):
         fflin.equilibrium(robot, q, v=v)
 
 
-def test_bad_input_is_told():
+def test_invalid_input_is_reported():
     robot = fflin.load("cubesat")
     with pytest.raises(fflin.InputError, match=r"\(1,\)"):
         fflin.equilibrium(robot, [0.0])
@@ -311,9 +311,9 @@ def test_bad_input_is_told():
         fflin.equilibrium("cubesat")
     with pytest.raises(fflin.InputError, match="hybrid"):
         fflin.equilibrium(robot, frame="body")
-    found = fflin.equilibrium(robot)
-    assert found.force_names[:4] == ("tau_b.x", "tau_b.y", "tau_b.z", "F_b.x")
+    result = fflin.equilibrium(robot)
+    assert result.force_names[:4] == ("tau_b.x", "tau_b.y", "tau_b.z", "F_b.x")
     with pytest.raises(FrozenInstanceError):
-        found.u = 0
+        result.u = 0
     with pytest.raises(ValueError, match="read-only"):
-        found.u[0] = 1.0
+        result.u[0] = 1.0

@@ -50,7 +50,7 @@ def relative(a, b):
 
 @pytest.mark.parametrize("case", CASES, ids=ids)
 @pytest.mark.parametrize("name", mostly([*BUNDLED, "tree"], "cubesat", "tree"))
-def test_there_and_back(name, case):
+def test_round_trip_is_the_identity(name, case):
     robot = (
         random_tree(np.random.default_rng(3), 6) if name == "tree" else fflin.load(name)
     )
@@ -70,7 +70,7 @@ def test_there_and_back(name, case):
         # velocities changes by M's condition.
         least = max(1e-13, 0.1 * np.finfo(float).eps * scaled_condition(lin.M))
         # Other matrices than fflin's, by T alone; inputs are held, so that those of B count in A.
-        X, Y = (rng.normal(size=each.shape) for each in (lin.A, lin.B))
+        X, Y = (rng.normal(size=item.shape) for item in (lin.A, lin.B))
         still = fflin.linearize(robot, q, v, **how)
         m = still.to(tool)
         A, B = m.A + m.T @ X @ m.T_left, m.B + m.T @ Y @ np.linalg.inv(m.T_u)
@@ -153,7 +153,7 @@ class Formulas:
 
 @pytest.mark.parametrize("tool", TOOLS)
 @pytest.mark.parametrize("name", ["inspector", *exhaustive("servicer_7dof")])
-def test_slopes_are_those_of_the_rates_in_the_tools_coordinates(name, tool):
+def test_derivatives_match_the_rates_in_the_tools_coordinates(name, tool):
     """A, B and f0 by differences of dx/dt: x by formulas, the motion by ABA."""
     robot = fflin.load(name).replace(
         gravity=(0.3, -0.2, 0.5), stiffness=3.0, damping=0.2
@@ -305,7 +305,7 @@ def test_the_step_of_mujoco_comes_back():
     assert relative(only.A, lin.A) < 1e-13 and relative(only.B, lin.B) < 1e-13
 
 
-def test_wrong_matrices_are_found_out():
+def test_wrong_matrices_are_detected():
     robot = fflin.load("servicer_7dof")
     q, v, u, _ = point(robot, 6, {})
     m = fflin.linearize(robot, q, v, u).to("drake")
@@ -354,8 +354,8 @@ def test_inputs_and_joints_stand_in_the_tools_order():
     # Siblings as the file has them, panels first; by name in Pinocchio.
     order = ("panel_left", "panel_right", *robot.joint_names[:7])
     for tool in TOOLS:
-        m, own = lin.to(tool), robot.joint_names
-        names = own if tool[:3] in ("pin", "cro", "eul") else order
+        m, joint_names = lin.to(tool), robot.joint_names
+        names = joint_names if tool[:3] in ("pin", "cro", "eul") else order
         assert tuple(m.input_names[6:]) == tuple(f"tau_m.{name}" for name in names)
         joints = [name[4:] for name in m.state_names if name.startswith("q_m.")]
         assert (
@@ -388,7 +388,7 @@ def refused(match, function, *arguments, kind=fflin.InputError, **options):
     assert "\n" not in str(caught.value)
 
 
-def test_what_is_no_point_of_a_tool_is_refused_in_one_line():
+def test_an_invalid_point_of_a_tool_is_refused_in_one_line():
     robot, rng = fflin.load("planar_detumble"), np.random.default_rng(0)
     lin, n = fflin.linearize(robot), robot.n
     to, back = fflin.transform, fflin.from_tool

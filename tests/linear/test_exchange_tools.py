@@ -173,7 +173,7 @@ def test_pinocchio(motion):
     assert np.abs(m.A[:nv, :nv] - np.transpose(slopes)).max() < 1e-4
 
 
-def test_the_order_of_joints_is_what_the_tool_says(tmp_path):
+def test_joints_are_in_the_order_of_the_tool(tmp_path):
     """Pinocchio sorts siblings by name; Drake and MuJoCo take them as the file has them."""
     body = (
         '<mass value="1"/><inertia ixx=".2" ixy="0" ixz="0" iyy=".2" iyz="0" izz=".2"/>'

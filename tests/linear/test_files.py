@@ -131,7 +131,7 @@ def test_nothing_is_left_behind_where_writing_fails(lin, tmp_path, monkeypatch):
     assert sorted(tmp_path.iterdir()) == before
 
 
-def test_bad_paths_are_told(lin, tmp_path):
+def test_invalid_paths_are_reported(lin, tmp_path):
     with pytest.raises(fflin.FileError, match=r"'\.xls'"):
         lin.save(tmp_path / "m.xls")
     (tmp_path / "folder.npz").mkdir()

@@ -19,7 +19,7 @@ def pair():
 
 
 def test_states_and_inputs_are_matched_by_name(pair):
-    free, held = (fflin.linearize(each) for each in pair)
+    free, held = (fflin.linearize(item) for item in pair)
     assert len(held.state_names) == len(free.state_names) + 4
     gain, other = fflin.lqr(free), fflin.lqr(held)
     K = fflin.line_up(gain, held)
@@ -58,11 +58,11 @@ def test_gains_between_masses_of_a_payload(pair):
         )
         for x in (0.5, 1.0)
     ]
-    models = [fflin.linearize(each) for each in (robot, *(c.robot for c in heavy))]
+    models = [fflin.linearize(item) for item in (robot, *(c.robot for c in heavy))]
     K = np.stack([fflin.line_up(fflin.lqr(lin), models[1]) for lin in models])
     between = 0.5 * (K[0] + K[2])
-    for each in (K[1], between):
-        assert np.linalg.eigvals(models[1].A - models[1].B @ each).real.max() < 0.0
+    for item in (K[1], between):
+        assert np.linalg.eigvals(models[1].A - models[1].B @ item).real.max() < 0.0
 
 
 @pytest.fixture
@@ -82,10 +82,10 @@ def test_a_schedule_over_joints_goes_on_after_the_catch(pair, lined_up):
     u = policy.bind(held)(
         0.0, q, fflin.velocity(held, {"omega_b.x": 0.01, "joint_3": 0.1})
     )
-    own = fflin.configuration(robot, {"joint_2": 0.5})
-    free = fflin.ScheduledFeedback(fflin.linearize(robot, own), gains)
+    default = fflin.configuration(robot, {"joint_2": 0.5})
+    free = fflin.ScheduledFeedback(fflin.linearize(robot, default), gains)
     v = fflin.velocity(robot, {"omega_b.x": 0.01, "joint_3": 0.1})
-    assert u == pytest.approx(free.bind(robot)(0.0, own, v), abs=1e-14)
+    assert u == pytest.approx(free.bind(robot)(0.0, default, v), abs=1e-14)
 
 
 @pytest.mark.compiled
@@ -103,12 +103,12 @@ def test_a_schedule_that_goes_on_is_the_same_in_either_engine(pair, lined_up):
     assert motions[0].x == pytest.approx(motions[1].x, abs=1e-12)
 
 
-def test_what_cannot_be_lined_up_is_one_line(pair):
-    free, held = (fflin.linearize(each) for each in pair)
+def test_models_that_cannot_be_matched_give_a_one_line_error(pair):
+    free, held = (fflin.linearize(item) for item in pair)
     gain = fflin.lqr(free)
     other = fflin.linearize(fflin.load("panda"))
     mixed = fflin.linearize(fflin.jam(pair[1], "joint_2").robot)
-    for call, said in [
+    for call, message in [
         (lambda: fflin.line_up(gain, other), "lacks the"),
         (lambda: fflin.line_up(gain, mixed), "other"),
         (
@@ -121,6 +121,6 @@ def test_what_cannot_be_lined_up_is_one_line(pair):
         (lambda: fflin.line_up(3, held), "Gain"),
         (lambda: fflin.line_up(gain, 3), "fflin.LinearModel"),
     ]:
-        with pytest.raises(fflin.InputError, match=said) as error:
+        with pytest.raises(fflin.InputError, match=message) as error:
             call()
         assert "\n" not in str(error.value)

@@ -58,7 +58,7 @@ def test_wheels_take_up_the_torque_of_the_gravity_gradient(massive, frame):
     assert np.abs(lin.f0[at]).max() < 1e-15
 
 
-def test_wheels_gain_in_flight_what_the_report_says():
+def test_wheels_gain_the_reported_momentum():
     """One orbit of the nonlinear loop; the momentum is measured in the flight."""
     robot, q = hub(wheels(*np.eye(3).tolist()))
     lin = fflin.linearize(robot, q)
@@ -83,11 +83,11 @@ def test_wheels_gain_in_flight_what_the_report_says():
     across = 2.0 * np.hypot(torque[0], torque[2]) / n
     assert abs(gained[1, -1]) == pytest.approx(abs(torque[1]) * period, rel=2e-2)
     assert np.hypot(gained[0], gained[2]).max() == pytest.approx(across, rel=2e-2)
-    said = [
+    message = [
         f"gain {abs(torque[1]) * period:.3g} N m s per orbit",
         f"up to {across:.3g} N m s",
     ]
-    assert says(" ".join(motion.notes), *said) and says(str(gain), *said)
+    assert says(" ".join(motion.notes), *message) and says(str(gain), *message)
 
 
 def test_an_equilibrium_needs_no_other_inputs():
@@ -118,7 +118,7 @@ def test_a_base_torque_holds_the_gravity_gradient(dt):
     assert fflin.lqg(gain, noise).poles.size == len(gain.poles) + len(noise.poles)
 
 
-def test_a_centre_of_mass_beside_the_origin_is_put_on_the_orbit():
+def test_a_centre_of_mass_next_to_the_origin_is_put_on_the_orbit():
     """No input pushes this robot, so its origin leaves the orbit instead of its centre of mass."""
     robot = fflin.load(
         "servicer_7dof", lock=["*"], inputs=wheels(*np.eye(3).tolist()), orbit=ORBIT
@@ -146,6 +146,6 @@ def test_forces_below_the_tolerance_of_an_equilibrium_are_no_reason_to_refuse():
     for number in (0, 5, 13):
         place = fflin.relative_equilibria(robot)[number]
         reference = pin.XYZQUATToSE3(place.q[:7])
-        found = fflin.equilibrium(robot, place.q, reference=reference)
-        lin = fflin.linearize(robot, found.q, u=found.u, reference=reference)
+        result = fflin.equilibrium(robot, place.q, reference=reference)
+        lin = fflin.linearize(robot, result.q, u=result.u, reference=reference)
         assert lin.is_equilibrium()

@@ -96,7 +96,7 @@ def gyro(lin):
     ],
     ids=lambda changes: next(iter(changes)),
 )
-def test_what_is_no_rotor_is_not_taken_for_one(changes):
+def test_a_joint_that_is_not_a_rotor_is_not_treated_as_one(changes):
     robot = wheeled(**changes)
     assert fflin.linearize(robot).ignorable == HOME
     v = fflin.velocity(robot, {"wheel": 2.0})
@@ -147,7 +147,7 @@ def test_a_leader_turns_its_followers(tmp_path):
         assert fflin.linearize(robot).ignorable == names
 
 
-def test_a_base_that_flies_along_stays_what_it_is_and_one_that_turns_does_not():
+def test_a_translating_base_is_unchanged_and_a_rotating_base_is_not():
     robot = wheeled()
     q = at_angle(robot, 0.0)
     drifting = fflin.velocity(robot, {"v_b.x": 2.0, "v_b.z": -1.0})
@@ -213,7 +213,7 @@ def test_gravity_lets_a_base_turn_about_the_vertical_only():
 
 @pytest.mark.parametrize("ending", [".npz", ".mat", ".json"])
 @pytest.mark.parametrize("moving", [False, True])
-def test_files_keep_what_is_ignorable(ending, moving, tmp_path):
+def test_files_keep_the_ignorable_states(ending, moving, tmp_path):
     robot = wheeled()
     spinning = fflin.velocity(robot, {"wheel": 5.0})
     swinging = fflin.velocity(robot, {"arm": 5.0})

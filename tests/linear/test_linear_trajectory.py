@@ -77,15 +77,15 @@ def test_interpolation_is_on_the_manifold():
         along.A[0] = 0.0
 
 
-def test_what_is_no_motion_is_told_with_the_time_and_refused_where_asked():
+def test_an_inconsistent_motion_is_reported_with_its_time_and_refused_on_request():
     robot = fflin.load("ets_vii")
     t, q, v, u = motion(robot, knots=17)
     jump = q.copy()
     jump[8:, 0] += 0.1
-    said = r"not a motion of 'ets_vii': from t = 0\.175 to 0\.2 s the error is \d"
-    with pytest.raises(fflin.InputError, match=said):
+    message = r"not a motion of 'ets_vii': from t = 0\.175 to 0\.2 s the error is \d"
+    with pytest.raises(fflin.InputError, match=message):
         fflin.linearize_trajectory(robot, t, jump, v, u, strict=True)
-    with pytest.warns(fflin.FflinWarning, match=said):
+    with pytest.warns(fflin.FflinWarning, match=message):
         along = fflin.linearize_trajectory(robot, t, jump, v, u)
     assert along.residual.argmax() == 7
     assert along.residual[7] > 1.0
@@ -204,15 +204,15 @@ def along(request):
 
 
 @pytest.mark.parametrize("dt", mostly((0.2, 0.05, 0.01), 0.05))
-def test_samples_are_those_of_the_variational_equation(along, dt):
+def test_samples_match_the_variational_equation(along, dt):
     sampled = along.discretize(dt)
     count = round(0.4 / dt)
     assert (sampled.dt, len(sampled), len(sampled.t)) == (dt, count, count + 1)
     for k in (0, count // 2, count - 1):
         expected = transition(along, sampled.t[k], sampled.t[k + 1])
-        found = np.column_stack((sampled.A[k], sampled.B[k]))
+        result = np.column_stack((sampled.A[k], sampled.B[k]))
         size = np.abs(expected).max(axis=0)
-        assert (np.abs(found - expected) / size).max() < 1e-8
+        assert (np.abs(result - expected) / size).max() < 1e-8
         assert (sampled[k].A == sampled.A[k]).all()
         assert sampled[k].dt == dt
         assert (
@@ -238,14 +238,14 @@ def test_a_step_of_the_transition_is_of_order_four(monkeypatch):
     errors = []
     for parts in (1, 2, 4):
         monkeypatch.setattr(linear_trajectory, "_MOST_PARTS", parts)
-        found = next(linear_trajectory.transitions(along, 0.2))[1]
-        errors.append(np.abs(found - exact).max())
+        result = next(linear_trajectory.transitions(along, 0.2))[1]
+        errors.append(np.abs(result - exact).max())
     assert np.log2(np.divide(errors[:-1], errors[1:])) == pytest.approx(
         [4.0, 4.0], abs=0.5
     )
 
 
-def test_at_rest_samples_are_those_of_one_model():
+def test_at_rest_samples_match_one_model():
     robot = fflin.load("ets_vii")
     t = np.linspace(0.0, 1.0, 3)
     q = np.tile(robot.neutral(), (3, 1))
@@ -292,15 +292,15 @@ def test_a_check_goes_along_it(watched):
     short = fflin.linearize_trajectory(
         robot, along.t[:4], along.q[:4], along.v[:4], along.u[:3], frame="hybrid"
     )
-    found = short.check()
-    assert found.ok
-    assert "planar_detumble, 4 knots" in str(found)
-    each = [fflin.check(robot, lin) for lin in short]
-    assert found.max_error == max(check.max_error for check in each)
+    result = short.check()
+    assert result.ok
+    assert "planar_detumble, 4 knots" in str(result)
+    item = [fflin.check(robot, lin) for lin in short]
+    assert result.max_error == max(check.max_error for check in item)
     wrong = short.A.copy()
     wrong[2, 12, 10] *= 1.0 + 1e-6
-    found = replace(short, A=wrong).check()
-    assert {(row.test, row.block) for row in found.failures} == {
+    result = replace(short, A=wrong).check()
+    assert {(row.test, row.block) for row in result.failures} == {
         ("ABA derivatives", "A[v_b, omega_b]"),
         ("differences", "A[v_b, omega_b]"),
     }

@@ -66,7 +66,7 @@ def test_fixed_point_does_not_depend_on_frame_or_base_pose(robots, name):
         assert lin.reference.isApprox(base, 1e-14)
 
 
-def test_inertia_is_that_of_the_kinetic_energy(robots):
+def test_inertia_matches_the_kinetic_energy(robots):
     """nu^T M nu / 2 in the frame's own velocities is Pinocchio's kinetic energy."""
     rng = np.random.default_rng(3)
     for name in BUNDLED:
@@ -149,7 +149,7 @@ def test_joint_torques_leave_the_momentum(robots, name):
 
 
 @pytest.mark.parametrize("frame", FRAMES)
-def test_orbit_costs_no_digits(frame):
+def test_orbit_loses_no_accuracy(frame):
     """Where the base is and how fast it flies changes no acceleration and no slope (Galilei)."""
     robot = fflin.load("servicer_7dof")
     q, v, u = random_point(robot, np.random.default_rng(6))
@@ -180,9 +180,9 @@ def test_check_holds_at_random_points(robots, name, frame):
         for reference in (None, pin.SE3.Identity()):
             q, v, u = random_point(robot, rng, degrees=degrees)
             lin = fflin.linearize(robot, q, v, u, frame=frame, reference=reference)
-            found = fflin.check(robot, lin)
-            assert found.ok, found
-            aba = [row for row in found.rows if row.test == "ABA derivatives"]
+            result = fflin.check(robot, lin)
+            assert result.ok, result
+            aba = [row for row in result.rows if row.test == "ABA derivatives"]
             assert len(aba) == 54 - 6 * (robot.n == 0)
             assert max(row.error for row in aba) < 1e-9
 
@@ -198,8 +198,8 @@ def test_check_holds_on_random_trees(frame):
             frame=frame,
             reference=random_pose(rng, 20.0),
         )
-        found = fflin.check(robot, lin)
-        assert found.ok, found
+        result = fflin.check(robot, lin)
+        assert result.ok, result
 
 
 def test_armature_is_part_of_the_inertia():
@@ -263,14 +263,14 @@ def test_linearizer_is_shared_copied_and_pickled():
     sys.setswitchinterval(1e-6)
     try:
         with ThreadPoolExecutor(4) as pool:
-            found = list(pool.map(lambda point: linearizer(*point), points * 5))
+            result = list(pool.map(lambda point: linearizer(*point), points * 5))
     finally:
         sys.setswitchinterval(interval)
-    for lin, right in zip(found, expected * 5, strict=True):
+    for lin, right in zip(result, expected * 5, strict=True):
         assert (lin.A == right.A).all() and (lin.B == right.B).all()
 
 
-def test_what_is_beyond_all_numbers_is_refused():
+def test_overflowing_values_are_refused():
     robot = fflin.load("ets_vii")
     q = fflin.configuration(robot)
     for v, u in ((np.full(12, 1e200), None), (None, np.full(12, 1e308))):

@@ -48,7 +48,7 @@ def test_hold_is_exact_anywhere(moving):
     assert tiny.f0 / 1e-6 == pytest.approx(moving.f0, rel=1e-4, abs=1e-4)
 
 
-def test_bad_sampling_times(rest):
+def test_invalid_sampling_times(rest):
     for dt in (0.0, -0.1):
         with pytest.raises(fflin.InputError, match="expected more than 0"):
             rest.discretize(dt)
@@ -80,11 +80,11 @@ def test_missing_control_says_how_to_get_it(rest, monkeypatch):
         rest.to_control()
 
 
-def test_equilibrium_is_told_from_motion(rest, moving):
+def test_equilibrium_is_distinguished_from_motion(rest, moving):
     assert rest.is_equilibrium() and not moving.is_equilibrium()
 
 
-def test_repr_says_what_it_is(rest):
+def test_repr_names_the_class_and_its_contents(rest):
     assert (
         repr(rest)
         == "LinearModel('ets_vii', nx=24, nu=12, ny=24, frame='hybrid', continuous)"
@@ -92,7 +92,7 @@ def test_repr_says_what_it_is(rest):
     assert "dt=0.1 s" in repr(rest.discretize(0.1))
 
 
-def test_what_is_made_when_asked_for_survives_copies_and_pickles(robots):
+def test_lazily_computed_results_survive_copies_and_pickles(robots):
     robot = robots["servicer_7dof"]
     q = fflin.configuration(
         robot, {"joint_2": 0.4}, pin.SE3(np.eye(3), np.array([1.0, 2.0, 3.0]))

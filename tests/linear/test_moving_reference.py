@@ -18,11 +18,11 @@ def test_check_holds_at_random_points(name):
         flying = robot.replace(gravity=gravity)
         lin = fflin.linearize(flying, q, v, u, moving=True)
         assert lin.moving and lin.frame == "local" and not lin.f0.any()
-        found = fflin.check(flying, lin)
-        assert found.ok, found
+        result = fflin.check(flying, lin)
+        assert result.ok, result
 
 
-def test_kinematics_are_those_of_a_turning_reference():
+def test_kinematics_match_a_turning_reference():
     robot = fflin.load("cubesat")
     q, v, u = random_point(robot, np.random.default_rng(2))
     lin = fflin.linearize(robot, q, v, u, moving=True)

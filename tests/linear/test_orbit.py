@@ -84,8 +84,8 @@ def test_every_route_agrees_at_any_point(name, frame):
         lin = fflin.linearize(
             robot, *moved(robot, rng, speed), frame=frame, reference=reference
         )
-        found = fflin.check(robot, lin)
-        assert found.ok, found
+        result = fflin.check(robot, lin)
+        assert result.ok, result
 
 
 def test_and_with_springs_wheels_thrusters_and_sensors():
@@ -109,8 +109,8 @@ def test_and_with_springs_wheels_thrusters_and_sensors():
     )
     for frame in ("hill", "lvlh"):
         lin = fflin.linearize(robot, *moved(robot, rng), frame=frame)
-        found = fflin.check(robot, lin)
-        assert found.ok, found
+        result = fflin.check(robot, lin)
+        assert result.ok, result
     # A gyroscope tells absolute rates; velocities of frames are relative.
     still = fflin.linearize(
         robot.replace(outputs=[fflin.Gyroscope("base"), fflin.FrameVelocity("base")])
@@ -118,7 +118,7 @@ def test_and_with_springs_wheels_thrusters_and_sensors():
     assert np.allclose(still.y0, [0, -N, 0, 0, 0, 0, 0, 0, 0], rtol=0, atol=1e-16)
 
 
-def test_the_orbit_of_the_earth_stands_beside_what_is_large():
+def test_large_objects_are_drawn_next_to_the_orbit_of_the_earth():
     """At a true orbit's rate, its terms are as exact as the others."""
     robot = fflin.load("servicer_7dof", orbit=800e3)
     lin = fflin.linearize(robot, *moved(robot, np.random.default_rng(3), 0.1))
@@ -148,8 +148,8 @@ def test_a_root_that_stands_askew_in_the_world_changes_nothing():
 def test_a_base_that_flies_fast_is_seen_from_the_frame_that_turns():
     robot = in_orbit(fflin.load("cubesat"))
     v = fflin.velocity(robot, {"v_b.x": 150.0, "omega_b.y": 0.1})
-    found = fflin.check(robot, fflin.linearize(robot, v=v))
-    assert found.ok, found
+    result = fflin.check(robot, fflin.linearize(robot, v=v))
+    assert result.ok, result
 
 
 def test_a_weak_field_is_one_too():
@@ -248,7 +248,7 @@ def test_an_equilibrium_holds_against_the_gradient():
         (lambda robot: far(robot, 5000e3), "linear"),
     ],
 )
-def test_what_an_orbit_has_not_is_one_line(ask, words):
+def test_missing_orbit_fields_give_a_one_line_error(ask, words):
     with (
         pytest.raises(fflin.InputError, match=words) as refused,
         warnings.catch_warnings(),
@@ -264,7 +264,7 @@ def far(robot, distance):
     return fflin.linearize(robot, fflin.configuration(robot, base=place))
 
 
-def test_far_from_its_point_the_field_is_said_to_be_coarse():
+def test_far_from_its_point_the_field_is_reported_to_be_coarse():
     robot = fflin.load("cubesat", orbit=800e3)
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -20,9 +20,9 @@ BODIES = (
 )
 
 
-def matched(found, expected):
+def matched(result, expected):
     """The largest distance of poles to those that are expected, one to one."""
-    left, worst = list(found), 0.0
+    left, worst = list(result), 0.0
     assert len(left) == len(expected)
     for pole in expected:
         nearest = min(left, key=lambda other: abs(other - pole))
@@ -42,9 +42,9 @@ def matched(found, expected):
 def test_libration_has_the_poles_of_textbooks(n, frame):
     for moments in BODIES:
         robot = in_orbit(free_body(moments), n)
-        found = fflin.relative_equilibria(robot, frame=frame)
-        assert len(found) == 24
-        for one in found:
+        result = fflin.relative_equilibria(robot, frame=frame)
+        assert len(result) == 24
+        for one in result:
             radial, along, normal = one.moments
             pitch = n * np.emath.sqrt(3.0 * (radial - along) / normal)
             k_a, k_r = (normal - radial) / along, (normal - along) / radial
@@ -71,7 +71,7 @@ def test_pitch_libration_of_a_stable_body_is_the_closed_form():
     assert np.abs(poles - LEO * math.sqrt(3.0 * (x - z) / y)).min() < 1e-12 * LEO
 
 
-def test_the_kinds_of_attitudes_are_told_and_margins_decide():
+def test_the_kinds_of_attitudes_are_reported_and_margins_decide():
     stable, *others = fflin.relative_equilibria(
         in_orbit(free_body((3.0, 5.0, 4.0)), LEO)
     )[::4]
@@ -88,7 +88,7 @@ def test_the_kinds_of_attitudes_are_told_and_margins_decide():
     assert len(kinds) == 8
 
 
-def test_what_has_no_such_attitudes_is_refused():
+def test_models_without_such_attitudes_are_refused():
     robot = fflin.load("cubesat", orbit=700e3)
     wheel = fflin.ReactionWheel([0.0, 1.0, 0.0], momentum=0.02)
     with pytest.raises(fflin.InputError, match="momentum"):

@@ -34,10 +34,10 @@ def test_a_trajectory_takes_every_quaternion_of_six_decimals(robots):
     exact, given = rounded(np.random.default_rng(0), 500)
     q = np.column_stack((np.zeros((500, 3)), given))
     nothing = np.zeros((500, 6))
-    found = fflin.Trajectory(robot, np.arange(500.0), q, nothing, nothing[1:]).q[:, 3:]
+    result = fflin.Trajectory(robot, np.arange(500.0), q, nothing, nothing[1:]).q[:, 3:]
     normalised = given / np.linalg.norm(given, axis=1, keepdims=True)
-    np.testing.assert_allclose(found, normalised, rtol=0, atol=3e-16)
-    np.testing.assert_allclose(found, exact, rtol=0, atol=TURN / 2.0)
+    np.testing.assert_allclose(result, normalised, rtol=0, atol=3e-16)
+    np.testing.assert_allclose(result, exact, rtol=0, atol=TURN / 2.0)
 
 
 def test_a_length_within_the_tolerance_is_normalised_and_another_is_refused(robots):
@@ -65,11 +65,11 @@ def test_other_tools_give_quaternions_of_six_decimals(robots, tool):
     robot = robots["planar_detumble"]
     for seed in range(20):
         pose = random_pose(np.random.default_rng(seed), 150.0)
-        own = fflin.linearize(robot, fflin.configuration(robot, {}, pose))
-        back = fflin.from_tool(robot, tool, np.round(own.to(tool).q, 6))
-        found = pin.XYZQUATToSE3(back.q[:7]).rotation
-        np.testing.assert_allclose(found.T @ found, np.eye(3), rtol=0, atol=ROUND_OFF)
-        assert angle(found, pose.rotation) < TURN
+        lin = fflin.linearize(robot, fflin.configuration(robot, {}, pose))
+        back = fflin.from_tool(robot, tool, np.round(lin.to(tool).q, 6))
+        result = pin.XYZQUATToSE3(back.q[:7]).rotation
+        np.testing.assert_allclose(result.T @ result, np.eye(3), rtol=0, atol=ROUND_OFF)
+        assert angle(result, pose.rotation) < TURN
 
 
 def test_rotation_matrices_of_six_decimals_are_normalised(robots):
@@ -78,9 +78,9 @@ def test_rotation_matrices_of_six_decimals_are_normalised(robots):
         R = random_pose(np.random.default_rng(seed), 150.0).rotation
         reference = pin.SE3(np.round(R, 6), np.zeros(3))
         state = fflin.StateMap(robot, reference=reference)
-        found = state.origin.rotation.T
-        np.testing.assert_allclose(found.T @ found, np.eye(3), rtol=0, atol=ROUND_OFF)
-        assert angle(found, R) < TURN
+        result = state.origin.rotation.T
+        np.testing.assert_allclose(result.T @ result, np.eye(3), rtol=0, atol=ROUND_OFF)
+        assert angle(result, R) < TURN
     far = pin.SE3(R * (1.0 + 1.01 * TOLERANCE), np.zeros(3))
     with pytest.raises(fflin.InputError, match="not a rotation matrix"):
         fflin.StateMap(robot, reference=far)
@@ -99,10 +99,10 @@ def test_placements_of_a_model_with_six_decimals_become_rotations():
     before = rough.copy()
     robot = fflin.from_model(rough)
     assert rough == before  # the model of the caller stays as it is
-    found = [*robot.model.jointPlacements, robot.model.frames[-1].placement]
+    result = [*robot.model.jointPlacements, robot.model.frames[-1].placement]
     exact = [*model.jointPlacements, model.jointPlacements[2]]
-    for own, placement in zip(found, exact, strict=True):
-        R = own.rotation
+    for default, placement in zip(result, exact, strict=True):
+        R = default.rotation
         np.testing.assert_allclose(R.T @ R, np.eye(3), rtol=0, atol=ROUND_OFF)
         assert angle(R, placement.rotation) < TURN
 
@@ -115,8 +115,8 @@ def test_mimic_joints_with_six_decimals_follow(tmp_path):
     robot = fflin.load(path)
     for position in np.linspace(-1.0, 1.0, 101) / np.pi:
         exact = fflin.configuration(robot, {"b": position})
-        found = robot.checked_configuration(np.round(exact, 6))
-        np.testing.assert_allclose(found, exact, rtol=0, atol=1.7e-6)
+        result = robot.checked_configuration(np.round(exact, 6))
+        np.testing.assert_allclose(result, exact, rtol=0, atol=1.7e-6)
         v = fflin.velocity(robot, {"b": position})
         robot.checked_velocity(np.round(v, 6))
 
@@ -155,11 +155,11 @@ def test_the_reference_of_a_trajectory_file_is_normalised_or_refused(robots, tmp
         placement = factor * np.round(exact, 6)
         path.write_text(json.dumps(given | {"placement": placement.tolist()}))
         if factor == 1.0:
-            found = fflin.Trajectory.load(path, robot).q[0]
+            result = fflin.Trajectory.load(path, robot).q[0]
             expected = fflin.StateMap(
                 robot, reference=pin.XYZQUATToSE3(exact)
             ).to_pinocchio(x[0])
-            np.testing.assert_allclose(found, expected[0], rtol=0, atol=TURN)
+            np.testing.assert_allclose(result, expected[0], rtol=0, atol=TURN)
         else:
             with pytest.raises(fflin.InputError, match=r"placement.* has length 2"):
                 fflin.Trajectory.load(path, robot)

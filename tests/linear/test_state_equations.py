@@ -23,10 +23,10 @@ CASES = [
 ]
 
 
-def rows_of(robot, frame, own):
+def rows_of(robot, frame, default):
     """State, actuation, chart, nu, u and rates of some points, and the same point by point."""
     rng = np.random.default_rng(3)
-    reference = None if own else random_pose(rng, 40.0)
+    reference = None if default else random_pose(rng, 40.0)
     state = fflin.StateMap(robot, reference=reference, frame=frame)
     actuation = Actuation(state)
     source = Accelerations(state, actuation, robot.create_data())
@@ -36,13 +36,13 @@ def rows_of(robot, frame, own):
     if robot.orbit:
         q[:, :3] *= 0.1
     nv, nu = state.nx // 2, state.velocities(v)
-    chart = Standing(COUNT) if own else state.charts(q)
+    chart = Standing(COUNT) if default else state.charts(q)
     u = actuation.in_base_axes(chart, u)
     rates = [
         source.rates(*point, np.empty((nv, 2 * nv)), np.empty((nv, u.shape[1])))
         for point in zip(q, v, nu, u, strict=True)
     ]
-    charts = [Standing() if own else state.chart(row) for row in q]
+    charts = [Standing() if default else state.chart(row) for row in q]
     return (
         state,
         actuation,
@@ -58,33 +58,33 @@ def assembled(state, actuation, chart, nu, u, rates, moving):
         : state.nx // 2
     ]
     A[..., state.nx // 2 :, :] = rates.slopes
-    own = AccelerationDerivatives(
+    derivatives = AccelerationDerivatives(
         rates.c, A[..., state.nx // 2 :, :], rates.by_u.copy(), rates.gravity
     )
-    f0 = assemble(actuation, chart, nu, u, own, A, moving=moving)
-    return A, own.by_u, f0
+    f0 = assemble(actuation, chart, nu, u, derivatives, A, moving=moving)
+    return A, derivatives.by_u, f0
 
 
-@pytest.mark.parametrize(("frame", "own", "moving", "fields"), CASES)
+@pytest.mark.parametrize(("frame", "default", "moving", "fields"), CASES)
 def test_many_rows_are_the_same_as_one_after_the_other(
-    robots, frame, own, moving, fields
+    robots, frame, default, moving, fields
 ):
     robot = robots["planar_detumble"].replace(**fields)
-    state, actuation, (chart, nu, u, rates), points = rows_of(robot, frame, own)
+    state, actuation, (chart, nu, u, rates), points = rows_of(robot, frame, default)
     many = AccelerationDerivatives(
         *(np.array(part) for part in zip(*rates, strict=True))
     )
-    found = assembled(state, actuation, chart, nu, u, many, moving)
+    result = assembled(state, actuation, chart, nu, u, many, moving)
     for row, point in enumerate(points):
         for all_rows, one in zip(
-            found, assembled(state, actuation, *point, moving), strict=True
+            result, assembled(state, actuation, *point, moving), strict=True
         ):
             assert np.abs(all_rows[row] - one).max() < 1e-13 * max(
                 1.0, np.abs(one).max()
             )
 
 
-def test_the_charts_of_rows_are_those_of_each(robots):
+def test_charts_of_rows_match_charts_of_single_points(robots):
     robot = robots["planar_detumble"]
     rng = np.random.default_rng(5)
     state = fflin.StateMap(robot, reference=random_pose(rng, 70.0))

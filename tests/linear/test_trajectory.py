@@ -73,11 +73,11 @@ def test_one_step_of_torque_holds_at_every_spacing(knots):
         ({"sample": 0.4, "every": 40}, "previous", 1e-6),
     ],
 )
-def test_what_is_simulated_holds(loop, options, hold, largest):
+def test_the_simulated_loop_holds_the_point(loop, options, hold, largest):
     """Held inputs to the integrator's order; of others the knots have what is linear between."""
     _, run = loop
-    found = run(**options)
-    along = found.trajectory()
+    result = run(**options)
+    along = result.trajectory()
     assert (along.hold, along.frame) == (hold, "hybrid")
     assert along.residual.max() < largest
     if hold == "linear":
@@ -86,7 +86,7 @@ def test_what_is_simulated_holds(loop, options, hold, largest):
         assert coarse / along.residual.max() == pytest.approx(4.0, abs=0.8)
 
 
-def test_axes_of_inputs_are_those_of_the_frame():
+def test_axes_of_inputs_match_the_frame():
     robot = fflin.load("ets_vii")
     reference = pin.SE3(pin.rpy.rpyToMatrix(0.4, -0.2, 0.9), np.array([1.0, 2.0, 3.0]))
     v0 = fflin.velocity(robot, {"omega_b.x": 0.5, "omega_b.y": -0.3, "v_b.z": 0.1})
@@ -121,13 +121,18 @@ def test_knots_that_are_no_motion_say_where_how_many_and_the_usual_causes():
     jump = v.copy()
     jump[40, 0] += 0.1
     given = fflin.Trajectory(robot, t, q, jump, u)
-    with pytest.warns(fflin.FflinWarning, match="and 2 of 80 intervals") as found:
+    with pytest.warns(fflin.FflinWarning, match="and 2 of 80 intervals") as result:
         along = fflin.linearize_trajectory(robot, given)
-    said = str(found[0].message)
+    message = str(result[0].message)
     k = int(given.interval_errors.argmax())
-    assert k in (39, 40) and f"from t = {t[k]:g} to {t[k + 1]:g} s" in said
-    assert f"the error is {given.residual.max():.2g}" in said and "usual causes" in said
-    assert said in " ".join(str(given).split()) and said in " ".join(str(along).split())
+    assert k in (39, 40) and f"from t = {t[k]:g} to {t[k + 1]:g} s" in message
+    assert (
+        f"the error is {given.residual.max():.2g}" in message
+        and "usual causes" in message
+    )
+    assert message in " ".join(str(given).split()) and message in " ".join(
+        str(along).split()
+    )
 
 
 def test_intervals_are_integrated_once(monkeypatch):
@@ -136,7 +141,7 @@ def test_intervals_are_integrated_once(monkeypatch):
     given, ends = fflin.Trajectory(robot, t, q, v, 1.1 * u), []
     end = fflin.Trajectory.end
     monkeypatch.setattr(
-        fflin.Trajectory, "end", lambda *each: ends.append(each[1]) or end(*each)
+        fflin.Trajectory, "end", lambda *item: ends.append(item[1]) or end(*item)
     )
     with pytest.warns(fflin.FflinWarning, match="not a motion"):
         along = fflin.linearize_trajectory(robot, given)
@@ -158,13 +163,13 @@ def test_intervals_are_integrated_once(monkeypatch):
         ("t", 80, 1e300, "from t = 0.395 to 1e+300 s the integration overflows"),
     ],
 )
-def test_what_overflows_is_refused_with_its_place(name, row, value, where, monkeypatch):
+def test_an_overflow_is_refused_with_its_index(name, row, value, where, monkeypatch):
     robot = fflin.load("astrobee_arm")
     given = dict(zip("tqvu", map(np.array, motion(robot)), strict=True))
     given[name][row if name == "t" else (row, 2)] = value
     ends, end = [], fflin.Trajectory.end
     monkeypatch.setattr(
-        fflin.Trajectory, "end", lambda *each: ends.append(each[1]) or end(*each)
+        fflin.Trajectory, "end", lambda *item: ends.append(item[1]) or end(*item)
     )
     with pytest.raises(fflin.InputError, match=re.escape(where)):
         fflin.linearize_trajectory(robot, *given.values())
@@ -179,11 +184,11 @@ def test_continuous_joints_may_be_angles(loop):
     narrow = np.column_stack((along.q[:, :7], angles))
     again = fflin.Trajectory(robot, along.t, narrow, along.v, along.u)
     assert again.q == pytest.approx(along.q, abs=1e-15)
-    said = (
+    message = (
         r"q has shape \(201, 11\), expected \(201, 13\), or \(201, 10\) with one angle "
         r"for each continuous joint"
     )
-    with pytest.raises(fflin.InputError, match=said):
+    with pytest.raises(fflin.InputError, match=message):
         fflin.linearize_trajectory(robot, along.t, along.q[:, 2:], along.v, along.u)
 
 
@@ -226,7 +231,7 @@ def test_points_between_knots_are_of_order_four():
     assert np.abs(v[:, 3:6]).max() > 0.1  # the base rotates
 
     def missed(every):
-        along = fflin.Trajectory(robot, *(each[::every] for each in (t, q, v, u)))
+        along = fflin.Trajectory(robot, *(item[::every] for item in (t, q, v, u)))
         midway = range(every // 2, len(t), every)
         apart = [
             pin.difference(robot.model, along.point(t[k])[0], q[k]) for k in midway
@@ -238,7 +243,7 @@ def test_points_between_knots_are_of_order_four():
     )
 
 
-def test_a_bad_interval_is_told_at_both_its_knots(loop):
+def test_a_bad_interval_is_reported_at_both_its_knots(loop):
     _, run = loop
     along = run(sample=0.1, every=10).trajectory()
     u = along.u.copy()
@@ -247,7 +252,7 @@ def test_a_bad_interval_is_told_at_both_its_knots(loop):
 
 
 @pytest.mark.parametrize("ending", ["npz", "mat", "json", "csv"])
-def test_what_is_saved_is_read_to_the_last_bit(loop, tmp_path, ending):
+def test_saved_results_are_read_bit_for_bit(loop, tmp_path, ending):
     robot, run = loop
     along = run(sample=0.1, every=10).trajectory()
     along.save(tmp_path / f"a.{ending}")
@@ -287,7 +292,7 @@ def test_a_changed_csv_is_refused_and_one_of_another_program_is_not_verified(
     ):
         with pytest.raises(fflin.FileError, match=refused):
             load(*table)
-    foreign = load(*(each[:-1] for each in (header, *rows[:3], changed, *rows[4:])))
+    foreign = load(*(item[:-1] for item in (header, *rows[:3], changed, *rows[4:])))
     assert "not verified" in str(foreign) and foreign.v[3, 8] == 2.0 * along.v[3, 8]
     foreign.save(path)
     assert "sha256" not in path.read_text()
@@ -296,15 +301,15 @@ def test_a_changed_csv_is_refused_and_one_of_another_program_is_not_verified(
 
 def test_files_of_other_programs_are_read(loop, tmp_path):
     robot, run = loop
-    found = run(sample=0.1, every=10)
-    along = found.trajectory()
+    result = run(sample=0.1, every=10)
+    along = result.trajectory()
     state = fflin.StateMap(robot, frame="world")
-    x = np.array([state.to_state(*each) for each in zip(along.q, along.v, strict=True)])
+    x = np.array([state.to_state(*item) for item in zip(along.q, along.v, strict=True)])
     turned = replace(along, frame="world", u=_of_world(along))
 
     # An input that does nothing may be left out.
     along, turned = (
-        replace(each, u=each.u * (np.arange(9) != 7)) for each in (along, turned)
+        replace(item, u=item.u * (np.arange(9) != 7)) for item in (along, turned)
     )
 
     def same(path, **options):
@@ -316,7 +321,7 @@ def test_files_of_other_programs_are_read(loop, tmp_path):
         assert not again.verified
 
     columns = {"t": along.t} | dict(zip(state.names, x.T, strict=True))
-    acting = zip(found.input_names, turned.u.T, strict=True)
+    acting = zip(result.input_names, turned.u.T, strict=True)
     columns |= {name: u for name, u in acting if name != "tau_m.joint_2"}
     path = tmp_path / "by_hand.csv"
 
@@ -358,7 +363,7 @@ def test_files_of_other_programs_are_read(loop, tmp_path):
     (tmp_path / "d.json").write_text(json.dumps(lists))
     same(tmp_path / "d.json")
 
-    found.save(tmp_path / "motion.npz")
+    result.save(tmp_path / "motion.npz")
     again = fflin.Trajectory.load(tmp_path / "motion.npz", robot, hold="previous")
     assert again.residual.max() < 1e-8
     with pytest.raises(fflin.InputError, match="file"):
@@ -409,7 +414,7 @@ def _of_world(along):
     return u
 
 
-def test_rows_that_miss_the_samples_are_told():
+def test_rows_that_miss_the_samples_are_reported():
     robot = fflin.load("cubesat")
     options = {"duration": 2.0, "dt": 0.01, "sample": 0.1}
     run = fflin.simulate(robot, lambda t, q, v: np.zeros(6), every=7, **options)
@@ -420,7 +425,7 @@ def test_rows_that_miss_the_samples_are_told():
         ).notes
 
 
-def test_a_base_that_turns_too_far_between_knots_is_told():
+def test_a_base_that_turns_too_far_between_knots_is_reported():
     robot = fflin.load("cubesat")
     for speed, far in ((3.3, True), (2.0, False)):
         v0 = fflin.velocity(robot, {"omega_b.z": speed})

@@ -84,7 +84,7 @@ def test_robot_file_gives_the_same_robot_as_python(tmp_path):
         ("radius = 0.3\n", "", 13, "the key 'radius'"),
     ],
 )
-def test_mistakes_are_told_by_file_and_line(tmp_path, old, new, line, message):
+def test_mistakes_are_reported_by_file_and_line(tmp_path, old, new, line, message):
     assert old in TWO_ARRAYS
     path = written(tmp_path, TWO_ARRAYS.replace(old, new, 1))
     with pytest.raises(FflinError) as caught:

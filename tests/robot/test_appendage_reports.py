@@ -76,12 +76,12 @@ def test_rotation_of_a_mode_is_about_the_frame_of_its_appendage():
 def test_a_large_amplitude_warns_that_the_model_is_linear_in_it():
     small, large = swinging(0.02), swinging(0.5)
     assert "linear" not in str(small)
-    said = " ".join(str(large).split())
+    message = " ".join(str(large).split())
     assert (
         "warning: the motion is not accurate, because the model is linear in the modal amplitudes"
-        in said
+        in message
     )
-    assert "more than 5 deg: beam_mode_1" in said
+    assert "more than 5 deg: beam_mode_1" in message
 
 
 def test_settling_and_campaigns_do_not_take_modes_for_joints():
@@ -120,13 +120,13 @@ def test_a_campaign_judges_the_base_of_a_robot_whose_joints_are_modes():
 
 def test_modes_of_appendages_are_listed_free_and_clamped():
     robot = full().replace(gravity=(0, 0, 0))
-    found = fflin.modes(fflin.linearize(robot))
+    result = fflin.modes(fflin.linearize(robot))
     of_boom = next(
-        mode for mode in found.vibrations if next(iter(mode.strain)) == "boom_mode_2"
+        mode for mode in result.vibrations if next(iter(mode.strain)) == "boom_mode_2"
     )
     assert sum(of_boom.strain.values()) == pytest.approx(1.0)
     assert of_boom.frequency > 2.0 * math.pi * 0.8
-    text = str(found)
+    text = str(result)
     line = next(
         line for line in text.splitlines() if " boom_mode_2  boom_mode_2 " in line
     )
@@ -162,13 +162,15 @@ def test_default_weights_leave_modes_to_their_damping_and_name_them():
     flexible = fflin.lqr(fflin.linearize(rigid.replace(appendages=appendages)))
     # The rigid part is as fast as it was: the modes are those that swing.
     decays = [
-        min(-p.real for p in each.poles if abs(p.imag) < 2.0 * abs(p.real))
-        for each in (gain, flexible)
+        min(-p.real for p in item.poles if abs(p.imag) < 2.0 * abs(p.real))
+        for item in (gain, flexible)
     ]
     assert decays[1] == pytest.approx(decays[0], rel=0.01)
-    said = " ".join(str(flexible).split())
-    assert "decaying more slowly: " in said and "kg^0.5 m of the joints" not in said
-    assert "boom_mode_2" in said[said.index("decaying more slowly") :]
+    message = " ".join(str(flexible).split())
+    assert (
+        "decaying more slowly: " in message and "kg^0.5 m of the joints" not in message
+    )
+    assert "boom_mode_2" in message[message.index("decaying more slowly") :]
 
 
 def test_a_pendulum_without_gravity_is_named():

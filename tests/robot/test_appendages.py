@@ -63,11 +63,11 @@ def frequencies(lin):
 )
 def test_a_clamped_beam_on_a_hub_has_the_frequencies_of_the_free_beam(hub, expected):
     robot = hub_with_rod(*hub, 1.0, 1.0).replace(appendages=[beam(1.0, 1.0, 1.0, 8)])
-    found = np.sqrt(frequencies(fflin.linearize(robot)))
-    assert found[:2] == pytest.approx(expected, abs=6e-5 if hub[0] < 1.0 else 6e-6)
+    result = np.sqrt(frequencies(fflin.linearize(robot)))
+    assert result[:2] == pytest.approx(expected, abs=6e-5 if hub[0] < 1.0 else 6e-6)
 
 
-def test_effective_masses_of_a_beam_are_the_published_shares():
+def test_effective_masses_of_a_beam_are_the_published_fractions():
     assert clamped_roots(5) == pytest.approx(CLAMPED, rel=1e-10)
     masses = beam(1.0, 1.0, 1.0, 3).translation[2] ** 2
     assert masses == pytest.approx((0.6131, 0.1883, 0.0648), abs=1e-4)
@@ -128,7 +128,7 @@ def postures(robot, rigid, seed):
     rng = np.random.default_rng(seed)
     joints = dict(zip(rigid.joint_names, rng.uniform(-1.0, 1.0, rigid.n), strict=True))
     turn = pin.SE3(pin.rpy.rpyToMatrix(*rng.normal(size=3)), rng.normal(size=3))
-    return [fflin.configuration(each, joints, turn) for each in (robot, rigid)]
+    return [fflin.configuration(item, joints, turn) for item in (robot, rigid)]
 
 
 def participation(rigid, appendage, q):
@@ -156,12 +156,12 @@ def test_the_mass_matrix_is_the_rigid_one_bordered_by_the_participation(seed):
         new = [6 + robot.joint_names.index(name) for name in appendage.modes]
         expected[np.ix_(old, new)] = participation(rigid, appendage, q_rigid)
         expected[np.ix_(new, old)] = expected[np.ix_(old, new)].T
-    found = symmetric(robot, q)
-    assert np.abs(found - expected).max() < 1e-12 * np.abs(expected).max()
+    result = symmetric(robot, q)
+    assert np.abs(result - expected).max() < 1e-12 * np.abs(expected).max()
     assert robot.mass == pytest.approx(rigid.mass, rel=1e-14)
 
 
-def test_the_linear_model_is_that_of_hybrid_coordinates():
+def test_the_linear_model_matches_hybrid_coordinates():
     rigid, appendages = servicer()
     robot = rigid.replace(appendages=appendages)
     q, _ = postures(robot, rigid, 5)
@@ -268,11 +268,11 @@ def test_pendulum_under_thrust_swings_with_the_reduced_mass():
     )
     lin = fflin.linearize(robot, u=fflin.effort(robot, {"F_b.z": thrust}), moving=True)
     expected = math.sqrt(thrust / (m0 + m1) / length * (m0 + m1) / m0)
-    found = frequencies(lin)
-    assert found == pytest.approx([expected], rel=1e-6)
+    result = frequencies(lin)
+    assert result == pytest.approx([expected], rel=1e-6)
 
 
-def test_springs_of_a_tank_are_those_of_its_frequency():
+def test_springs_of_a_tank_match_its_frequency():
     robot = hub_with_rod(1e9, 1e9, 10.0, 1.0)
     tank = fflin.Slosh(
         "root_joint", 5.0, (0.3, 0, 0), frequency=0.4, damping=0.1, name="tank"
@@ -391,7 +391,7 @@ def test_wrong_liquids_are_refused(change, message):
         fflin.Slosh(**(given | change))
 
 
-def test_what_the_link_cannot_have_is_refused():
+def test_an_appendage_that_exceeds_its_link_is_refused():
     robot = hub_with_rod(1.0, 0.1, 1.0, 1.0)
     heavy = fflin.FlexibleAppendage("root_joint", [1.0, 2.0], [[0, 0], [0, 0], [0.5, 1.5]],
                                     np.zeros((3, 2)), name="array")  # fmt: skip
@@ -462,7 +462,7 @@ def test_huge_participation_is_refused_by_the_mode(size):
 
 
 @pytest.mark.parametrize("name", ["*", "a[1]", " ", "a\nb"])
-def test_names_that_are_none_are_refused(name):
+def test_invalid_names_are_refused(name):
     with pytest.raises(InputError, match="of an appendage is"):
         fflin.FlexibleAppendage(
             "base", 1.0, np.zeros((3, 1)), np.zeros((3, 1)), name=name

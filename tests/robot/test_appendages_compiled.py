@@ -105,8 +105,8 @@ def test_both_engines_agree_on_an_array_with_noise_in_place_of_zero(noise):
         assert fflin.check(noisy, lin).ok
         for key in ("A", "B", "f0"):
             expected = getattr(lin, key)
-            found = getattr(batch, key)[index]
-            assert np.abs(found - expected).max() < 1e-12 * np.abs(expected).max()
+            result = getattr(batch, key)[index]
+            assert np.abs(result - expected).max() < 1e-12 * np.abs(expected).max()
     motions = [
         fflin.simulate(noisy, q0=q[0], v0=v[0], duration=20.0, dt=0.05, engine=engine)
         for engine in ("python", "compiled")

@@ -40,8 +40,10 @@ CHANGES = [
 ]
 
 
-@pytest.mark.parametrize(("change", "said"), CHANGES)
-def test_a_changed_model_is_refused_wherever_results_are_made(change, said, tmp_path):
+@pytest.mark.parametrize(("change", "message"), CHANGES)
+def test_a_changed_model_is_refused_wherever_results_are_made(
+    change, message, tmp_path
+):
     robot = fflin.load("ets_vii")
     linearizer = fflin.Linearizer(robot)
     before = linearizer()
@@ -61,12 +63,12 @@ def test_a_changed_model_is_refused_wherever_results_are_made(change, said, tmp_
         lambda: fflin.validity(robot, before, gain, samples=1),
         lambda: robot.replace(damping=1.0),
     ):
-        with pytest.raises(fflin.ModelError, match=f"{said}.*from_model"):
+        with pytest.raises(fflin.ModelError, match=f"{message}.*from_model"):
             result()
     assert not list(tmp_path.iterdir())
 
 
-def test_a_model_of_a_changed_robot_is_refused_by_what_uses_it():
+def test_a_model_of_a_changed_robot_is_refused_by_its_users():
     robot = fflin.load("ets_vii")
     linearizer = fflin.Linearizer(robot)
     batch = fflin.sweep(robot, [robot.neutral()])
@@ -87,7 +89,7 @@ def test_a_model_of_a_changed_robot_is_refused_by_what_uses_it():
         fflin.lqr_batch(batch, 1.0, 1.0)
 
 
-def test_what_is_made_of_a_model_remembers_the_robot():
+def test_objects_made_from_a_model_keep_the_robot():
     robot = fflin.load("ets_vii", lock=["joint_6"])
     lin = fflin.linearize(robot)
     made = [
@@ -96,12 +98,12 @@ def test_what_is_made_of_a_model_remembers_the_robot():
         replace(lin, u0=lin.u0 + 1.0),
     ]
     heavier(robot.model)
-    for each in made:
+    for item in made:
         with pytest.raises(fflin.ModelError, match=r"inertia .*'joint_1'"):
-            each.to_scipy()
+            item.to_scipy()
 
 
-def test_a_replaced_robot_remembers_what_was_made():
+def test_a_replaced_robot_keeps_its_cached_results():
     robot = fflin.load("ets_vii")
     heavier(robot.model)
     with pytest.raises(fflin.ModelError, match=r"inertia .*'joint_1'"):
@@ -120,7 +122,7 @@ def test_a_robot_made_of_the_changed_model_works_and_differs():
     assert np.abs(lin.B - B).max() > 1e-6
 
 
-def test_copies_remember_what_was_made():
+def test_copies_keep_cached_results():
     robot = fflin.load("ets_vii")
     heavier(robot.model)
     for twin in (pickle.loads(pickle.dumps(robot)), copy.deepcopy(robot)):
@@ -139,7 +141,7 @@ def test_limits_and_new_frames_are_no_change():
     assert fflin.check(pushed, fflin.linearize(pushed)).ok
 
 
-def test_a_limit_that_is_no_number_is_no_change():
+def test_a_limit_that_is_not_a_number_is_not_a_change():
     model = fflin.load("ets_vii").model.copy()
     model.lowerPositionLimit[7] = np.nan
     fflin.linearize(fflin.from_model(model))

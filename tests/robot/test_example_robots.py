@@ -19,7 +19,7 @@ REFUSED = {
 NAMES = [n for n in fflin.list_robots() if find_robot(n).origin == "example-robot-data"]
 
 
-def test_names_are_those_of_the_package():
+def test_names_match_the_package():
     from example_robot_data.robots_loader import ROBOTS
 
     # SDF only, and a robot that its loader makes from the URDF of another.
@@ -38,21 +38,21 @@ def test_check_holds(name):
         return
     robot = fflin.load(name)
     assert robot.n == robot.model.nv - 6 - len(robot.followers)
-    found = fflin.check(robot, fflin.linearize(robot))
-    assert found.ok, found
+    result = fflin.check(robot, fflin.linearize(robot))
+    assert result.ok, result
     rng = np.random.default_rng(1)
     for frame in FRAMES:
         point = random_point(robot, rng, degrees=160.0)
-        found = fflin.check(robot, fflin.linearize(robot, *point, frame=frame))
-        assert found.ok, found
+        result = fflin.check(robot, fflin.linearize(robot, *point, frame=frame))
+        assert result.ok, result
 
 
-def test_an_inertia_that_is_negative_by_rounding_is_that_of_a_link():
+def test_an_inertia_that_is_negative_only_by_rounding_is_accepted():
     robot = fflin.load("icub", lock=["neck_roll", "neck_yaw"])
     link = robot.links["r_hip_2"]
     assert -1e-18 < np.linalg.eigvalsh(link.inertia)[0] < 0.0 < link.mass
     assert sum(
-        each.mass for each in robot.pieces.values() if not each.whole
+        item.mass for item in robot.pieces.values() if not item.whole
     ) == pytest.approx(robot.mass)
     model = fflin.uncertain(robot, {"base.mass": 0.1})
     assert model.names == ("base.mass",)

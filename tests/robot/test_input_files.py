@@ -64,7 +64,7 @@ def written(tmp_path):
     "start", [b"", b"\xef\xbb\xbf"], ids=["plain", "byte order mark"]
 )
 @pytest.mark.parametrize("ending", ["\n", "\r\n"])
-def test_order_in_the_file_is_that_of_u(written, start, ending):
+def test_order_in_the_file_matches_u(written, start, ending):
     path = written(start + WHOLE.replace("\n", ending).encode())
     inputs = (
         fflin.Thruster("tool", (0.1, 2, -0.3), (0, 0, 1)),
@@ -119,8 +119,8 @@ def test_thrusters_of_cubesat_push_and_turn_every_way():
         (*least, *least), (*np.eye(6), *-np.eye(6)), strict=True
     ):
         # thrusts of 0 or more
-        found = linprog(np.ones(12), A_eq=wrenches, b_eq=direction)
-        assert found.success and found.fun == pytest.approx(total, rel=1e-9)
+        result = linprog(np.ones(12), A_eq=wrenches, b_eq=direction)
+        assert result.success and result.fun == pytest.approx(total, rel=1e-9)
     # All at once cancel, so that every thrust can be raised by the same amount.
     np.testing.assert_allclose(wrenches @ np.ones(12), 0.0, atol=1e-15)
 
@@ -189,7 +189,7 @@ def test_every_mistake_has_its_line(written, content):
     assert line in text and keyword in text
 
 
-def test_files_that_are_none(tmp_path, written):
+def test_invalid_files_are_refused(tmp_path, written):
     for path, words in (
         (tmp_path / "none.toml", "No such file"),
         (tmp_path, "folder"),

@@ -15,10 +15,10 @@ AT = ("base", (0, 0, 0), (1, 0, 0))
 
 def test_the_urdf_says_efforts_speeds_and_travels():
     robot = fflin.load("servicer_7dof")
-    found = limits_of(robot)
-    assert found["tau_m.joint_1"] == (-300.0, 300.0)
-    assert found["qdot_m.joint_5"] == (-0.4, 0.4)
-    low, high = found["q_m.joint_2"]
+    result = limits_of(robot)
+    assert result["tau_m.joint_1"] == (-300.0, 300.0)
+    assert result["qdot_m.joint_5"] == (-0.4, 0.4)
+    low, high = result["q_m.joint_2"]
     assert (low, high) == pytest.approx((-2.094, 2.094), abs=1e-3)
     sizes = magnitudes_of(robot)
     assert sizes["q_m.joint_2"] == high - low
@@ -52,23 +52,23 @@ def test_limits_of_inputs_go_before_the_urdf_and_given_ones_before_both():
             "main": 4.0,
         },
     )
-    found = limits_of(robot)
-    assert found["tau_b.y"] == (-40.0, 40.0)
-    assert [found[f"F_b.{axis}"] for axis in "xyz"] == [
+    result = limits_of(robot)
+    assert result["tau_b.y"] == (-40.0, 40.0)
+    assert [result[f"F_b.{axis}"] for axis in "xyz"] == [
         (-0.5, 3.0),
         (-0.5, 2.0),
         (-0.5, 1.0),
     ]
-    assert found["tau_m.joint_1"] == (-2.0, 7.0)
-    assert found["tau_m.joint_2"] == (-5.0, 6.0)
-    assert found["thruster_1"] == (0.0, 22.0)
-    assert found["main"] == (0.0, 4.0)
-    assert found["spin"] == (-0.2, 0.2)
-    assert found["qdot_m.spin"] == (-600.0, 600.0)
-    assert found["wheel_2"] == (-0.1, 0.1)
-    assert found["q_m.joint_7"] == (-1.0, 1.0)
-    assert found["q_m.panel_left"] == (-0.6, 0.6)
-    assert found["omega_b.z"] == (-0.1, 0.1)
+    assert result["tau_m.joint_1"] == (-2.0, 7.0)
+    assert result["tau_m.joint_2"] == (-5.0, 6.0)
+    assert result["thruster_1"] == (0.0, 22.0)
+    assert result["main"] == (0.0, 4.0)
+    assert result["spin"] == (-0.2, 0.2)
+    assert result["qdot_m.spin"] == (-600.0, 600.0)
+    assert result["wheel_2"] == (-0.1, 0.1)
+    assert result["q_m.joint_7"] == (-1.0, 1.0)
+    assert result["q_m.panel_left"] == (-0.6, 0.6)
+    assert result["omega_b.z"] == (-0.1, 0.1)
     lin = fflin.linearize(robot)
     assert lin.limits["spin"] == 0.2
     assert lin.limits["thruster_1"] == 22.0
@@ -77,24 +77,24 @@ def test_limits_of_inputs_go_before_the_urdf_and_given_ones_before_both():
     bare = robot.replace(inputs=[fflin.BaseTorque()])
     assert "main" not in limits_of(bare)
     assert "tau_b.x" not in limits_of(bare)
-    assert limits_of(bare.replace(inputs=robot.inputs)) == found
+    assert limits_of(bare.replace(inputs=robot.inputs)) == result
 
 
 def test_a_pattern_goes_before_a_group_and_a_name_before_both():
     limits = {"tau_m.joint_7": 1.0, "tau_m": 3.0, "joint_*": 2.0}
-    found = limits_of(fflin.load("servicer_7dof", limits=limits))
-    assert found["tau_m.joint_7"] == (-1.0, 1.0)
-    assert found["tau_m.joint_1"] == (-2.0, 2.0)
-    assert found["tau_m.panel_left"] == (-3.0, 3.0)
+    result = limits_of(fflin.load("servicer_7dof", limits=limits))
+    assert result["tau_m.joint_7"] == (-1.0, 1.0)
+    assert result["tau_m.joint_1"] == (-2.0, 2.0)
+    assert result["tau_m.panel_left"] == (-3.0, 3.0)
 
 
 def test_the_group_of_all_joints_leaves_wheels_out():
     wheel = fflin.ReactionWheel((0, 0, 1), inertia=0.03, max_speed=600.0, name="spin")
     robot = fflin.load("servicer_7dof", inputs=[wheel])
-    found = limits_of(robot.replace(limits={"qdot_m": 0.5, "qdot_m.joint_*": 0.2}))
-    assert found["qdot_m.panel_left"] == (-0.5, 0.5)
-    assert found["qdot_m.joint_1"] == (-0.2, 0.2)
-    assert found["qdot_m.spin"] == (-600.0, 600.0)
+    result = limits_of(robot.replace(limits={"qdot_m": 0.5, "qdot_m.joint_*": 0.2}))
+    assert result["qdot_m.panel_left"] == (-0.5, 0.5)
+    assert result["qdot_m.joint_1"] == (-0.2, 0.2)
+    assert result["qdot_m.spin"] == (-600.0, 600.0)
     assert limits_of(robot.replace(limits={"qdot_m.spin": 50}))["qdot_m.spin"] == (
         -50.0,
         50.0,
@@ -120,7 +120,7 @@ def test_limits_make_no_second_input():
 
 
 @pytest.mark.parametrize(
-    ("make", "said"),
+    ("make", "message"),
     [
         (lambda: fflin.BaseTorque(max=-1.0), "base_torque"),
         (lambda: fflin.BaseTorque(max=(1, 0, 1)), "base_torque"),
@@ -141,13 +141,13 @@ def test_limits_make_no_second_input():
         ),
     ],
 )
-def test_limits_that_are_none_are_refused_in_a_line(make, said):
-    with pytest.raises(fflin.InputError, match=said):
+def test_invalid_limits_are_refused_in_one_line(make, message):
+    with pytest.raises(fflin.InputError, match=message):
         make()
 
 
 @pytest.mark.parametrize(
-    ("limits", "error", "said"),
+    ("limits", "error", "message"),
     [
         ({"nosuch": 1.0}, fflin.UnknownNameError, "'nosuch'"),
         ({"tau_b": -1.0}, fflin.InputError, "-1.0"),
@@ -155,8 +155,8 @@ def test_limits_that_are_none_are_refused_in_a_line(make, said):
         ({"tau_b": "much"}, fflin.InputError, "'much'"),
     ],
 )
-def test_given_limits_that_are_none_are_refused_in_a_line(limits, error, said):
-    with pytest.raises(error, match=said):
+def test_invalid_limit_arguments_are_refused_in_one_line(limits, error, message):
+    with pytest.raises(error, match=message):
         fflin.load("cubesat", limits=limits)
 
 
@@ -172,17 +172,17 @@ URDF = """<robot name="arm"><link name="base">{0}</link><link name="a">{0}</link
 )
 
 
-def test_efforts_and_velocities_of_zero_are_said_once_and_are_none(tmp_path):
+def test_efforts_and_velocities_of_zero_are_reported_once_and_ignored(tmp_path):
     path = tmp_path / "arm.urdf"
     path.write_text(URDF)
-    with pytest.warns(fflin.FflinWarning) as told:
+    with pytest.warns(fflin.FflinWarning) as messages:
         robot = fflin.load(path)
-    said = [str(each.message) for each in told]
-    assert said == [
+    message = [str(item.message) for item in messages]
+    assert message == [
         "arm: effort 0 of joints 'hinge', 'elbow': no limit (or passive)",
         "arm: velocity 0 of joint 'hinge': no limit (or passive)",
     ]
-    assert tuple(said) == robot.notes
+    assert tuple(message) == robot.notes
     assert not {"tau_m.hinge", "tau_m.elbow", "qdot_m.hinge"} & set(limits_of(robot))
     assert limits_of(robot)["qdot_m.elbow"] == (-2.0, 2.0)
     path.write_text(
@@ -228,7 +228,7 @@ max_speed = 600
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("type = 'base_torque'\nmax = 'a'", ":3: .*'a'"),
         ("type = 'base_torque'\nmax = -2", ":3: .*base_torque"),
@@ -240,10 +240,12 @@ max_speed = 600
         ("type = 'joint_torque'\njoint = 'a'\nlimit = 1", ":4: .*'l"),
     ],
 )
-def test_wrong_limits_in_toml_files_are_told_with_their_line(tmp_path, text, said):
+def test_wrong_limits_in_toml_files_are_reported_with_their_line(
+    tmp_path, text, message
+):
     path = tmp_path / "inputs.toml"
     path.write_text(f"[[input]]\n{text}\n")
-    with pytest.raises(fflin.FflinError, match=said):
+    with pytest.raises(fflin.FflinError, match=message):
         fflin.load_inputs(path)
 
 
@@ -262,10 +264,10 @@ def test_the_range_of_a_travel_may_be_open_or_one_sided(tmp_path):
 def test_one_side_of_a_motor_leaves_the_other_to_the_urdf():
     robot = fflin.load("servicer_7dof")
     effort = limits_of(robot)["tau_m.joint_1"][1]
-    own = robot.replace(
+    limited = robot.replace(
         inputs=[fflin.JointTorque("joint_1", min=-1.0), fflin.BaseTorque()]
     )
-    assert limits_of(own)["tau_m.joint_1"] == (-1.0, effort)
+    assert limits_of(limited)["tau_m.joint_1"] == (-1.0, effort)
 
 
 def test_limits_of_groups_have_the_order_of_the_state():

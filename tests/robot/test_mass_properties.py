@@ -121,7 +121,7 @@ def test_perturbed_bodies_are_rigid_bodies_within_the_spread(name):
                 continue
             assert abs(after.mass / before.mass - 1.0) <= 0.3
             was, now = (
-                np.linalg.eigvalsh(pseudo_inertia(each)) for each in (before, after)
+                np.linalg.eigvalsh(pseudo_inertia(item)) for item in (before, after)
             )
             # Consistent where it was, beyond rounding.
             if was[0] >= -1e-12 * was[-1]:
@@ -185,7 +185,7 @@ def test_every_route_works_on_them():
         assert motion.urdf_sha256 == other.urdf_sha256 == lin.urdf_sha256
 
 
-def test_wheels_stay_in_what_carries_them():
+def test_wheels_remain_part_of_their_carrier():
     robot = wheeled()
     heavy = robot.with_mass_properties({"base": {"mass": 7.0}})
     assert heavy.wheels == robot.wheels and heavy.joint_names == robot.joint_names
@@ -220,7 +220,7 @@ def test_results_of_the_one_are_not_taken_for_the_others(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("given", "said"),
+    ("given", "message"),
     [
         ({"joint_9": {"mass": 1.0}}, "'joint_9'"),
         ({"base": {"mass": 0.0}}, "mass .*0 kg"),
@@ -243,14 +243,14 @@ def test_results_of_the_one_are_not_taken_for_the_others(tmp_path):
         (3, "bodies"),
     ],
 )
-def test_what_is_no_body_is_refused_in_a_line(given, said):
-    with pytest.raises(fflin.FflinError, match=said) as caught:
+def test_an_invalid_body_is_refused_in_one_line(given, message):
+    with pytest.raises(fflin.FflinError, match=message) as caught:
         fflin.load("ets_vii").with_mass_properties(given)
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
-    ("given", "said"),
+    ("given", "message"),
     [
         ({"mass": 1.0}, "mass"),
         ({"com": -0.1}, "-0.1"),
@@ -258,8 +258,8 @@ def test_what_is_no_body_is_refused_in_a_line(given, said):
         ({"seed": 0.5}, "seed"),
     ],
 )
-def test_spreads_that_are_none_are_refused(given, said):
-    with pytest.raises(fflin.InputError, match=said):
+def test_invalid_spreads_are_refused(given, message):
+    with pytest.raises(fflin.InputError, match=message):
         fflin.load("ets_vii").perturbed(**given)
 
 

@@ -111,11 +111,11 @@ def test_the_axes_of_link_and_frame_do_not_change_the_forces_of_a_beam():
     robot = fflin.from_model(model, name="hub").replace(appendages=[array])
     v, omega, eta, etadot = moving(0.4)
     twist = clamp.act(pin.Motion(v, omega))
-    found = accelerations(robot, twist.linear, twist.angular, eta, etadot)
+    result = accelerations(robot, twist.linear, twist.angular, eta, etadot)
     expected = Beam(hub_mass).accelerations(v, omega, eta, etadot)
     tolerance = 1e-10 * np.abs(expected).max()
-    assert found[6:] == pytest.approx(expected[6:], abs=tolerance)
-    assert found[:3] == pytest.approx(clamp.rotation @ expected[:3], abs=tolerance)
+    assert result[6:] == pytest.approx(expected[6:], abs=tolerance)
+    assert result[:3] == pytest.approx(clamp.rotation @ expected[:3], abs=tolerance)
 
 
 def general(seed=1, count=4):
@@ -143,7 +143,7 @@ def heavier(rigid, factor):
 
 def test_the_density_of_the_base_changes_no_modal_force():
     rigid, array = general()
-    found = []
+    result = []
     for factor in (1.0, 1.7, 40.0):
         robot = heavier(rigid, factor).replace(appendages=[array])
         q, v = displaced(robot, size=0.3)
@@ -154,11 +154,11 @@ def test_the_density_of_the_base_changes_no_modal_force():
         for index, scale in modes:  # the same rates of the amplitudes
             v[index], a[index] = 0.4 * scale, -0.7 * scale
         forces = pin.rnea(robot.model, robot.create_data(), q, v, a)
-        found.append([scale * forces[index] for index, scale in modes])
-    assert np.abs(found[0]).min() > 1e-3
+        result.append([scale * forces[index] for index, scale in modes])
+    assert np.abs(result[0]).min() > 1e-3
     # The inertia of the rest of the link does not enter these entries of RNEA.
-    assert found[1] == pytest.approx(found[0], abs=1e-12 * np.abs(found[0]).max())
-    assert found[2] == pytest.approx(found[0], abs=1e-12 * np.abs(found[0]).max())
+    assert result[1] == pytest.approx(result[0], abs=1e-12 * np.abs(result[0]).max())
+    assert result[2] == pytest.approx(result[0], abs=1e-12 * np.abs(result[0]).max())
 
 
 @pytest.mark.parametrize("key", ["A", "f0"])
@@ -176,12 +176,12 @@ def test_sensitivity_is_the_derivative_of_robots_that_get_their_appendage_anew(k
     far, near = at(1.0 + 2.0 * h) - at(1.0 - 2.0 * h), at(1.0 + h) - at(1.0 - h)
     expected = (8.0 * near - far) / (12.0 * h)
     S = fflin.sensitivity(fflin.linearize(robot, *state.to_pinocchio(x)))
-    found = getattr(S["base.density"], f"d{key}")
+    result = getattr(S["base.density"], f"d{key}")
     # The error of these differences is h^4/30 times the fifth derivative, which is 5! for 1/factor.
     # The rounding errors of `at` are amplified by 1 / h.
     rounding = 1e-13 * np.abs(at(1.0)).max() / h
     tolerance = 4.0 * h**4 * np.abs(expected).max() + rounding
-    np.testing.assert_allclose(found, expected, rtol=0, atol=tolerance)
+    np.testing.assert_allclose(result, expected, rtol=0, atol=tolerance)
     assert tolerance < 1e-6 * np.abs(expected).max()
 
 
@@ -254,7 +254,7 @@ def test_forces_do_not_jump_where_the_choice_of_the_ball_changes(part, size):
 
 def test_forces_are_continuous_in_the_translation_of_a_rotation():
     # Noise has an effect of its own size, and from a rotation to a translation no step is large.
-    rigid, found, sizes = (
+    rigid, result, sizes = (
         hub_with_rod(30.0, 20.0, ROD, LENGTH),
         [],
         np.logspace(-14.0, -1.0, 27),
@@ -264,8 +264,8 @@ def test_forces_are_continuous_in_the_translation_of_a_rotation():
         t, r = size * np.array([[0.3], [0.2], [1.0]]), [[1.5], [2.5], [0.3]]
         array = fflin.FlexibleAppendage("root_joint", 0.3, t, r)
         robot = rigid.replace(appendages=[array])
-        found.append(accelerations(robot, v, omega, eta[:1], etadot[:1]))
-    change = np.abs(np.array(found) - found[0]).max(axis=1) / np.abs(found[0]).max()
+        result.append(accelerations(robot, v, omega, eta[:1], etadot[:1]))
+    change = np.abs(np.array(result) - result[0]).max(axis=1) / np.abs(result[0]).max()
     assert (change[sizes < 2e-7] < sizes[sizes < 2e-7]).all()
     # About 5 of 26 steps are between a rotation and a translation. A jump would be one of them.
     assert np.abs(np.diff(change)).max() < 0.6 * np.ptp(change)
@@ -308,9 +308,9 @@ def test_noise_in_place_of_zero_changes_a_model_by_noise():
     expected = at(exact)
     for noise in (1e-16, 1e-14, 1e-13, 1e-12, 1e-10):
         for seed in range(3):
-            found = at(array_on_a_drive(noise, seed)[1])
+            result = at(array_on_a_drive(noise, seed)[1])
             for key in ("A", "B", "f0"):
-                ours, theirs = getattr(expected, key), getattr(found, key)
+                ours, theirs = getattr(expected, key), getattr(result, key)
                 assert (
                     np.abs(ours - theirs).max()
                     <= (1e2 * noise + 1e-12) * np.abs(ours).max()
@@ -328,10 +328,10 @@ def test_energies_of_links_include_their_modes():
         appendages=[array], stiffness={"drive": 30.0}, rest={"drive": 0.7}
     )
     q = fflin.configuration(robot, {"drive": 0.7})
-    found = fflin.modes(fflin.linearize(robot, q, frame="local"))
+    result = fflin.modes(fflin.linearize(robot, q, frame="local"))
     state = StateMap(robot, frame="local")
-    assert len(found.vibrations) == 4
-    for mode in found.vibrations:
+    assert len(result.vibrations) == 4
+    for mode in result.vibrations:
         assert set(mode.energy) == {"base", "drive"}
         assert min(mode.energy.values()) >= 0.0
         assert sum(mode.energy.values()) == pytest.approx(1.0, abs=1e-12)

@@ -98,15 +98,15 @@ def test_superelement_is_reduced_to_its_rigid_interface(files):
     center = GRIDS.mean(axis=0)
     assert array.frequency == pytest.approx(np.sqrt(squares) / (2.0 * np.pi), rel=1e-7)
     expected = shifted(L, center)
-    found = np.vstack((array.translation, array.rotation))
-    signs = np.sign((found * expected).sum(axis=0))
-    assert found * signs == pytest.approx(expected, rel=1e-6, abs=1e-6)
+    result = np.vstack((array.translation, array.rotation))
+    signs = np.sign((result * expected).sum(axis=0))
+    assert result * signs == pytest.approx(expected, rel=1e-6, abs=1e-6)
     about = shifted(shifted(rigid_mass, center).T, center)
     assert array.inertia == pytest.approx(about, rel=1e-6, abs=1e-6 * about.max())
     text = str(array)
     assert "array_mode_5" in text and "clamped at frame 'base'" in text
     rows = {line.split()[0]: line.split() for line in text.splitlines() if line}
-    residual = (array.inertia - found @ found.T).diagonal()
+    residual = (array.inertia - result @ result.T).diagonal()
     assert [float(x) for x in rows["residual"][1:]] == pytest.approx(
         residual, rel=1e-3, abs=1e-9
     )
@@ -147,7 +147,7 @@ def test_units_origin_and_number_of_modes_are_as_told(files):
             read(op4, asm, frame="base", **wrong)
 
 
-def test_a_link_that_differs_from_the_file_is_told_and_may_be_replaced(files):
+def test_a_link_that_differs_from_the_file_is_reported_and_may_be_replaced(files):
     op4, asm, (rigid_mass, _, _) = files
     robot = fflin.load("planar_detumble")
     read = fflin.FlexibleAppendage.from_nastran
@@ -174,7 +174,7 @@ def test_a_link_that_differs_from_the_file_is_told_and_may_be_replaced(files):
         robot.replace(appendages=twice)
 
 
-def test_what_is_no_superelement_is_refused(files, tmp_path):
+def test_an_invalid_superelement_is_refused(files, tmp_path):
     op4, asm, _ = files
     read = fflin.FlexibleAppendage.from_nastran
     text = tmp_path / "text.asm"
@@ -194,8 +194,8 @@ def test_what_is_no_superelement_is_refused(files, tmp_path):
 
 def test_matrices_of_another_kind_are_refused(files, tmp_path):
     op4, asm, _ = files
-    found = {name: matrix for name, matrix in nastran.op4.read(str(op4)).items()}
-    M, K = found["maa"], found["kaa"]
+    result = {name: matrix for name, matrix in nastran.op4.read(str(op4)).items()}
+    M, K = result["maa"], result["kaa"]
     coupled, grounded, lopsided, free = K.copy(), K.copy(), M.copy(), K.copy()
     coupled[0, -1] = coupled[-1, 0] = 10.0
     grounded[0, 0] += 100.0

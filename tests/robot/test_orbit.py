@@ -19,7 +19,7 @@ def test_altitude_and_mean_motion_say_the_same():
     same = fflin.CircularOrbit(mean_motion=high.mean_motion)
     assert same.altitude == pytest.approx(high.altitude, rel=1e-12)
     assert pickle.loads(pickle.dumps(high)) == high
-    assert all(type(each).from_json(each.to_json()) == each for each in (high, same))
+    assert all(type(item).from_json(item.to_json()) == item for item in (high, same))
     assert "35786 km over earth" in str(high)
 
 
@@ -27,13 +27,13 @@ def test_other_bodies():
     assert fflin.CircularOrbit(100e3, body="moon").period == pytest.approx(
         7066.0, rel=2e-3
     )
-    own = fflin.CircularOrbit(1e3, body="bennu", mu=4.89, body_radius=245.0)
-    assert own.mean_motion == pytest.approx(math.sqrt(4.89 / 1245.0**3))
+    orbit = fflin.CircularOrbit(1e3, body="bennu", mu=4.89, body_radius=245.0)
+    assert orbit.mean_motion == pytest.approx(math.sqrt(4.89 / 1245.0**3))
     assert {"earth", "moon", "mars"} <= set(BODIES)
 
 
 @pytest.mark.parametrize(
-    ("given", "said"),
+    ("given", "message"),
     [
         ({}, "altitude"),
         ({"altitude": 7e5, "mean_motion": 1e-3}, "exactly one"),
@@ -49,26 +49,26 @@ def test_other_bodies():
         ({"altitude": 7e5, "body": "x", "mu": 0.0, "body_radius": 1.0}, "mu"),
     ],
 )
-def test_refused(given, said):
-    with pytest.raises(fflin.FflinError, match=said):
+def test_refused(given, message):
+    with pytest.raises(fflin.FflinError, match=message):
         fflin.CircularOrbit(**given)
 
 
 @pytest.mark.parametrize(
-    ("altitude", "body", "said"),
+    ("altitude", "body", "message"),
     [
         (400, "earth", "write 400 km as 400e3"),
         (79e3, "earth", "79000 m"),
     ],
 )
-def test_a_doubtful_altitude_is_warned_of(altitude, body, said):
-    with pytest.warns(fflin.FflinWarning, match=said) as record:
+def test_a_doubtful_altitude_gives_a_warning(altitude, body, message):
+    with pytest.warns(fflin.FflinWarning, match=message) as record:
         fflin.CircularOrbit(altitude, body=body)
-    assert [each.filename for each in record] == [__file__]
+    assert [item.filename for item in record] == [__file__]
 
 
 @pytest.mark.filterwarnings("error::fflin.FflinWarning")
-def test_no_other_altitude_is_warned_of():
+def test_no_other_altitude_gives_a_warning():
     # of LAGEOS, O3b, GPS
     for altitude in (100e3, 400e3, 5860e3, 8062e3, 20200e3, 35786e3):
         fflin.CircularOrbit(altitude)
@@ -114,9 +114,9 @@ def test_robot_file(tmp_path):
 
 def test_frames_suit_the_orbit():
     robot = fflin.load("cubesat")
-    for given, said in ((robot, "orbit"), (robot.replace(orbit=7e5), "orbit")):
+    for given, message in ((robot, "orbit"), (robot.replace(orbit=7e5), "orbit")):
         frame = "lvlh" if given is robot else "hybrid"
-        with pytest.raises(fflin.InputError, match=said):
+        with pytest.raises(fflin.InputError, match=message):
             fflin.StateMap(given, frame=frame)
     assert fflin.StateMap(robot.replace(orbit=7e5)).frame == "lvlh"
 

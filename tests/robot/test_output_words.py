@@ -28,7 +28,7 @@ def test_every_spec(text, outputs):
     assert parse_output(text) == outputs
 
 
-def test_mistakes_say_what_to_write():
+def test_invalid_text_gives_an_error_with_a_valid_example():
     for text in ("frame", "frame:"):
         with pytest.raises(fflin.InputError, match="frame:NAME"):
             parse_output(text)

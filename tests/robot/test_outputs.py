@@ -57,13 +57,13 @@ def test_check_holds_with_every_output(name, link, frame, turned):
     u = rng.normal(size=7) * 10
     lin = fflin.linearize(robot, q, v, u, frame=frame, reference=reference)
     assert lin.D.any()
-    found = fflin.check(robot, lin)
-    assert found.ok, found
+    result = fflin.check(robot, lin)
+    assert result.ok, result
 
 
 @pytest.mark.parametrize("first", mostly(range(6), 0))
 @pytest.mark.parametrize("matrix", ["C", "D", "y0"])
-def test_planted_error_is_found_in_every_row(matrix, first):
+def test_planted_error_is_detected_in_every_row(matrix, first):
     bare = fflin.load("planar_detumble")
     robot = watched(bare, "hand")
     q, v, _ = random_point(bare, np.random.default_rng(2))
@@ -80,12 +80,12 @@ def test_planted_error_is_found_in_every_row(matrix, first):
             wrong[row] += 1e-5 * max(1.0, np.abs(lin.y0).max())
         else:
             wrong[row, np.abs(wrong[row]).argmax()] *= -1.0
-        found = fflin.check(robot, replace(lin, **{matrix: wrong}))
-        (failure,) = found.failures
+        result = fflin.check(robot, replace(lin, **{matrix: wrong}))
+        (failure,) = result.failures
         assert failure.block in {
             f"{matrix} ({output.WORD})" for output in robot.outputs
         }
-        assert str(found).startswith(f"{failure.block} is not verified: 1 of ")
+        assert str(result).startswith(f"{failure.block} is not verified: 1 of ")
 
 
 def test_outputs_follow_their_laws():
@@ -138,7 +138,7 @@ def test_sampled_model_keeps_its_outputs(tmp_path):
         fflin.check(bare, loaded)
 
 
-def test_bad_outputs_are_told():
+def test_invalid_outputs_are_reported():
     robot = fflin.load("servicer_7dof")
     for words, outputs in {
         "'tol'": [fflin.FramePose("tol")],

@@ -133,7 +133,7 @@ def test_pinocchios_own_mimic_joints_are_refused_with_the_way_out():
         fflin.from_model(model)
 
 
-def test_what_is_no_robot_is_refused():
+def test_an_invalid_robot_is_refused():
     lin = fflin.linearize(fflin.load("cubesat"))
     for call in (
         lambda: fflin.linearize("cubesat"),
@@ -151,7 +151,7 @@ def test_what_is_no_robot_is_refused():
         fflin.from_model("cubesat")
 
 
-def test_arguments_of_the_wrong_kind_are_told():
+def test_arguments_of_the_wrong_kind_are_reported():
     robot = fflin.load("ets_vii")
     for call in (
         lambda: fflin.load(None),
@@ -258,7 +258,7 @@ def _set_scaled_rotation(model):
         (_set_scaled_rotation, "rotation"),
     ],
 )
-def test_what_no_robot_has_is_refused_by_name(robots, spoil, words):
+def test_unknown_names_are_refused(robots, spoil, words):
     model = robots["dual_arm"].model.copy()
     spoil(model)
     with pytest.raises(fflin.ModelError, match=re.escape(words)) as caught:

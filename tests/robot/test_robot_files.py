@@ -75,9 +75,9 @@ def written(tmp_path):
     return write
 
 
-def test_a_file_says_what_load_would_be_told(written):
+def test_a_robot_file_is_equivalent_to_the_arguments_of_load(written):
     robot = fflin.load(written(WHOLE))
-    told = fflin.load(
+    messages = fflin.load(
         "servicer_7dof",
         lock={"joint_7": 0.5},
         passive=["panel_left", "panel_right"],
@@ -102,7 +102,7 @@ def test_a_file_says_what_load_would_be_told(written):
             "bryson": {"tau_b": 2.0, "qdot_m.rw": 10.0},
         },
     )
-    assert robot.name == "sat" and robot.urdf == told.urdf
+    assert robot.name == "sat" and robot.urdf == messages.urdf
     for key in (
         *(
             "urdf_sha256",
@@ -116,8 +116,8 @@ def test_a_file_says_what_load_would_be_told(written):
         ),
         *("gravity", "weights", "passive", "wheels"),
     ):
-        assert getattr(robot, key) == getattr(told, key), key
-    assert robot.model == told.model
+        assert getattr(robot, key) == getattr(messages, key), key
+    assert robot.model == messages.model
     assert robot.passive == ("panel_left", "panel_right")
     assert robot.start == {
         "joints": {"joint_2": 0.4, "panel_left": 0.05, "panel_right": 0.05},
@@ -127,7 +127,7 @@ def test_a_file_says_what_load_would_be_told(written):
     }
 
 
-def test_urdf_lies_beside_the_file_wherever_that_is_named_from(
+def test_urdf_lies_next_to_the_file_wherever_that_is_named_from(
     written, tmp_path, monkeypatch
 ):
     (tmp_path / "deep").mkdir()
@@ -158,7 +158,7 @@ def test_bundled_robot_files_are_asked_for_by_their_whole_name():
         fflin.load("cubesats.toml")
 
 
-def test_what_is_told_goes_before_the_file(written):
+def test_arguments_override_the_file(written):
     path = written(WHOLE)
     robot = fflin.load(
         path, stiffness={"panel_right": 9}, lock={"joint_1": 0.1}, gravity=(0, 0, 0)
@@ -318,7 +318,7 @@ def test_hostile_files_are_refused_in_time(written, content):
     assert time.process_time() - begin < 5.0
 
 
-def test_models_of_a_file_are_told_from_those_of_its_urdf(written, tmp_path):
+def test_models_of_a_file_are_distinguished_from_those_of_its_urdf(written, tmp_path):
     plain = fflin.load("servicer_7dof")
     robot = fflin.load(written(AT_REST))
     lin = fflin.linearize(robot)
@@ -333,7 +333,7 @@ def test_models_of_a_file_are_told_from_those_of_its_urdf(written, tmp_path):
 
 
 @pytest.mark.parametrize("ending", ["npz", "mat", "json"])
-def test_a_regulator_weighs_what_the_robot_says(written, tmp_path, ending):
+def test_a_regulator_uses_the_weights_of_the_robot(written, tmp_path, ending):
     robot = fflin.load(written(AT_REST))
     lin = fflin.linearize(robot)
     Q, R = np.eye(len(lin.x0)), np.eye(len(lin.u0))
@@ -405,4 +405,4 @@ def test_the_draft_and_the_guide_have_every_key():
     assert sorted(described) == sorted(KEYS)
     for name in KEYS:
         written = (f"[[{name}]]", f"[{name}]", f"{name} = ", f"${name}")
-        assert any(each in draft for each in written), name
+        assert any(item in draft for item in written), name

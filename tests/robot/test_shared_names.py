@@ -110,7 +110,7 @@ def test_a_robot_with_shared_names_is_shown(tmp_path, links, joints):
         assert page.stat().st_size > 1000
 
 
-def test_the_world_is_no_tool(tmp_path):
+def test_the_world_is_not_a_tool(tmp_path):
     robot = fflin.load("planar_detumble")
     motion = fflin.simulate(robot, duration=0.1)
     with pytest.raises(fflin.UnknownNameError, match="'universe'"):

@@ -153,9 +153,9 @@ def test_check_holds_in_every_block(kind, frame, turned, moving):
         lin = fflin.linearize(
             robot, q, v, u, frame=frame, reference=reference, moving=moving
         )
-        found = fflin.check(robot, lin)
-        assert found.ok, found
-        assert any(row.block.endswith("wheel]") for row in found.rows)
+        result = fflin.check(robot, lin)
+        assert result.ok, result
+        assert any(row.block.endswith("wheel]") for row in result.rows)
 
 
 def test_check_holds_on_random_trees_and_where_joints_mimic_others():
@@ -179,10 +179,10 @@ def test_check_holds_on_random_trees_and_where_joints_mimic_others():
         q, v, _ = random_point(robot, rng)
         v[robot.joint("wheel_1").idx_v] = 200.0
         for frame in FRAMES:
-            found = fflin.check(
+            result = fflin.check(
                 robot, fflin.linearize(robot, q, v, rng.normal(size=6), frame=frame)
             )
-            assert found.ok, found
+            assert result.ok, result
 
 
 def test_wheels_are_joints_as_if_built_by_hand():
@@ -504,7 +504,7 @@ def test_axis_is_fixed_in_its_frame(fields):
         assert given == pytest.approx(expected, abs=1e-12 * np.abs(expected).max())
 
 
-def test_bad_wheels_are_told_in_a_line():
+def test_invalid_wheels_are_reported_in_a_line():
     robot = fflin.load("servicer_7dof")
     none = ReactionWheel((0, 0, 1))
     cases = {

@@ -53,10 +53,10 @@ def both(robot, policy=None, tolerance=1e-10, rounding=2e-14, **options):
     assert (python.engine, motion.engine) == ENGINES
     assert motion.stopped == python.stopped
     for name in ("t", "q", "v", "x", "u", "energy", "momentum"):
-        expected, found = getattr(python, name), getattr(motion, name)
-        assert found.shape == expected.shape, name
+        expected, result = getattr(python, name), getattr(motion, name)
+        assert result.shape == expected.shape, name
         size = np.maximum(1.0, np.abs(expected).max(axis=0))
-        assert (np.abs(found - expected) <= tolerance * size).all(), name
+        assert (np.abs(result - expected) <= tolerance * size).all(), name
     if options.get("project", True):
         assert (
             motion.momentum_drift.max() <= rounding + 2.0 * python.momentum_drift.max()
@@ -250,7 +250,7 @@ def test_a_run_stops_at_the_same_step_with_the_same_words(robots):
     assert 20 < len(motion.t) < 1001
 
 
-def test_an_orbit_costs_no_digits(robots):
+def test_an_orbit_loses_no_accuracy(robots):
     robot = robots["canadarm2"]
     reference = pin.SE3(HOME.rotation, np.array([7e6, 1e5, -2e5]))
     lin = fflin.linearize(
@@ -264,7 +264,7 @@ def test_an_orbit_costs_no_digits(robots):
     both(robot, policy, 1e-7, 1e-8, x0=x0, duration=3.0)
 
 
-def test_ctrl_c_keeps_what_is_done(robots, monkeypatch):
+def test_ctrl_c_keeps_finished_work(robots, monkeypatch):
     count = itertools.count()
 
     def update(self, done, total):
@@ -295,11 +295,11 @@ def test_recorded_rows_do_not_depend_on_the_slices(robots, monkeypatch, every, m
     counted = lambda *names: lambda *a: [calls.append(a), kernel(*names)(*a)]  # noqa: E731
     monkeypatch.setattr(lanes, "kernel", counted)
     monkeypatch.setattr(lanes, "_MEMORY", memory)
-    found = fflin.simulate(robot, policy, **options, every=every, engine="compiled")
+    result = fflin.simulate(robot, policy, **options, every=every, engine="compiled")
     chosen = np.append(np.arange(0, 100, every), 100)
     for name in ("t", "q", "v", "u"):
         np.testing.assert_array_equal(
-            getattr(found, name), getattr(motion, name)[chosen]
+            getattr(result, name), getattr(motion, name)[chosen]
         )
     # Each call fills its memory: one row, or all rows of the run.
     assert len(calls) == (-(-100 // every) if memory == 1 else 1)
@@ -320,7 +320,7 @@ def nothing(t, q, v):
     return np.zeros(9)
 
 
-def test_what_cannot_be_compiled_says_why(robots):
+def test_a_policy_that_cannot_be_compiled_gives_the_reason(robots):
     robot, options = robots["planar_detumble"], {"duration": 0.1, "engine": "compiled"}
     cases = (
         ({"policy": nothing}, "Python"),
@@ -375,19 +375,19 @@ def test_eight_lanes_are_eight_runs(robots):
             model.inertias[joint] = pin.Inertia.FromDynamicParameters(
                 mass * model.inertias[joint].toDynamicParameters()
             )
-        own = fflin.from_model(model, inputs=robot.inputs)
+        copy = fflin.from_model(model, inputs=robot.inputs)
         options = {
             "x0": share * displaced(lin),
             "duration": 2.0,
             "dt": 0.01,
             "linear": False,
         }
-        plan = Plan(SimulationOptions(robot=own, policy=policy, **options))
+        plan = Plan(SimulationOptions(robot=copy, policy=policy, **options))
         plant = plan.plant
         faults = plant.faults._replace(gain=np.full(len(plant.faults.gain), gain))
         plans.append(plan.replace(plant=Plant(plant.state, faults=faults)))
         start = {"q": plan.q, "nu": plant.state.velocities(plan.v)}
-        runs.append(start | {"bodies": batch_tree(own).bodies} | faults._asdict())
+        runs.append(start | {"bodies": batch_tree(copy).bodies} | faults._asdict())
     together, kept = lanes.LaneLoop(plans[0]), Kept()
     out = {"end": np.empty(8)}
     together.fly(
@@ -431,22 +431,22 @@ def test_arguments_are_laid_out_or_refused():
         tree.laid_out(given._replace(at=np.zeros((1, 1))), loop.WHEELS)
 
 
-def test_a_command_that_is_no_number_is_told(robots):
+def test_a_command_that_is_not_a_number_is_refused(robots):
     robot = robots["cubesat"]
     lin = fflin.linearize(robot)
     policy = fflin.StateFeedback(lin, np.full(lin.B.shape[::-1], 1e308))
     x0 = displaced(lin, offset=100.0)
     options = {"x0": x0, "sample": 0.01, "duration": 0.1, "linear": False}
-    said = []
+    message = []
     for engine in ENGINES:
         with np.errstate(over="ignore"), pytest.raises(fflin.InputError) as caught:
             fflin.simulate(robot, policy, **options, engine=engine)
-        said.append(str(caught.value))
-    assert said[0] == said[1]
-    assert "tau_b.x" in said[0]
+        message.append(str(caught.value))
+    assert message[0] == message[1]
+    assert "tau_b.x" in message[0]
 
 
-def test_a_long_run_in_python_says_what_the_compiled_loop_would_take(
+def test_a_long_run_in_python_estimates_the_duration_of_the_compiled_loop(
     robots, monkeypatch, caplog
 ):
     monkeypatch.setattr("fflin.simulation.simulate.LONG_RUN", 0.0)

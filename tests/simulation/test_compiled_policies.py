@@ -28,10 +28,10 @@ def apart(robot, policy, **options):
     assert motion.stopped == python.stopped == ""
     sizes = {}
     for name in ("t", "q", "v", "x", "u", "energy", "momentum"):
-        expected, found = getattr(python, name), getattr(motion, name)
-        assert found.shape == expected.shape, name
+        expected, result = getattr(python, name), getattr(motion, name)
+        assert result.shape == expected.shape, name
         size = np.maximum(1.0, np.abs(expected).max(axis=0))
-        sizes[name] = (np.abs(found - expected) / size).max(initial=0.0)
+        sizes[name] = (np.abs(result - expected) / size).max(initial=0.0)
     return motion, sizes
 
 

@@ -48,7 +48,7 @@ def acted_on():
 
 
 @pytest.mark.parametrize("method", ["cf4", "semi_implicit_euler"])
-def test_both_first_integrals_of_a_free_motion_are_kept_to_rounding(method):
+def test_both_first_integrals_of_a_free_motion_are_kept_to_machine_precision(method):
     robot = random_tree(np.random.default_rng(4), 3, prismatic=False)
     q0, v0 = tumbling(robot, size=1.0)
     v0[:3] += 1.0, -0.5, 0.3
@@ -65,7 +65,7 @@ def test_both_first_integrals_of_a_free_motion_are_kept_to_rounding(method):
     assert motion.com_drift.max() < 3e-15
 
 
-def test_without_the_projection_the_centre_of_mass_leaves_its_line_by_what_is_said():
+def test_without_projection_the_centre_of_mass_drifts_by_the_reported_error():
     robot = random_tree(np.random.default_rng(4), 3, prismatic=False)
     q0, v0 = tumbling(robot, size=1.0)
     options = {"q0": q0, "v0": v0, "duration": 1.0, "dt": 0.02, "project": False}
@@ -163,9 +163,9 @@ def test_the_line_is_kept_where_everything_acts_and_the_order_too(frame, options
     # An independent reference: the bare method at a step fine enough.
     exact = motion(0.0025, False)
 
-    def error(found):
-        apart = pin.difference(robot.model, exact.q[-1], found.q[-1])
-        return np.linalg.norm(np.r_[apart, found.v[-1] - exact.v[-1]])
+    def error(result):
+        apart = pin.difference(robot.model, exact.q[-1], result.q[-1])
+        return np.linalg.norm(np.r_[apart, result.v[-1] - exact.v[-1]])
 
     assert math.log2(error(kept) / error(motion(0.0125))) == pytest.approx(4.0, abs=0.4)
     assert error(kept) < 2.0 * error(motion(0.025, False))
@@ -232,7 +232,7 @@ def test_a_motion_at_rest_has_no_drift():
 
 
 @pytest.mark.parametrize("part", [slice(0, 3), slice(3, 6)])
-def test_what_is_lost_is_shown_relative_to_mass_speed_and_extent(part, monkeypatch):
+def test_conservation_errors_are_relative_to_mass_speed_and_extent(part, monkeypatch):
     """Dynamics that hear of a wrench of which the impulse is not told lose all that it gives."""
     robot = fflin.load("canadarm2")
     q0, v0 = tumbling(robot, size=0.1)

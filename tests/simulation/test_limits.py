@@ -100,12 +100,13 @@ def test_a_wheel_saturates_and_no_momentum_is_lost(sign, sample, method):
     assert (40.0 - INERTIA) * body == pytest.approx(
         -INERTIA * (sign * SPEED + body), rel=1e-9
     )
-    told = {each.name: each for each in motion.saturated}
+    messages = {item.name: item for item in motion.saturated}
     assert (
-        told["spin"].limit == 0.5 * sign and told["qdot_m.spin"].limit == SPEED * sign
+        messages["spin"].limit == 0.5 * sign
+        and messages["qdot_m.spin"].limit == SPEED * sign
     )
-    assert told["spin"].share == pytest.approx(full.mean(), abs=1e-3)
-    assert told["qdot_m.spin"].share == pytest.approx(1.0 - full.mean(), abs=2e-3)
+    assert messages["spin"].share == pytest.approx(full.mean(), abs=1e-3)
+    assert messages["qdot_m.spin"].share == pytest.approx(1.0 - full.mean(), abs=2e-3)
     assert not motion.passed
 
 
@@ -129,8 +130,8 @@ def test_a_wheel_that_other_inputs_drive_beyond_its_limit_is_in_the_headline(tor
     body = torque / (40.0 - INERTIA) * motion.t
     np.testing.assert_allclose(speed, 1.9 + body, rtol=1e-9)
     exceeded = f"wheel speed limit exceeded: spin {speed[-1]:.3g} rad/s (limit 2)"
-    for each in (motion, free, replace(motion, stopped="by hand")):
-        headline = " ".join(str(each).partition("\nbody: ")[0].split())
+    for item in (motion, free, replace(motion, stopped="by hand")):
+        headline = " ".join(str(item).partition("\nbody: ")[0].split())
         assert (exceeded in headline) == (torque > 0.0) == ("speed limit" in headline)
 
 
@@ -162,13 +163,13 @@ def test_the_attitude_is_lost_where_the_wheel_is_full():
     for run in runs.values():
         assert run.momentum_drift.max() < 1e-13
     assert not runs["urdf"].passed
-    (told,) = runs[None].passed
-    assert told.name == "qdot_m.spin"
-    assert told.value == pytest.approx(500.0, rel=1e-2)
-    assert says(str(told), "spin 500 rad/s", "100 s", "300")
+    (messages,) = runs[None].passed
+    assert messages.name == "qdot_m.spin"
+    assert messages.value == pytest.approx(500.0, rel=1e-2)
+    assert says(str(messages), "spin 500 rad/s", "100 s", "300")
 
 
-def test_the_linear_model_foresees_the_wheel_that_saturates():
+def test_the_linear_model_predicts_the_wheel_that_saturates():
     robot = spinner()
     lin = fflin.linearize(robot.replace(inputs=[*robot.inputs, fflin.BaseTorque()]))
     robot = robot.replace(inputs=[*robot.inputs, fflin.BaseTorque()])
@@ -187,7 +188,7 @@ def test_the_linear_model_foresees_the_wheel_that_saturates():
 
 
 @pytest.mark.parametrize("asked", [0.0, 0.5, -0.2])
-def test_a_wheel_that_begins_too_fast_takes_no_torque_but_what_brakes_it(asked):
+def test_a_wheel_beyond_its_largest_speed_accepts_only_braking_torque(asked):
     robot = spinner()
     motion = fflin.simulate(
         robot,
@@ -197,8 +198,8 @@ def test_a_wheel_that_begins_too_fast_takes_no_torque_but_what_brakes_it(asked):
         limits="urdf",
     )
     np.testing.assert_array_equal(motion.u[:, 0], min(asked, 0.0))
-    told = motion.passed[0]
-    assert (told.name, told.value, told.time, told.limit) == (
+    messages = motion.passed[0]
+    assert (messages.name, messages.value, messages.time, messages.limit) == (
         "qdot_m.spin",
         301.0,
         0.0,
@@ -260,9 +261,13 @@ def test_a_command_becomes_pulses_of_the_same_impulse():
         inputs=[fflin.Thruster(*AT, max=2.0, on_off=True), fflin.BaseTorque()]
     )
     rng = np.random.default_rng(3)
-    told = np.column_stack((rng.uniform(-0.5, 2.5, 200), rng.normal(size=(200, 3))))
+    messages = np.column_stack((rng.uniform(-0.5, 2.5, 200), rng.normal(size=(200, 3))))
     motion = fflin.simulate(
-        robot, lambda t, q, v: told[round(t / 0.1)], duration=20.0, dt=0.01, sample=0.1
+        robot,
+        lambda t, q, v: messages[round(t / 0.1)],
+        duration=20.0,
+        dt=0.01,
+        sample=0.1,
     )
     thrust = motion.u[:-1, 0].reshape(200, 10)
     # One pulse from the beginning of each sample. Its last step has the mean thrust of this step.
@@ -270,16 +275,16 @@ def test_a_command_becomes_pulses_of_the_same_impulse():
     partial = (thrust > 0.0) & (thrust < 2.0)
     assert partial.sum(axis=1).max() == 1
     given = thrust.sum(axis=1) * 0.01
-    asked = np.clip(told[:, 0], 0.0, 2.0) * 0.1
+    asked = np.clip(messages[:, 0], 0.0, 2.0) * 0.1
     np.testing.assert_allclose(given, asked, rtol=0.0, atol=1e-14)
     given = given.cumsum()
-    np.testing.assert_array_equal(motion.u[:-1:10, 1:], told[:, 1:])
+    np.testing.assert_array_equal(motion.u[:-1:10, 1:], messages[:, 1:])
     assert robot.mass * motion.v[-1, :3] @ [1, 0, 0] < given[-1]
     assert motion.momentum_drift.max() < 1e-13
 
 
 @pytest.mark.parametrize("on_off", [True, False])
-def test_what_is_below_the_least_impulse_is_carried_until_it_is_enough(on_off):
+def test_impulses_below_the_least_impulse_accumulate(on_off):
     thruster = fflin.Thruster(*AT, max=2.0, on_off=on_off, least_impulse=0.05)
     robot = free_body((20.0, 30.0, 40.0)).replace(inputs=[thruster])
     motion = fflin.simulate(
@@ -295,7 +300,7 @@ def test_what_is_below_the_least_impulse_is_carried_until_it_is_enough(on_off):
         assert motion.u[25, 0] == pytest.approx(0.6)
 
 
-def test_pulses_are_late_where_there_is_a_delay_and_begin_with_what_the_model_asks():
+def test_pulses_are_delayed_and_begin_with_the_command_of_the_model():
     robot = free_body((20.0, 30.0, 40.0)).replace(
         inputs=[fflin.Thruster(*AT, max=1.0, on_off=True)]
     )
@@ -314,7 +319,7 @@ def test_pulses_are_late_where_there_is_a_delay_and_begin_with_what_the_model_as
     np.testing.assert_array_equal(late.u[15:25, 0], [1.0] * 4 + [0.0] * 6)
 
 
-def test_the_linear_model_foresees_pulses():
+def test_the_linear_model_predicts_pulses():
     robot = free_body((20.0, 30.0, 40.0)).replace(
         inputs=[fflin.Thruster(*AT, max=1.0, on_off=True), fflin.BaseTorque()]
     )
@@ -334,7 +339,7 @@ def test_the_linear_model_foresees_pulses():
 
 
 @pytest.mark.parametrize(
-    ("thruster", "options", "said"),
+    ("thruster", "options", "message"),
     [
         ({"on_off": True}, {}, "'thruster_1'"),
         ({"least_impulse": 0.1}, {}, "sample"),
@@ -345,10 +350,10 @@ def test_the_linear_model_foresees_pulses():
         ),
     ],
 )
-def test_pulses_without_samples_are_refused_in_a_line(thruster, options, said):
+def test_pulses_without_samples_are_refused_in_one_line(thruster, options, message):
     robot = free_body((20.0, 30.0, 40.0))
     robot = robot.replace(inputs=[fflin.Thruster(*AT, max=2.0, **thruster)])
-    with pytest.raises(fflin.InputError, match=said):
+    with pytest.raises(fflin.InputError, match=message):
         fflin.simulate(
             robot, lambda t, q, v: [1.0], duration=1.0, limits="urdf", **options
         )
@@ -356,7 +361,7 @@ def test_pulses_without_samples_are_refused_in_a_line(thruster, options, said):
 
 
 @pytest.mark.parametrize(
-    ("limits", "error", "said"),
+    ("limits", "error", "message"),
     [
         ("none", fflin.InputError, "'none'"),
         (["urdf", "x"], fflin.InputError, "'x'"),
@@ -364,12 +369,12 @@ def test_pulses_without_samples_are_refused_in_a_line(thruster, options, said):
         ({"tau_b": -1.0}, fflin.InputError, "-1.0"),
     ],
 )
-def test_limits_that_are_none_are_refused_in_a_line(limits, error, said):
-    with pytest.raises(error, match=said):
+def test_invalid_limits_are_refused_in_one_line(limits, error, message):
+    with pytest.raises(error, match=message):
         fflin.simulate(fflin.load("cubesat"), duration=0.1, limits=limits)
 
 
-def test_what_was_passed_is_told_with_value_time_and_limit():
+def test_violations_are_reported_with_value_time_and_limit():
     robot = fflin.load("canadarm2")
     asked = np.zeros(13)
     asked[8] = 4000.0
@@ -378,21 +383,21 @@ def test_what_was_passed_is_told_with_value_time_and_limit():
         return asked * math.cos(math.pi * t)
 
     run = fflin.simulate(robot, drive, duration=1.0)
-    told = {each.name: each for each in run.passed}
-    torque = told["tau_m.joint_3"]
+    messages = {item.name: item for item in run.passed}
+    torque = messages["tau_m.joint_3"]
     assert (torque.value, torque.time, torque.limit) == (4000.0, 0.0, 3000.0)
     assert str(torque) == "tau_m.joint_3 4000 N m at 0 s, limit 3000"
-    speed = told["qdot_m.joint_3"]
+    speed = messages["qdot_m.joint_3"]
     rate = run.x[:, run.state_names.index("qdot_m.joint_3")]
     assert speed.value == rate[np.abs(rate).argmax()]
     assert speed.time == run.t[np.abs(rate).argmax()]
     assert re.fullmatch(r"joint_3 2\.\d+ rad/s at 0\.\d+ s, limit 0\.2", str(speed))
     # The farthest first.
-    shares = [abs(each.value / each.limit) for each in run.passed]
+    shares = [abs(item.value / item.limit) for item in run.passed]
     assert shares == sorted(shares, reverse=True)
     cut = fflin.simulate(robot, drive, duration=1.0, limits="urdf")
-    assert "tau_m.joint_3" not in {each.name for each in cut.passed}
-    low, high = sorted(cut.saturated, key=lambda each: each.limit)
+    assert "tau_m.joint_3" not in {item.name for item in cut.passed}
+    low, high = sorted(cut.saturated, key=lambda item: item.limit)
     assert (low.limit, high.limit) == (-3000.0, 3000.0)
     at = math.acos(0.75) / math.pi
     assert high.share == pytest.approx(at, abs=0.011)
@@ -405,11 +410,11 @@ def test_what_was_passed_is_told_with_value_time_and_limit():
 def test_travel_is_a_limit_too():
     robot = fflin.load("servicer_7dof")
     v0 = fflin.velocity(robot, {"panel_left": 0.5, "panel_right": -0.1})
-    (told,) = fflin.simulate(robot, v0=v0, duration=2.0).passed
-    assert told.name == "q_m.panel_left"
-    assert told.limit == 0.6
-    assert str(told).startswith("panel_left ")
-    assert says(str(told), "rad", "2 s", "0.6")
+    (messages,) = fflin.simulate(robot, v0=v0, duration=2.0).passed
+    assert messages.name == "q_m.panel_left"
+    assert messages.limit == 0.6
+    assert str(messages).startswith("panel_left ")
+    assert says(str(messages), "rad", "2 s", "0.6")
 
 
 @pytest.mark.parametrize("ending", [".npz", ".mat", ".json"])
@@ -419,9 +424,9 @@ def test_limits_are_saved_and_loaded_and_older_files_have_none(tmp_path, ending)
     motion = fflin.simulate(robot, duration=0.02)
     assert np.isinf(motion.limits).any()
     motion.save(tmp_path / f"m{ending}")
-    found = fflin.Motion.load(tmp_path / f"m{ending}")
-    assert found.limit_names == motion.limit_names
-    np.testing.assert_array_equal(found.limits, motion.limits)
+    result = fflin.Motion.load(tmp_path / f"m{ending}")
+    assert result.limit_names == motion.limit_names
+    np.testing.assert_array_equal(result.limits, motion.limits)
     bare = fflin.simulate(fflin.load("ets_vii"), duration=0.02)
     assert bare.limits.shape == (0, 2)
     bare.save(tmp_path / f"b{ending}")
@@ -437,7 +442,7 @@ def held_up(**limits):
     return robot, q, fflin.equilibrium(robot, q).u
 
 
-def test_limits_that_cannot_hold_the_robot_are_said_before_the_run():
+def test_limits_that_cannot_hold_the_robot_are_reported_before_the_run():
     robot, q, u = held_up()
     names = fflin.linearize(robot).input_names
     most = int(np.abs(u[6:]).argmax()) + 6
@@ -446,18 +451,19 @@ def test_limits_that_cannot_hold_the_robot_are_said_before_the_run():
     lin = fflin.linearize(robot, q, u=u)
     gain = fflin.lqr(lin, weights="identity")
     policy = fflin.StateFeedback(lin, gain.K)
-    said = f"the input limits are too small for 'canadarm2' at its target: {names[most]} requires "
-    said += f"{u[most]:.3g} N m, its limit is {np.sign(u[most]) * small:g}"
-    with pytest.warns(fflin.FflinWarning, match=re.escape(said)) as told:
+    message = "the input limits are too small for 'canadarm2' at its target: "
+    message += f"{names[most]} requires {u[most]:.3g} N m, its limit is "
+    message += f"{np.sign(u[most]) * small:g}"
+    with pytest.warns(fflin.FflinWarning, match=re.escape(message)) as messages:
         fflin.simulate(robot, policy, q0=q, duration=0.02, limits="urdf")
-    assert len(told) == 1
+    assert len(messages) == 1
     for limits in (None, ["urdf", {names[most]: 2.1 * small}]):
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             fflin.simulate(robot, policy, q0=q, duration=0.02, limits=limits)
 
 
-def test_allocation_keeps_within_the_thrusters_and_shares_what_one_alone_cannot_give():
+def test_allocation_respects_limits_and_distributes_force_over_several_thrusters():
     body = free_body((20.0, 30.0, 40.0))
     thrusters = [fflin.Thruster(*AT, max=1.0), fflin.Thruster(*AT, max=9.0)]
     design = body.replace(inputs=[fflin.BaseForce()])

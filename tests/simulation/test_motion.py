@@ -31,9 +31,11 @@ def test_a_plain_policy_has_no_target_unless_one_is_given(settled):
     assert blind.error is None and blind.attitude_error is None
     seen = fflin.simulate(robot, feedback, **options)
     for target in (lin, lin.x0):
-        told = fflin.simulate(robot, plain, target=target, **options)
-        np.testing.assert_array_equal(told.target, seen.target)
-        np.testing.assert_allclose(told.attitude_error, seen.attitude_error, atol=1e-9)
+        messages = fflin.simulate(robot, plain, target=target, **options)
+        np.testing.assert_array_equal(messages.target, seen.target)
+        np.testing.assert_allclose(
+            messages.attitude_error, seen.attitude_error, atol=1e-9
+        )
     assert seen.attitude_error[0] == pytest.approx(30.0)
     assert seen.attitude_error[-1] < 1.0
     # What is given goes before the policy's own.
@@ -50,7 +52,7 @@ def test_a_free_robot_has_no_target():
 
 
 @pytest.mark.parametrize(
-    ("target", "said"),
+    ("target", "message"),
     [
         (np.zeros(3), r"\(3,\)"),
         (np.full(30, np.nan), "target"),
@@ -58,14 +60,14 @@ def test_a_free_robot_has_no_target():
         ({"q": 1}, "target"),
     ],
 )
-def test_a_target_that_is_none_is_refused_in_a_line(target, said):
+def test_an_invalid_target_is_refused_in_one_line(target, message):
     robot = fflin.load("ets_vii")
-    with pytest.raises(fflin.InputError, match=said) as caught:
+    with pytest.raises(fflin.InputError, match=message) as caught:
         fflin.simulate(robot, duration=0.1, target=target)
     assert "\n" not in str(caught.value)
 
 
-def test_a_model_of_another_robot_is_no_target():
+def test_a_model_of_another_robot_is_not_a_target():
     lin = fflin.linearize(fflin.load("planar_detumble"))
     with pytest.raises(fflin.InputError, match="'planar_detumble'"):
         fflin.simulate(fflin.load("ets_vii"), duration=0.1, target=lin)
@@ -114,10 +116,12 @@ def test_a_page_without_a_target_shows_neither_ghost_nor_errors(tmp_path):
     free, steered = tmp_path / "free.html", tmp_path / "steered.html"
     fflin.visualize(robot, motion, html=free, open=False)
     fflin.visualize(robot, motion, html=steered, open=False, target=robot.neutral())
-    for page, there in ((free, False), (steered, True)):
+    for page, expected_value in ((free, False), (steered, True)):
         text = page.read_text()
-        assert ('"attitude error"' in text) is there
-        assert (re.search(r'"target": ?(true|false)', text).group(1) == "true") is there
+        assert ('"attitude error"' in text) is expected_value
+        assert (
+            re.search(r'"target": ?(true|false)', text).group(1) == "true"
+        ) is expected_value
 
 
 def test_the_figure_of_a_motion_without_a_target_is_drawn(tmp_path):

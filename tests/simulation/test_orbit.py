@@ -146,7 +146,7 @@ def test_refused():
         fflin.simulate(robot, q0=q, v0=v, duration=0.1, frame="world")
 
 
-def test_a_target_in_the_other_frame_is_no_target():
+def test_a_target_in_the_other_frame_is_not_a_target():
     robot = fflin.load("cubesat", orbit=8e5)
     target = fflin.linearize(robot, frame="hill")
     with pytest.raises(fflin.InputError, match=r"'hill'.*'lvlh'"):
@@ -156,7 +156,7 @@ def test_a_target_in_the_other_frame_is_no_target():
     )
 
 
-def test_what_wheels_store_counts_in_the_jacobi_integral():
+def test_the_jacobi_integral_includes_stored_momentum():
     robot, q, v = moving("cubesat")
     robot = robot.replace(inputs=[fflin.ReactionWheel([1.0, 2.0, -1.0], momentum=0.02)])
     motion = fflin.simulate(robot, q0=q, v0=v, duration=4.0, dt=0.02)

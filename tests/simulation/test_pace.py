@@ -311,7 +311,7 @@ def test_campaigns_use_the_same_step():
     assert runs.notes == motion.notes and "array_mode_1" in str(runs)
 
 
-def test_the_pace_of_a_rotation_is_that_of_an_undamped_mode():
+def test_the_pace_of_a_rotation_matches_an_undamped_mode():
     pace = Pace([rotation(60.0)], CommutatorFree4, 8.0)
     step, mode = pace.step()
     assert step == 0.005 and "rotation" in mode

@@ -85,14 +85,14 @@ def as_function(policy, robot):
 
 def roads(policy, robot, delay):
     """Return {road: (policy, options)} of the roads in Python."""
-    found = {"controller": (fflin.LinearController(-policy.K, policy.lin), {})}
+    result = {"controller": (fflin.LinearController(-policy.K, policy.lin), {})}
     # a function has no u0 that acts before its commands
     if not (delay and policy.lin.u0.any()):
-        found["function"] = (
+        result["function"] = (
             as_function(policy, robot),
             {"sample": policy.lin.dt or None},
         )
-    return found
+    return result
 
 
 CASES = {
@@ -156,8 +156,10 @@ def test_a_law_flies_the_same_motion_in_each_form(name, case):
     assert any("past 180 deg" in note for note in motion.notes) == jumps.any()
     assert (motion.linear is None) == jumps.any()
     assert motion.attitude_error.max() <= 180.0
-    for road, (by, more) in roads(policy, robot, options["delay"]).items():
-        assert_same(motion, flown(robot, by, **options, **more, engine="python"), road)
+    for road, (controller, more) in roads(policy, robot, options["delay"]).items():
+        assert_same(
+            motion, flown(robot, controller, **options, **more, engine="python"), road
+        )
 
 
 @needs_compiler
@@ -181,8 +183,8 @@ def test_both_engines_fly_the_same_motion(name, case):
     robot, policy, options = prepared(name, case)
     motion = flown(robot, policy, **options, engine="python")
     controller = fflin.LinearController(-policy.K, policy.lin)
-    for road, by in {"state feedback": policy, "controller": controller}.items():
-        other = flown(robot, by, **options, engine="compiled")
+    for road, by_key in {"state feedback": policy, "controller": controller}.items():
+        other = flown(robot, by_key, **options, engine="compiled")
         assert_same(motion, other, road)
         assert other.notes == motion.notes
 
@@ -284,7 +286,8 @@ def test_a_trajectory_is_followed_from_beyond_half_a_turn():
     v0[3] = 3.0
     options |= {"q0": q0, "v0": v0, "duration": 3.0}
     motion, other = (
-        flown(robot, by, **options, engine="python") for by in (steady, policy)
+        flown(robot, controller, **options, engine="python")
+        for controller in (steady, policy)
     )
     assert_same(motion, other, "trajectory")
     assert motion.notes[0].startswith(
@@ -318,7 +321,7 @@ def test_a_wheel_of_the_urdf_moves_as_the_same_reaction_wheel(tmp_path):
     wheel = fflin.ReactionWheel((0, 0, 1), name="spin", inertia=0.05)
     of_object = fflin.load(whole, inputs=[*base, wheel])
     of_urdf = fflin.load(carrier, inputs=[*base, fflin.JointTorque("spin")])
-    models = [fflin.linearize(each) for each in (of_object, of_urdf)]
+    models = [fflin.linearize(item) for item in (of_object, of_urdf)]
     for key in ("A", "B"):
         one, other = (getattr(lin, key) for lin in models)
         np.testing.assert_allclose(one, other, atol=1e-12, err_msg=key)
@@ -326,14 +329,14 @@ def test_a_wheel_of_the_urdf_moves_as_the_same_reaction_wheel(tmp_path):
     # speed of the wheel [rad/s], whose momentum of 5 N m s turns the body
     x0[-1] = 100.0
     options = {"x0": x0, "dt": 0.02, "duration": 4.0}
-    free = [fflin.simulate(each, **options) for each in (of_object, of_urdf)]
+    free = [fflin.simulate(item, **options) for item in (of_object, of_urdf)]
     assert_same(*free, "free")
     K = np.zeros(models[0].B.T.shape)
     K[:3, :3], K[:3, 7:10] = 4.0 * np.eye(3), 3.0 * np.eye(3)
     pairs = zip((of_object, of_urdf), models, strict=True)
     laws = [
-        fflin.simulate(each, fflin.StateFeedback(lin, K), **options)
-        for each, lin in pairs
+        fflin.simulate(item, fflin.StateFeedback(lin, K), **options)
+        for item, lin in pairs
     ]
     assert_same(*laws, "law")
     assert laws[0].notes == laws[1].notes != ()
@@ -341,13 +344,13 @@ def test_a_wheel_of_the_urdf_moves_as_the_same_reaction_wheel(tmp_path):
 
 def in_python(call):
     """Return the warnings of fflin while a function is called."""
-    with warnings.catch_warnings(record=True) as found:
+    with warnings.catch_warnings(record=True) as result:
         warnings.simplefilter("always")
         call()
     return {
-        str(each.message)
-        for each in found
-        if issubclass(each.category, fflin.FflinWarning)
+        str(item.message)
+        for item in result
+        if issubclass(item.category, fflin.FflinWarning)
     }
 
 
@@ -432,12 +435,12 @@ WARNINGS = {
 
 
 @pytest.mark.parametrize("case", WARNINGS)
-def test_a_command_warns_of_what_python_warns_of(case):
+def test_a_command_gives_the_warnings_of_the_python_call(case):
     command, call, word = WARNINGS[case]
     with any_wording():
-        said = warned(*command)
-    assert said == in_python(call)
-    assert any(word in each for each in said)
+        message = warned(*command)
+    assert message == in_python(call)
+    assert any(word in item for item in message)
 
 
 def test_each_public_regulator_warns_and_designs_that_contain_one_do_not():
@@ -459,8 +462,8 @@ def test_a_joint_is_warned_of_only_beyond_its_limits(tmp_path):
     file.write_text(URDF.format(m=20, x=2.0, y=3.0, z=2.5, more=limited))
     robot = fflin.load(file)
     for value, beyond in ((-0.5, False), (1.0, False), (-0.6, True), (1.1, True)):
-        found = in_python(
+        result = in_python(
             lambda value=value: fflin.configuration(robot, {"spin": value})
         )
-        said = {f"joint 'spin' at {value:g} rad is outside -0.5 to 1 rad"}
-        assert found == (said if beyond else set())
+        message = {f"joint 'spin' at {value:g} rad is outside -0.5 to 1 rad"}
+        assert result == (message if beyond else set())

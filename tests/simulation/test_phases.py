@@ -15,7 +15,7 @@ def flown():
     return phases()
 
 
-def test_the_rows_are_those_of_the_phases_one_after_the_other(flown):
+def test_the_rows_match_the_phases_one_after_the_other(flown):
     robot, approach, _, held, _, after, whole = flown
     assert whole.phases == (
         "servicer_7dof",
@@ -23,7 +23,7 @@ def test_the_rows_are_those_of_the_phases_one_after_the_other(flown):
         "joint_3 jammed",
     )
     assert whole.starts == pytest.approx([0.0, 4.0, 10.0])
-    ends = np.cumsum([len(each.t) for each in (approach, held, after)])
+    ends = np.cumsum([len(item.t) for item in (approach, held, after)])
     assert len(whole.t) == ends[-1] and whole.t[-1] == pytest.approx(13.0)
     assert (np.diff(whole.t) >= 0.0).all()
     assert (whole.q[: ends[0]] == approach.q).all() and (
@@ -50,21 +50,23 @@ def test_the_rows_are_those_of_the_phases_one_after_the_other(flown):
 def test_forces_are_turned_into_the_axes_of_the_first_phase(flown):
     *_, held, _, _, whole = flown
     k = len(flown.approach.t) + 20
-    force, there = (
-        each.reference.rotation @ each.u[row, 3:6]
-        for each, row in ((whole, k), (held, 20))
+    force, expected_value = (
+        item.reference.rotation @ item.u[row, 3:6]
+        for item, row in ((whole, k), (held, 20))
     )
-    assert np.abs(there).max() > 1e-3 and force == pytest.approx(there, abs=1e-14)
+    assert np.abs(expected_value).max() > 1e-3 and force == pytest.approx(
+        expected_value, abs=1e-14
+    )
 
 
 def test_errors_are_counted_from_the_target_of_each_phase(flown):
     whole = flown.whole
     rows = np.cumsum(
-        [0, *(len(each.t) for each in (flown.approach, flown.held, flown.after))]
+        [0, *(len(item.t) for item in (flown.approach, flown.held, flown.after))]
     )
     for k, part in enumerate((flown.approach, flown.held, flown.after)):
-        own = whole.attitude_error[rows[k] : rows[k + 1]]
-        assert own == pytest.approx(part.attitude_error, abs=1e-9)
+        errors = whole.attitude_error[rows[k] : rows[k + 1]]
+        assert errors == pytest.approx(part.attitude_error, abs=1e-9)
 
 
 def test_momentum_and_energy_across_the_phases(flown):
@@ -82,11 +84,11 @@ def test_momentum_and_energy_across_the_phases(flown):
     came = 0.5 * caught.payload_v @ DEBRIS.matrix() @ caught.payload_v
     lost = approach.energy[-1] + came - held.energy[0]
     assert lost == pytest.approx(caught.energy_lost, rel=1e-9)
-    said = str(whole)
-    assert says(said, "4 s: payload of 500 kg")
-    assert says(said, "10 s: joint_3 jammed", "N m s")
-    assert says(said, "not settled")
-    assert max(map(len, said.splitlines())) <= 80
+    message = str(whole)
+    assert says(message, "4 s: payload of 500 kg")
+    assert says(message, "10 s: joint_3 jammed", "N m s")
+    assert says(message, "not settled")
+    assert max(map(len, message.splitlines())) <= 80
 
 
 def test_the_table_has_energy_and_momentum_at_both_ends_of_each_phase(flown):
@@ -121,7 +123,7 @@ def test_the_table_has_energy_and_momentum_at_both_ends_of_each_phase(flown):
         13.0,
     ]
     ends = np.cumsum(
-        [len(each.t) for each in (flown.approach, flown.held, flown.after)]
+        [len(item.t) for item in (flown.approach, flown.held, flown.after)]
     )
     for row, k in (
         (0, 0),
@@ -130,14 +132,14 @@ def test_the_table_has_energy_and_momentum_at_both_ends_of_each_phase(flown):
         (4, ends[1] - 1),
         (7, ends[2] - 1),
     ):
-        own = (
+        errors = (
             whole.energy[k],
             *(
                 np.linalg.norm(whole.momentum[k, part])
                 for part in ([3, 4, 5], [0, 1, 2])
             ),
         )
-        assert [*map(float, rows[row][2:])] == pytest.approx(own, rel=1e-3), row
+        assert [*map(float, rows[row][2:])] == pytest.approx(errors, rel=1e-3), row
     for before, impact in ((2, flown.caught), (5, flown.jammed)):
         assert rows[before][3:] == rows[before + 1][3:]
         lost = float(rows[before][2]) - float(rows[before + 1][2])
@@ -192,7 +194,7 @@ def test_it_goes_on_step_by_step_and_under_another_policy(flown):
     assert not both.u[-1, 8] and (both.u[-1, [6, 7]] == on.u[-1, [6, 7]]).all()
 
 
-def test_what_does_not_go_on_is_one_line(flown):
+def test_a_file_that_cannot_be_continued_gives_a_one_line_error(flown):
     robot, approach, caught, held, jammed, after, whole = flown
     away = fflin.capture(robot, "tool", DEBRIS)
     turned = fflin.simulate(
@@ -204,7 +206,7 @@ def test_what_does_not_go_on_is_one_line(flown):
     pushed = fflin.simulate(
         pushed, None, q0=approach.q[-1], v0=approach.v[-1], duration=0.1
     )
-    for call, said in [
+    for call, message in [
         (approach.then, "last phase"),
         (lambda: approach.then(caught), "last phase"),
         (lambda: approach.then(3), "Motion"),
@@ -216,7 +218,7 @@ def test_what_does_not_go_on_is_one_line(flown):
         (lambda: approach.then(pushed), "jet"),
         (whole.trajectory, "several phases"),
     ]:
-        with pytest.raises(fflin.InputError, match=said) as error:
+        with pytest.raises(fflin.InputError, match=message) as error:
             call()
         assert "\n" not in str(error.value)
 

@@ -37,19 +37,17 @@ def lines(axes):
     return {line.get_label(): line for line in axes.get_lines()}
 
 
-def test_motion_shows_linear_beside_nonlinear_and_their_difference(loop):
+def test_motion_shows_linear_next_to_nonlinear_and_their_difference(loop):
     _, _, motion = loop
     figure = motion.plot()
-    axes = {each.get_title(): each for each in figure.axes if each.get_title()}
+    axes = {ax.get_title(): ax for ax in figure.axes if ax.get_title()}
     attitude = axes["attitude q_b"]
     full, dashed = attitude.get_lines()[4], attitude.get_lines()[5]
     assert full.get_label() == "z"
     np.testing.assert_array_equal(full.get_ydata(), motion.x[:, 2])
     np.testing.assert_array_equal(dashed.get_ydata(), motion.linear[:, 2])
     assert dashed.get_linestyle() == "--"
-    differences = [
-        each for each in figure.axes if each.get_ylabel().startswith("difference")
-    ]
+    differences = [ax for ax in figure.axes if ax.get_ylabel().startswith("difference")]
     assert len(differences) == 6
     apart = differences[0].get_lines()[2].get_ydata()
     np.testing.assert_array_equal(apart, motion.x[:, 2] - motion.linear[:, 2])
@@ -68,15 +66,15 @@ def along():
     return tracked(fflin.load("planar_detumble"), 2.0, run=4.0, limits=0.3)
 
 
-def test_a_reference_lies_pale_under_what_follows_it(along):
+def test_a_reference_is_drawn_in_a_pale_colour_below_the_motion(along):
     _, motion = along
     figure = motion.plot()
-    found = panels(figure)
+    result = panels(figure)
     titles = ("attitude q_b", "position r_b", "joints q_m", "angular velocity omega_b")
     titles = (*titles, "velocity v_b", "joint rates qdot_m")
     for title, start in zip(titles, range(0, 18, 3), strict=True):
         curves = [
-            each for each in found[title].get_lines() if len(each.get_xdata()) > 2
+            item for item in result[title].get_lines() if len(item.get_xdata()) > 2
         ]
         assert len(curves) == 6
         for k, (pale, flown) in enumerate(zip(curves[::2], curves[1::2], strict=True)):
@@ -102,13 +100,13 @@ def legend_texts(axes):
 def test_below_it_stands_the_error(along):
     _, motion = along
     figure = motion.plot()
-    strips = [each for each in figure.axes if each.get_ylabel().startswith("error")]
+    strips = [item for item in figure.axes if item.get_ylabel().startswith("error")]
     units = ["[deg]", "[m]", "[rad]", "[rad/s]", "[m/s]", "[rad/s]"]
-    assert [each.get_ylabel() for each in strips] == [
+    assert [item.get_ylabel() for item in strips] == [
         f"error\n{unit}" for unit in units
     ]
     flown = np.array(
-        [each.get_ydata() for axes in strips for each in axes.get_lines()[:3]]
+        [item.get_ydata() for axes in strips for item in axes.get_lines()[:3]]
     ).T
     np.testing.assert_allclose(flown[:, 3:], motion.error[:, 3:], atol=1e-15)
     turned = motion.error[:, :3] / np.linalg.norm(
@@ -142,12 +140,10 @@ def test_motion_without_a_prediction_has_no_differences():
     robot = fflin.load("cubesat")
     motion = fflin.simulate(robot, v0=[0, 0, 0, 0.1, 0, 0.2], duration=1.0, every=10)
     figure = motion.plot()
-    assert not [
-        each for each in figure.axes if each.get_ylabel().startswith("difference")
-    ]
+    assert not [ax for ax in figure.axes if ax.get_ylabel().startswith("difference")]
 
 
-def test_many_inputs_and_joints_are_named_beside_the_panels_each_in_its_colour():
+def test_many_inputs_and_joints_are_named_next_to_the_panels_each_in_its_colour():
     bare = fflin.load("servicer_7dof")
     thrusters = [
         fflin.Thruster(
@@ -165,7 +161,7 @@ def test_many_inputs_and_joints_are_named_beside_the_panels_each_in_its_colour()
     for legend in named.values():
         colors = {line.get_color() for line in legend.get_lines()}
         assert len(colors) == len(legend.get_lines())
-    axes = {each.get_title(): each for each in figure.axes}
+    axes = {item.get_title(): item for item in figure.axes}
     torques, angles = (
         {
             line.get_label().rpartition(".")[2]: line.get_color()
@@ -176,7 +172,7 @@ def test_many_inputs_and_joints_are_named_beside_the_panels_each_in_its_colour()
     assert torques == angles
     # Nothing lies on anything else.
     figure.draw_without_rendering()
-    boxes = [each.get_tightbbox() for each in (*figure.axes, *figure.legends)]
+    boxes = [item.get_tightbbox() for item in (*figure.axes, *figure.legends)]
     for i, one in enumerate(boxes):
         assert not any(one.overlaps(other) for other in boxes[:i])
         assert one.x0 >= 0.0
@@ -221,12 +217,12 @@ def test_a_target_rests_from_where_two_rows_of_it_are_one(target, since):
 
 
 def panels(figure):
-    return {each.get_title(): each for each in figure.axes if each.get_title()}
+    return {ax.get_title(): ax for ax in figure.axes if ax.get_title()}
 
 
-def test_each_axis_has_one_unit_and_wheels_have_panels_of_their_own(limited):
-    found = panels(limited.plot())
-    units = {title: axes.get_ylabel() for title, axes in found.items()}
+def test_each_axis_has_one_unit_and_wheels_have_separate_panels(limited):
+    result = panels(limited.plot())
+    units = {title: axes.get_ylabel() for title, axes in result.items()}
     assert units["base torque"] == "[N m]"
     assert units["base force"] == units["thrusters"] == "[N]"
     assert units["joint torques"] == "[N m]"
@@ -234,17 +230,17 @@ def test_each_axis_has_one_unit_and_wheels_have_panels_of_their_own(limited):
     assert units["wheel torque"] == "[N m]"
     assert units["wheel momentum"] == "[N m s]"
     for title in ("base torque", "base force"):
-        assert {"x", "y", "z"} == set(lines(found[title])) - {"limit"}
-    assert {"main"} == set(lines(found["thrusters"])) - {"limit"}
+        assert {"x", "y", "z"} == set(lines(result[title])) - {"limit"}
+    assert {"main"} == set(lines(result["thrusters"])) - {"limit"}
     for title in ("wheel speed", "wheel torque", "wheel momentum"):
-        assert set(lines(found[title])) == {"spin", "idle", "limit"}
+        assert set(lines(result[title])) == {"spin", "idle", "limit"}
     for title in ("joints q_m", "joint rates qdot_m"):
-        assert not {"spin", "idle"} & set(lines(found[title]))
+        assert not {"spin", "idle"} & set(lines(result[title]))
     speed = limited.x[:, limited.state_names.index("qdot_m.spin")]
     np.testing.assert_array_equal(
-        lines(found["wheel speed"])["spin"].get_ydata(), speed
+        lines(result["wheel speed"])["spin"].get_ydata(), speed
     )
-    momentum = lines(found["wheel momentum"])["spin"].get_ydata()
+    momentum = lines(result["wheel momentum"])["spin"].get_ydata()
     np.testing.assert_allclose(momentum, 0.05 * speed)
 
 
@@ -257,14 +253,14 @@ def levels(axes):
 
 def test_limits_are_drawn_where_a_curve_comes_to_a_third_of_them(limited):
     figure = limited.plot()
-    found = panels(figure)
-    assert levels(found["base torque"]) == ([8.0], 1)
-    assert levels(found["thrusters"]) == ([22.0], 1)
-    assert levels(found["joint torques"]) == ([300.0], 1)
-    assert levels(found["wheel speed"]) == ([300.0], 1)
-    assert levels(found["wheel momentum"]) == ([15.0], 1)
-    assert levels(found["joint rates qdot_m"])[0] in ([0.05], [-0.05, 0.05])
-    assert levels(found["joints q_m"]) == ([], 0)
+    result = panels(figure)
+    assert levels(result["base torque"]) == ([8.0], 1)
+    assert levels(result["thrusters"]) == ([22.0], 1)
+    assert levels(result["joint torques"]) == ([300.0], 1)
+    assert levels(result["wheel speed"]) == ([300.0], 1)
+    assert levels(result["wheel momentum"]) == ([15.0], 1)
+    assert levels(result["joint rates qdot_m"])[0] in ([0.05], [-0.05, 0.05])
+    assert levels(result["joints q_m"]) == ([], 0)
     (named,) = [x for x in figure.legends if x.get_title().get_text() == "joints"]
     assert [text.get_text() for text in named.get_texts()].count("limit") == 1
 
@@ -279,7 +275,7 @@ def test_a_motion_without_limits_has_no_lines_of_them(loop):
 def test_panels_of_wheels_and_limits_do_not_lie_on_each_other(limited):
     figure = limited.plot()
     figure.draw_without_rendering()
-    boxes = [each.get_tightbbox() for each in (*figure.axes, *figure.legends)]
+    boxes = [item.get_tightbbox() for item in (*figure.axes, *figure.legends)]
     for i, one in enumerate(boxes):
         assert not any(one.overlaps(other) for other in boxes[:i])
         assert one.x0 >= 0.0
@@ -289,9 +285,9 @@ def test_panels_of_wheels_and_limits_do_not_lie_on_each_other(limited):
 def test_the_inertias_of_wheels_are_saved_and_loaded(limited, tmp_path):
     for ending in (".npz", ".mat", ".json"):
         limited.save(tmp_path / f"m{ending}")
-        found = fflin.Motion.load(tmp_path / f"m{ending}")
-        np.testing.assert_array_equal(found.wheel_inertias, [0.05, 0.05])
-        assert found.wheels == ("spin", "idle") or found.wheels == ("idle", "spin")
+        result = fflin.Motion.load(tmp_path / f"m{ending}")
+        np.testing.assert_array_equal(result.wheel_inertias, [0.05, 0.05])
+        assert result.wheels == ("spin", "idle") or result.wheels == ("idle", "spin")
 
 
 def test_attitude_through_180_degrees_has_a_gap():
@@ -313,7 +309,7 @@ def test_figures_are_saved_whole(loop, tmp_path, suffix):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_bad_figures_are_refused(loop, tmp_path, monkeypatch):
+def test_invalid_figures_are_refused(loop, tmp_path, monkeypatch):
     _, _, motion = loop
     with pytest.raises(fflin.FileError, match=r"'\.bmp'"):
         motion.plot(tmp_path / "loop.bmp")

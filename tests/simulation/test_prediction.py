@@ -11,7 +11,7 @@ from tests.support.weights import unit_weights
 
 
 @pytest.mark.parametrize("outputs", [POSITIONS, FELT], ids=["positions", "felt"])
-def test_a_measured_feedback_is_foreseen_with_its_filter(outputs):
+def test_a_measured_feedback_is_predicted_with_its_filter(outputs):
     robot, lin, compensator = designed(outputs, stiffness=3.0)
     policy = fflin.OutputFeedback(lin, compensator)
     x0 = lin.x0 + 1e-3 * np.cos(np.arange(len(lin.x0)))
@@ -29,7 +29,7 @@ def test_a_measured_feedback_is_foreseen_with_its_filter(outputs):
     assert np.abs(often.linear - often.x).max() < 0.1 * np.abs(often.x - lin.x0).max()
 
 
-def test_a_robot_that_nothing_drives_is_foreseen():
+def test_a_robot_that_nothing_drives_is_predicted():
     robot = fflin.load("ets_vii", stiffness=30.0, damping=3.0)
     lin = fflin.linearize(robot)
     x0 = lin.x0 + 1e-4 * np.cos(np.arange(len(lin.x0)))
@@ -37,10 +37,10 @@ def test_a_robot_that_nothing_drives_is_foreseen():
     assert np.abs(free.linear - free.x).max() < 1e-7 < 1e-5 < np.abs(free.x - x0).max()
 
 
-def test_a_feedback_of_a_part_is_foreseen_by_the_whole_model():
+def test_a_feedback_of_a_part_is_predicted_by_the_whole_model():
     robot = fflin.load("servicer_7dof")
     robot = robot.replace(
-        inputs=[each for each in robot.inputs if hasattr(each, "joint")]
+        inputs=[item for item in robot.inputs if hasattr(item, "joint")]
     )
     lin = fflin.linearize(robot)
     part = fflin.momentum_reduction(lin)
@@ -55,18 +55,18 @@ def test_a_feedback_of_a_part_is_foreseen_by_the_whole_model():
         fflin.simulate(robot, policy, x0=x0, duration=0.1, linear=True)
 
 
-def test_a_model_about_another_point_foresees_with_the_policys_law():
+def test_a_model_about_another_point_predicts_with_the_policys_law():
     robot, lin, gain = regulated("ets_vii")
     q = fflin.configuration(robot, {"joint_1": 1e-3})
     beside = fflin.linearize(robot, q)
     policy, x0 = fflin.StateFeedback(lin, gain.K), displaced(lin, 0.05, 1e-3, 1e-3)
-    here = fflin.simulate(robot, policy, x0=x0, duration=10.0)
-    there = fflin.simulate(robot, policy, x0=x0, duration=10.0, linear=beside)
-    assert np.abs(there.linear - there.x).max() < 1e-5
-    np.testing.assert_allclose(there.linear[-1], here.linear[-1], atol=1e-5)
+    point = fflin.simulate(robot, policy, x0=x0, duration=10.0)
+    motion = fflin.simulate(robot, policy, x0=x0, duration=10.0, linear=beside)
+    assert np.abs(motion.linear - motion.x).max() < 1e-5
+    np.testing.assert_allclose(motion.linear[-1], point.linear[-1], atol=1e-5)
 
 
-def test_where_nothing_can_be_foreseen_the_reason_is_said():
+def test_where_nothing_can_be_predicted_the_reason_is_reported():
     robot, lin, gain = regulated("planar_detumble")
     feedback = fflin.StateFeedback(lin, gain.K)
     batch = fflin.sweep(robot, fflin.grid(robot, {"joint_1": [0.0, 1.0]}))
@@ -86,7 +86,7 @@ def test_where_nothing_can_be_foreseen_the_reason_is_said():
         assert fflin.simulate(robot, policy, duration=0.02, sample=0.02).linear is None
 
 
-def test_a_model_in_another_reference_foresees_nothing():
+def test_a_model_in_another_reference_predicts_nothing():
     robot, lin, gain = regulated("ets_vii")
     moved = fflin.configuration(robot, {}, fflin.linearize(robot).reference)
     moved[0] += 1.0
@@ -96,7 +96,7 @@ def test_a_model_in_another_reference_foresees_nothing():
         fflin.simulate(robot, policy, duration=0.1, linear=other)
 
 
-def test_a_continuous_controller_is_foreseen_from_another_point_and_with_what_is_felt():
+def test_a_continuous_controller_is_predicted_from_another_point_and_with_accelerometers():
     outputs = [fflin.BasePose(), fflin.JointPositions(), fflin.Accelerometer("base")]
     robot = fflin.load("ets_vii", outputs=outputs, stiffness=3.0, damping=1.0)
     lin = fflin.linearize(robot)
@@ -129,7 +129,7 @@ def test_a_continuous_controller_is_foreseen_from_another_point_and_with_what_is
         (1030, 300),
     ],
 )
-def test_the_motion_of_a_linear_loop_is_that_of_its_single_steps(steps, every):
+def test_the_motion_of_a_linear_loop_matches_its_single_steps(steps, every):
     rng = np.random.default_rng(4)
     A = 0.99 * np.linalg.qr(rng.normal(size=(5, 5)))[0]
     f0, e = rng.normal(size=(2, 5))
@@ -137,9 +137,9 @@ def test_the_motion_of_a_linear_loop_is_that_of_its_single_steps(steps, every):
     for _ in range(steps):
         expected.append(A @ expected[-1] + f0)
     rows = [*expected[:-1:every], expected[-1]]
-    found = _affine_motion(A, f0, e, steps, every)
+    result = _affine_motion(A, f0, e, steps, every)
     # Each of 100 steps adds a rounding error of a few EPS, and none grows.
-    assert np.abs(found - rows).max() < 1e-12 * np.abs(rows).max()
+    assert np.abs(result - rows).max() < 1e-12 * np.abs(rows).max()
 
 
 def test_a_prediction_survives_powers_that_overflow():

@@ -16,7 +16,7 @@ def flown(robot, q, v, u, duration):
     lin = fflin.linearize(robot, q, v, u, reference=pin.SE3.Identity())
     state = fflin.StateMap(robot)
     model = Nonlinear(Aba(state), lin)
-    found = solve_ivp(
+    result = solve_ivp(
         lambda _, x: model.rates(np.r_[x, lin.u0][None])[0],
         (0.0, duration),
         lin.x0,
@@ -24,8 +24,8 @@ def flown(robot, q, v, u, duration):
         rtol=1e-13,
         atol=1e-13,
     )
-    assert found.success
-    return state, found.y[:, -1]
+    assert result.success
+    return state, result.y[:, -1]
 
 
 def test_two_hinged_panels_of_a_tumbling_hub():

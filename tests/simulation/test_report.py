@@ -37,7 +37,7 @@ def cells(motion, title):
     return line.removeprefix(title).split()
 
 
-def test_what_has_settled_says_so_first_and_when():
+def test_a_settled_motion_reports_first_when_it_settled():
     motion = course(lambda t: np.exp(-t / 2.0))
     # 2 % of the largest is passed at 2 ln 50 = 7.82 s.
     assert first(motion).startswith("settled")
@@ -58,7 +58,7 @@ def test_the_margin_is_two_percent_of_the_largest_error_for_the_last_twentieth(
     assert ("not yet" in motion_report(motion)) is not settled
 
 
-def test_what_stays_away_says_by_how_much():
+def test_a_motion_that_does_not_settle_reports_its_error():
     motion = course(lambda t: np.exp(-t / 10.0))
     assert says(first(motion), "not settled", "2.7 deg", "0.068 rad")
     motion = course(lambda t: np.exp(-t), joint=0.0)
@@ -88,7 +88,7 @@ def test_the_headline_names_the_rates_that_the_table_calls_unsettled():
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-17, 1e-12])
-def test_what_never_left_its_target_but_for_rounding_has_settled(size):
+def test_a_motion_that_leaves_its_target_only_by_rounding_has_settled(size):
     motion = course(lambda t: 0.0 * t)
     noise = size * np.random.default_rng(0).normal(size=motion.x.shape)
     motion = replace(motion, x=motion.x + noise)
@@ -96,13 +96,13 @@ def test_what_never_left_its_target_but_for_rounding_has_settled(size):
     assert "not yet" not in motion_report(motion)
 
 
-def test_what_is_below_rounding_is_shown_as_none():
+def test_values_below_the_rounding_error_are_shown_as_zero():
     motion = course(lambda t: np.exp(-25.0 * t))
     assert 0.0 < motion.x[-1, 6] < 1e-199
     assert cells(motion, "joints") == ["rad", "0.5", "0.5", ".", "0.16"]
 
 
-def test_what_was_stopped_says_so_first():
+def test_a_stopped_motion_reports_the_reason_first():
     motion = course(lambda t: np.exp(-t), stopped="diverged at t = 20 s")
     assert says(first(motion), "diverged", "t = 20 s")
     free = fflin.simulate(
@@ -163,8 +163,8 @@ def pushed_by(*inputs, policy=True):
 @pytest.mark.exhaustive
 def test_where_no_input_pushes_the_base_its_position_is_not_judged():
     motion = pushed_by(fflin.BaseTorque())
-    said = " ".join(motion_report(motion).split("cubesat:")[0].split())
-    assert said.startswith("settled") and says(said, "position")
+    message = " ".join(motion_report(motion).split("cubesat:")[0].split())
+    assert message.startswith("settled") and says(message, "position")
     # In the headline, and in the rows of position and v_b.
     assert " ".join(motion_report(motion).split()).count("not controlled") == 3
     # Nor is it judged if the law does not feed it back, whatever pushes the base.
@@ -175,7 +175,7 @@ def test_where_no_input_pushes_the_base_its_position_is_not_judged():
         assert says(motion_report(pushing), "not controlled: position")
 
 
-def test_wheels_are_no_joints():
+def test_wheels_are_not_joints():
     robot = fflin.load("cubesat", inputs=fflin.load_inputs("cubesat"))
     lin = fflin.linearize(robot)
     x = np.zeros(len(lin.x0))
@@ -195,13 +195,13 @@ def test_a_base_that_no_force_pushes_is_off_its_target_by_a_figure():
     x0 = np.zeros(len(lin.x0))
     x0[3] = 1.0
     policy = fflin.StateFeedback(lin, fflin.lqr(lin).K)
-    said = motion_report(fflin.simulate(robot, policy, x0=x0, duration=1.0))
+    message = motion_report(fflin.simulate(robot, policy, x0=x0, duration=1.0))
     assert says(
-        said, "settled: attitude at the target", "not controlled: position 1 m;"
+        message, "settled: attitude at the target", "not controlled: position 1 m;"
     )
 
 
-def test_lengths_and_angles_of_joints_have_rows_of_their_own():
+def test_lengths_and_angles_of_joints_have_separate_rows():
     motion = course(lambda t: np.exp(-t))
     units = list(motion.state_units)
     units[motion.state_names.index("q_m.joint_2")] = "m"
@@ -214,16 +214,16 @@ def test_lengths_and_angles_of_joints_have_rows_of_their_own():
     assert ["joints", "rad"] in rows and ["joints", "m"] in rows
 
 
-def test_what_no_policy_steers_is_told_apart():
+def test_states_that_no_policy_controls_are_distinguished():
     steered = tuple(
         n for n in course(np.exp).state_names if n.startswith(("q_m", "qdot_m"))
     )
     motion = course(lambda t: np.exp(-t), steered=steered)
     x = motion.x.copy()
     x[:, 0] = np.sin(np.radians(15.0))
-    said = first(replace(motion, x=x))
-    assert said.startswith("settled") and says(
-        said, "3.92 s", "not controlled: attitude 30 deg"
+    message = first(replace(motion, x=x))
+    assert message.startswith("settled") and says(
+        message, "3.92 s", "not controlled: attitude 30 deg"
     )
 
 
@@ -243,11 +243,11 @@ def test_inputs_at_their_limits_all_along_are_named():
     names = motion.input_names[:5]
     limits = np.array([[-3.0, 3.0], [-3.0, 3.0], [-3.0, 3.0], [0.0, 3.0], [0.0, 0.0]])
     motion = replace(motion, u=u, limit_names=names, limits=limits)
-    said = motion_report(motion)
-    assert says(said, "3.92 s", "tau_b.x (100 %), tau_b.y (100 %), tau_b.z (80 %)")
-    assert says(said, "tau_b.y", "-3 N m", "100 %")
-    assert says(said, "tau_b.z", "3 N m", "80 %")
-    assert "F_b" not in said
+    message = motion_report(motion)
+    assert says(message, "3.92 s", "tau_b.x (100 %), tau_b.y (100 %), tau_b.z (80 %)")
+    assert says(message, "tau_b.y", "-3 N m", "100 %")
+    assert says(message, "tau_b.z", "3 N m", "80 %")
+    assert "F_b" not in message
 
 
 def test_an_input_that_goes_from_limit_to_limit_is_at_its_limit_all_along():
@@ -256,8 +256,8 @@ def test_an_input_that_goes_from_limit_to_limit_is_at_its_limit_all_along():
     u[:, 0], u[:1000, 1] = -3.0, 2.0  # all of the run, and half of it
     u[:1000, 0] = 3.0  # at the one limit or at the other
     names, limits = ("tau_b.x", "tau_b.y"), np.array([[-3.0, 3.0], [-2.0, 2.0]])
-    said = first(replace(motion, u=u, limit_names=names, limits=limits))
-    assert says(said, "not settled", "2.7 deg", "tau_b.x")
+    message = first(replace(motion, u=u, limit_names=names, limits=limits))
+    assert says(message, "not settled", "2.7 deg", "tau_b.x")
 
 
 @pytest.mark.parametrize(
@@ -273,15 +273,17 @@ def test_an_input_that_goes_from_limit_to_limit_is_at_its_limit_all_along():
         ),
     ],
 )
-def test_the_command_says_it_first_and_unsettled_is_no_failure(options, code, begins):
-    found, out, _ = run("simulate", "planar_detumble", "--duration", 2, *options)
-    assert found == code
+def test_the_command_says_it_first_and_unsettled_is_not_a_failure(
+    options, code, begins
+):
+    result, out, _ = run("simulate", "planar_detumble", "--duration", 2, *options)
+    assert result == code
     assert out.splitlines()[0].startswith(begins)
     assert max(map(len, out.splitlines())) <= 80
 
 
 @pytest.mark.parametrize("duration", [10.0, 30.0, *exhaustive(40.0, 50.0, 60.0)])
-def test_what_tumbles_or_swings_through_its_target_has_not_settled(duration):
+def test_a_robot_that_passes_through_its_target_has_not_settled(duration):
     robot = fflin.load("cubesat")
     lin = fflin.linearize(robot)
     x0 = np.zeros(12)
@@ -299,7 +301,7 @@ def test_what_tumbles_or_swings_through_its_target_has_not_settled(duration):
 
 
 @pytest.mark.exhaustive
-def test_a_wheel_at_its_largest_speed_is_told_and_its_angle_is_no_difference():
+def test_a_wheel_at_its_largest_speed_is_reported_and_its_angle_is_not_a_difference():
     wheels = [
         fflin.ReactionWheel(axis, inertia=3e-6, max_speed=60.0, name=name)
         for name, axis in zip("abc", np.eye(3).tolist(), strict=True)
@@ -312,7 +314,7 @@ def test_a_wheel_at_its_largest_speed_is_told_and_its_angle_is_no_difference():
     motion = fflin.simulate(
         robot, policy, q0=q0, duration=60.0, limits="urdf", linear=lin
     )
-    (full,) = [each for each in motion.saturated if each.name == "qdot_m.a"]
+    (full,) = [item for item in motion.saturated if item.name == "qdot_m.a"]
     speed = np.abs(motion.x[:, motion.state_names.index("qdot_m.a")])
     share = (
         np.diff(motion.t, append=motion.t[-1:])[speed >= 60.0 * (1.0 - 1e-3)].sum()
@@ -412,7 +414,7 @@ def test_thrusters_without_pulses_saturate():
     motion = fflin.simulate(
         robot, lambda t, q, v: [0, 0, 0, 9.0], duration=1.0, limits="urdf"
     )
-    assert [each.name for each in motion.saturated] == ["jet"]
+    assert [item.name for item in motion.saturated] == ["jet"]
     assert says(
         motion_report(motion), "impulse 1 N s"
     ) and "pulses" not in motion_report(motion)

@@ -41,8 +41,8 @@ def test_sampled_loops_settle_when_their_continuous_ones_do():
     sampled = lin.discretize(0.25)
     q = fflin.configuration(robot, {"joint_2": 0.3})
     one, two = (
-        time_to_settle(robot, fflin.StateFeedback(each, fflin.lqr(each).K), q, None)
-        for each in (lin, sampled)
+        time_to_settle(robot, fflin.StateFeedback(item, fflin.lqr(item).K), q, None)
+        for item in (lin, sampled)
     )
     assert abs(one - two) <= 20.0
 
@@ -69,16 +69,16 @@ def test_which_thrusters_give_every_wrench():
     )
     assert not thrusters_give_every_wrench(fflin.load("cubesat"))
     fewer = [
-        each
-        for each in inspector.inputs
-        if getattr(each, "name", "") != "top_left_front"
+        item
+        for item in inspector.inputs
+        if getattr(item, "name", "") != "top_left_front"
     ]
     assert not thrusters_give_every_wrench(inspector.replace(inputs=fewer))
     helped = [*fewer, fflin.BaseTorque(), fflin.BaseForce()]
     assert thrusters_give_every_wrench(inspector.replace(inputs=helped))
 
 
-def test_what_is_not_fed_back_does_not_lengthen_or_shorten_a_run():
+def test_states_that_are_not_fed_back_do_not_change_the_duration_of_a_run():
     wheels = [fflin.ReactionWheel(axis, inertia=1e-4) for axis in np.eye(3).tolist()]
     robot = fflin.load("cubesat", inputs=wheels)
     lin = fflin.linearize(robot)

@@ -65,7 +65,7 @@ def test_states_alone_and_inputs_alone(motion):
     assert drawn(motion, None).keys() == drawn(motion, ["*"]).keys()
 
 
-def test_what_is_not_there_is_told(motion):
+def test_missing_packages_are_reported(motion):
     with pytest.raises(fflin.UnknownNameError, match="'thrust'"):
         motion.plot(show=["thrust"])
     with pytest.raises(fflin.InputError, match="show"):

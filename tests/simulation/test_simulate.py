@@ -112,7 +112,7 @@ def test_momentum_and_energy_of_a_free_robot_are_conserved(name):
     np.testing.assert_allclose(com, straight, atol=1e-9)
 
 
-def test_projection_is_what_keeps_the_momentum():
+def test_projection_conserves_the_momentum():
     robot = fflin.load("servicer_7dof")
     q0, v0 = tumbling(robot, size=1.0)
     options = {"q0": q0, "v0": v0, "duration": 4.0, "dt": 0.02}
@@ -182,7 +182,7 @@ def test_momentum_follows_the_impulse_of_wrenches_thrusters_wheels_and_gravity(f
 
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("name", ["ets_vii", "servicer_7dof"])
-def test_regulated_loop_converges_and_the_linear_model_foresees_it(name):
+def test_regulated_loop_converges_and_the_linear_model_predicts_it(name):
     robot, lin, gain = regulated(name)
     policy = fflin.StateFeedback(lin, gain.K)
     motion = fflin.simulate(robot, policy, x0=displaced(lin), duration=90.0, every=20)
@@ -198,7 +198,7 @@ def test_regulated_loop_converges_and_the_linear_model_foresees_it(name):
     assert math.log2(apart[0] / apart[1]) == pytest.approx(2.0, abs=0.15)
 
 
-def test_sampled_feedback_is_held_and_foreseen():
+def test_sampled_feedback_is_held_and_predicted():
     robot, lin, _ = regulated("ets_vii")
     sampled = lin.discretize(0.1)
     gain = fflin.lqr(sampled, *fflin.sampled_cost(lin, 0.1, *unit_weights(lin)))
@@ -214,7 +214,7 @@ def test_sampled_feedback_is_held_and_foreseen():
     np.testing.assert_array_equal(rows.x, motion.x[::5])
 
 
-def test_delay_shifts_what_acts():
+def test_a_delay_shifts_the_applied_inputs():
     robot = free_body((20.0, 30.0, 40.0))
 
     def ramp(t, q, v):
@@ -433,7 +433,7 @@ def test_csv_has_names_and_rows(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "message"),
     [
         ({"duration": -1.0}, "duration"),
         ({"duration": 1.0, "dt": 0.0}, "dt"),
@@ -455,11 +455,11 @@ def test_csv_has_names_and_rows(tmp_path):
         ({"duration": 1.0, "frame": "base"}, "frame"),
     ],
 )
-def test_bad_input_is_one_clear_line(options, said):
+def test_invalid_input_is_one_clear_line(options, message):
     robot = fflin.load("ets_vii")
     with pytest.raises(fflin.FflinError, match=r"\w") as caught:
         fflin.simulate(robot, **options)
-    assert said in str(caught.value)
+    assert message in str(caught.value)
     assert "\n" not in str(caught.value)
 
 

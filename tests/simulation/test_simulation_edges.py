@@ -40,7 +40,7 @@ def after_half_a_second(value):
 
 @pytest.mark.parametrize("sample", [None, 0.1])
 @pytest.mark.parametrize(
-    ("policy", "said"),
+    ("policy", "message"),
     [
         (after_half_a_second(math.nan), "tau_b.x"),
         (after_half_a_second(math.inf), "tau_b.x"),
@@ -51,11 +51,11 @@ def after_half_a_second(value):
         (lambda t, q, v: np.zeros((6, 1)), "(6, 1)"),
     ],
 )
-def test_a_policy_that_gives_no_inputs_is_refused(policy, said, sample):
+def test_a_policy_that_gives_no_inputs_is_refused(policy, message, sample):
     robot = free_body((20.0, 30.0, 40.0))
     with pytest.raises(fflin.InputError) as caught:
         fflin.simulate(robot, policy, duration=1.0, sample=sample)
-    assert said in str(caught.value)
+    assert message in str(caught.value)
 
 
 def test_an_infinite_command_within_limits_is_the_limit():
@@ -69,7 +69,7 @@ def test_an_infinite_command_within_limits_is_the_limit():
         fflin.simulate(robot, after_half_a_second(math.nan), duration=1.0, limits=2.0)
 
 
-def test_a_policy_may_keep_and_change_what_it_is_given_and_gives():
+def test_a_policy_may_keep_and_change_its_arguments_and_results():
     robot = free_body((20.0, 30.0, 40.0))
     kept, u = [], np.zeros(6)
 
@@ -132,7 +132,7 @@ def test_a_speed_whose_square_overflows_is_refused_or_a_divergence(size):
     assert finite(motion)
 
 
-def test_the_prediction_is_that_of_the_last_row_too():
+def test_the_prediction_matches_the_last_row_too():
     robot, lin, gain = regulated("ets_vii")
     policy = fflin.StateFeedback(lin, gain.K)
     x0 = lin.x0 + 1e-6 * (displaced(lin) - lin.x0)
@@ -177,7 +177,7 @@ def test_the_default_step_divides_samples_delay_and_duration():
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "message"),
     [
         ({"sample": 0.0}, "sample"),
         ({"sample": "often"}, "'often'"),
@@ -194,10 +194,10 @@ def test_the_default_step_divides_samples_delay_and_duration():
         ({"linear": 3}, "fflin.LinearModel"),
     ],
 )
-def test_bad_input_is_one_line(options, said):
+def test_invalid_input_is_one_line(options, message):
     with pytest.raises(fflin.FflinError) as caught:
         fflin.simulate(free_body((20.0, 30.0, 40.0)), **{"duration": 1.0, **options})
-    assert said in str(caught.value)
+    assert message in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
@@ -240,7 +240,7 @@ def test_energy_of_gravity_and_springs_is_part_of_the_whole():
     ).energy[0] == pytest.approx(25.0 * 0.16 + 10.0 * 0.09)
 
 
-def test_the_linear_loop_is_that_of_scipy_late_limited_and_off_a_fixed_point():
+def test_the_linear_loop_matches_scipy_late_limited_and_off_a_fixed_point():
     from scipy.signal import cont2discrete
 
     robot = fflin.load("ets_vii", gravity=(0.0, 0.0, -0.2))
@@ -287,17 +287,17 @@ def test_feedback_along_a_trajectory_does_not_see_the_quaternions_sign():
     lin = fflin.linearize(robot)
     Q, R = unit_weights(lin)
     policy = fflin.TrajectoryFeedback(traj, fflin.tvlqr(traj, Q, R, Q)).bind(robot)
-    here, speed = fflin.StateMap(robot).to_pinocchio(displaced(lin))
-    other = here.copy()
+    point, speed = fflin.StateMap(robot).to_pinocchio(displaced(lin))
+    other = point.copy()
     other[3:7] *= -1.0
-    asked = policy(0.5, here, speed)
+    asked = policy(0.5, point, speed)
     assert np.abs(asked).max() > 1.0
     np.testing.assert_array_equal(policy(0.5, other, speed), asked)
     with pytest.raises(fflin.InputError, match="Trajectory"):
         fflin.TrajectoryFeedback(3, 4)
 
 
-def test_an_allocation_is_sampled_as_its_policy_is_and_refuses_what_is_no_command():
+def test_an_allocation_is_sampled_as_its_policy_is_and_refuses_an_invalid_command():
     design = fflin.load("cubesat", inputs=[fflin.BaseTorque(), fflin.BaseForce()])
     robot = design.replace(inputs=strong_thrusters())
     lin = fflin.linearize(design)
@@ -309,19 +309,19 @@ def test_an_allocation_is_sampled_as_its_policy_is_and_refuses_what_is_no_comman
     )
     changes = np.flatnonzero(np.diff(motion.u, axis=0).any(axis=1)) + 1
     np.testing.assert_array_equal(changes, np.arange(2, 20, 2))
-    for asked, said in (
+    for asked, message in (
         (lambda t, q, v: np.zeros(3), "(3,)"),
         (lambda t, q, v: "push", "real"),
         (lambda t, q, v: np.full(6, math.nan), "tau_b.x"),
     ):
         with pytest.raises(fflin.InputError) as caught:
             fflin.simulate(robot, fflin.Allocation(asked, design), duration=1.0)
-        assert said in str(caught.value)
+        assert message in str(caught.value)
     with pytest.raises(fflin.InputError, match=r"fflin\.Robot"):
         fflin.simulate(robot, fflin.Allocation(inner, 3), duration=1.0)
 
 
-def test_an_allocation_to_the_same_inputs_gives_what_was_asked():
+def test_an_allocation_to_the_same_inputs_returns_the_command():
     # The force is held in reference axes, while the base is turned.
     robot = fflin.load("ets_vii")
     lin = fflin.linearize(robot)
@@ -349,7 +349,7 @@ def test_the_attitude_error_is_the_angle_to_the_target_that_is_turned_too():
     assert motion.attitude_error[0] == pytest.approx(angle, abs=1e-9)
 
 
-def test_a_motion_of_unequal_rows_is_none(tmp_path):
+def test_a_motion_with_unequal_rows_is_refused(tmp_path):
     motion = fflin.simulate(free_body((20.0, 30.0, 40.0)), duration=0.1)
     motion.save(tmp_path / "m.json")
     record = json.loads((tmp_path / "m.json").read_text())
@@ -370,7 +370,7 @@ def test_a_motion_that_is_not_finite_is_not_saved(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_step_that_a_fast_gain_makes_short_is_told_once():
+def test_a_step_that_a_fast_gain_makes_short_is_reported_once():
     robot = free_body((20.0, 30.0, 40.0))
     lin = fflin.linearize(robot)
     K = fflin.lqr(lin, 1.0, 1.0).K
@@ -378,14 +378,16 @@ def test_a_step_that_a_fast_gain_makes_short_is_told_once():
     def at_once(t, q, v):
         return -1.0
 
-    with pytest.warns(fflin.FflinWarning) as told:
+    with pytest.warns(fflin.FflinWarning) as messages:
         fflin.simulate(
             robot, fflin.StateFeedback(lin, 1e6 * K), duration=2.0, events=[at_once]
         )
-    (said,) = [str(each.message) for each in told]
+    (message,) = [str(item.message) for item in messages]
     poles = np.abs(np.linalg.eigvals(lin.A - lin.B @ (1e6 * K)))
-    assert says(said, f"{poles.max():.3g} 1/s", "dt=")
-    steps = max(int(each.replace(",", "")) for each in re.findall(r"\d[\d,]{4,}", said))
+    assert says(message, f"{poles.max():.3g} 1/s", "dt=")
+    steps = max(
+        int(item.replace(",", "")) for item in re.findall(r"\d[\d,]{4,}", message)
+    )
     assert 1e5 < steps <= 2.0 * 2.0 * poles.max() + 1.0
     # Neither where the step is given, nor where it is not the pole that asks for so many.
     for gain, times in ((1e6, {"dt": 1e-5}), (1.0, {"duration": 2000.0})):
@@ -393,7 +395,7 @@ def test_a_step_that_a_fast_gain_makes_short_is_told_once():
         fflin.simulate(robot, policy, **{"duration": 2.0} | times, events=[at_once])
 
 
-def test_a_gain_that_is_not_finite_is_said_to_hold_nan():
+def test_a_gain_that_is_not_finite_is_reported_to_hold_nan():
     lin = fflin.linearize(free_body((20.0, 30.0, 40.0)))
     with pytest.raises(fflin.InputError, match=r"K\[0, 0\] is nan"):
         fflin.StateFeedback(lin, np.full((6, 12), np.nan))

@@ -36,11 +36,11 @@ def test_runs_of_up_to_100000_rows_are_recorded_step_by_step():
 @pytest.mark.parametrize(
     ("sample", "every"), [(0.01, 24), (0.03, 24), (0.5, 50), (0.07, 28)]
 )
-def test_what_is_recorded_of_a_sampled_loop_are_samples_or_parts_of_them(sample, every):
-    found = of(2400.0 - 2400.0 % sample, sample=sample)
-    assert found.every == every
-    assert found.every % found.sample == 0
-    assert 4_000 < found.rows <= 10_002
+def test_recorded_rows_of_a_sampled_loop_divide_the_samples(sample, every):
+    result = of(2400.0 - 2400.0 % sample, sample=sample)
+    assert result.every == every
+    assert result.every % result.sample == 0
+    assert 4_000 < result.rows <= 10_002
 
 
 def test_a_thinned_run_is_the_run_at_some_of_its_rows(monkeypatch):
@@ -60,7 +60,7 @@ def test_a_thinned_run_is_the_run_at_some_of_its_rows(monkeypatch):
     assert len(short.t) == 101 and not short.notes
 
 
-def test_the_pole_that_makes_a_run_slow_is_told():
+def test_the_pole_that_makes_a_run_slow_is_reported():
     robot = fflin.load("ets_vii")
     lin = fflin.linearize(robot)
     K = fflin.lqr(lin).K.copy()
@@ -73,10 +73,10 @@ def test_the_pole_that_makes_a_run_slow_is_told():
     def at_once(t, q, v):
         return -1.0
 
-    with pytest.warns(fflin.FflinWarning) as said:
+    with pytest.warns(fflin.FflinWarning) as message:
         motion = fflin.simulate(robot, policy, duration=120.0, events=[at_once])
     fastest = np.abs(np.linalg.eigvals(lin.A - lin.B @ K)).max()
-    (line,) = [str(each.message) for each in said]
+    (line,) = [str(item.message) for item in message]
     assert says(
         line, f"{-fastest:.3g} 1/s", "mainly qdot_m.joint_5", "0.001 s", "120,000"
     )
@@ -93,7 +93,7 @@ def test_all_poles_of_a_schedule_count():
     B = np.tile([[0.0], [1.0]], (3, 1, 1))
     schedule = SimpleNamespace(t=np.array([0.0, 90.0, 90.1]), A=A, B=B, K=K, dt=0.0)
     poles = poles_along.__wrapped__(schedule)
-    expected = np.concatenate([np.linalg.eigvals(each) for each in (*A, *(A - B @ K))])
+    expected = np.concatenate([np.linalg.eigvals(item) for item in (*A, *(A - B @ K))])
     assert np.sort_complex(poles) == pytest.approx(np.sort_complex(expected))
     assert not len(poles_along.__wrapped__(SimpleNamespace(dt=0.1)))
 

@@ -21,19 +21,19 @@ def case():
 
 
 @pytest.mark.parametrize("frame", ["local", "hybrid", "world"])
-def test_the_errors_of_rows_are_those_of_points_and_lead_back(frame):
+def test_errors_of_rows_match_errors_of_points_and_are_inverted(frame):
     robot, rng = fflin.load("servicer_7dof"), np.random.default_rng(5)
     state = fflin.StateMap(robot, frame=frame)
     turns = 0.5 * rng.standard_normal((20, robot.nv))
     turns[:, 3:6] *= 4.0  # across half turns
     q = [pin.integrate(robot.model, robot.neutral(), turn) for turn in turns]
     v = rng.standard_normal((20, robot.nv))
-    x = np.array([state.to_state(*each) for each in zip(q, v, strict=True)])
+    x = np.array([state.to_state(*item) for item in zip(q, v, strict=True)])
     e = moving_errors(frame, x[1:], x[:-1])
     for k, row in enumerate(e):
-        here = moving_error(state, q[k], v[k], q[k + 1], v[k + 1])
-        here[6 : 6 + robot.n] = x[k + 1, 6 : 6 + robot.n] - x[k, 6 : 6 + robot.n]
-        np.testing.assert_allclose(row, here, atol=1e-13)
+        error = moving_error(state, q[k], v[k], q[k + 1], v[k + 1])
+        error[6 : 6 + robot.n] = x[k + 1, 6 : 6 + robot.n] - x[k, 6 : 6 + robot.n]
+        np.testing.assert_allclose(row, error, atol=1e-13)
     np.testing.assert_allclose(moved_by(frame, x[:-1], e), x[1:], atol=1e-13)
 
 
@@ -117,14 +117,14 @@ def test_a_clock_that_does_not_begin_at_zero_is_counted_from_the_first_knot(case
     moved = fflin.tvlqr(fflin.linearize_trajectory(robot, late))
     q0, v0 = beside(robot, traj, 0.02)
     runs = [
-        fflin.simulate(robot, each, q0=q0, v0=v0, linear=False)
-        for each in (schedule, moved)
+        fflin.simulate(robot, item, q0=q0, v0=v0, linear=False)
+        for item in (schedule, moved)
     ]
     np.testing.assert_allclose(runs[1].x, runs[0].x, atol=1e-9)
 
 
 @pytest.mark.exhaustive
-def test_thrusters_take_what_a_schedule_asks_of_the_base():
+def test_thrusters_realise_the_base_commands_of_a_schedule():
     design = fflin.load("cubesat", inputs=[fflin.BaseTorque(), fflin.BaseForce()])
     traj = swung(design, size=1e-4, spin=0.02).trajectory()
     schedule = fflin.tvlqr(fflin.linearize_trajectory(design, traj))
@@ -145,22 +145,22 @@ def test_thrusters_take_what_a_schedule_asks_of_the_base():
     np.testing.assert_allclose(run.target, alone.target, atol=1e-14)
 
 
-def test_limits_that_the_trajectory_itself_breaks_are_told(case):
+def test_limits_that_the_trajectory_itself_breaks_are_reported(case):
     robot, schedule, _ = case
     with pytest.warns(fflin.FflinWarning, match=r"0\.\d+ N"):
         fflin.simulate(robot, schedule, duration=0.1, limits=0.05)
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "message"),
     [
         ({"frame": "hybrid"}, "'hybrid'"),
         ({"linear": True}, "TrajectoryFeedback"),
     ],
 )
-def test_what_does_not_go_along_a_trajectory_is_refused(case, options, said):
+def test_options_that_exclude_a_trajectory_are_refused(case, options, message):
     robot, schedule, _ = case
-    with pytest.raises(fflin.InputError, match=said):
+    with pytest.raises(fflin.InputError, match=message):
         fflin.simulate(robot, schedule, **options)
 
 
@@ -231,8 +231,8 @@ def test_after_the_end_the_regulator_about_rest_acts_whatever_the_weight_at_the_
     heavy = fflin.tvlqr(along, 10.0, 0.05, 1e4, sample=sample)
     steady = fflin.tvlqr(along, 10.0, 0.05, "steady", sample=sample)
     ends = [
-        fflin.TrajectoryFeedback(along, each).gain(traj.t[-1] + 1.0)
-        for each in (heavy, steady)
+        fflin.TrajectoryFeedback(along, item).gain(traj.t[-1] + 1.0)
+        for item in (heavy, steady)
     ]
     np.testing.assert_array_equal(*ends)
     if sample is None:
@@ -260,7 +260,7 @@ def test_the_last_step_ends_on_the_trajectory_whatever_its_time_is_rounded_to():
     "engine", ["python", pytest.param("compiled", marks=pytest.mark.compiled)]
 )
 @pytest.mark.parametrize("how", ["schedule", "option"])
-def test_at_the_very_end_held_inputs_are_those_of_rest(engine, how):
+def test_at_the_end_held_inputs_match_rest(engine, how):
     """The last input of a motion brakes: held on for a sample it kicks the robot out of rest."""
     robot = fflin.load("planar_detumble")
     start = fflin.velocity(robot, {"omega_b.y": 0.02})
@@ -365,7 +365,7 @@ def test_default_gains_of_samples_bring_errors_to_nothing_within_a_trajectory(
     assert run.attitude_error[-1] < degrees
 
 
-def test_a_start_beside_a_trajectory_is_off_by_what_is_asked(case):
+def test_a_start_next_to_a_trajectory_has_the_requested_error(case):
     robot, schedule, traj = case
     policy = fflin.TrajectoryFeedback(traj, schedule)
     state = fflin.StateMap(robot, frame="local")

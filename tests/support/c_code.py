@@ -5,7 +5,7 @@ import subprocess
 
 import pytest
 
-COMPILERS = [each for each in ("gcc", "clang") if shutil.which(each)]
+COMPILERS = [item for item in ("gcc", "clang") if shutil.which(item)]
 FLAGS = [
     *("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Wdouble-promotion"),
     *("-pedantic", "-Werror", "-O1"),

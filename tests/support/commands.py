@@ -18,8 +18,8 @@ def run(*arguments, cwd=None, **environment):
     In this process: the same code from the arguments to the exit code, without the half second
     that an interpreter and its packages take to start.
     """
-    code, said, complained = _called(arguments, cwd, environment)
-    return code, said, without_warnings(hear_lines(complained))
+    code, message, complained = _called(arguments, cwd, environment)
+    return code, message, without_warnings(hear_lines(complained))
 
 
 def warned(*arguments, cwd=None):
@@ -48,8 +48,8 @@ def _called(arguments, cwd, environment):
             code = cli.main([*map(str, arguments)])
         except SystemExit as ended:
             code = ended.code or 0
-    said, complained = (each.buffer.getvalue().decode() for each in (out, err))
-    return code, said, complained
+    message, complained = (item.buffer.getvalue().decode() for item in (out, err))
+    return code, message, complained
 
 
 def run_in_process(*arguments, cwd=None, **environment):

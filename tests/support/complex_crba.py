@@ -24,7 +24,7 @@ def motions(model, q):
     """Return by joint the motion (6, nv) of its frame in its axes, linear first."""
     data = model.createData()
     pin.forwardKinematics(model, data, q)
-    found = {}
+    result = {}
     for joint in range(1, model.njoints):
         place, J = data.oMi[joint], np.zeros((6, model.nv))
         at = joint
@@ -32,12 +32,12 @@ def motions(model, q):
             relative = place.actInv(data.oMi[at])
             R, p = relative.rotation, relative.translation
             X = np.block([[R, skew(p) @ R], [np.zeros((3, 3)), R]])
-            own = model.joints[at]
-            S = np.eye(6) if at == 1 else axis_of(own)
-            J[:, own.idx_v : own.idx_v + own.nv] = X @ S
+            default = model.joints[at]
+            S = np.eye(6) if at == 1 else axis_of(default)
+            J[:, default.idx_v : default.idx_v + default.nv] = X @ S
             at = model.parents[at]
-        found[joint] = J
-    return found
+        result[joint] = J
+    return result
 
 
 def axis_of(joint):

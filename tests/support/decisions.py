@@ -122,7 +122,7 @@ def main():
     arguments = parser.parse_args()
     warnings.simplefilter("ignore")
     robots = {name: fflin.load(name) for name in BUNDLED}
-    found = {}
+    result = {}
     for seed in range(arguments.first, arguments.first + arguments.count):
         lin, K, D = case(seed, robots)
         for dt in PERIODS:
@@ -132,8 +132,8 @@ def main():
                 decided["wrong"] = {
                     k: [decided[k], v] for k, v in true.items() if decided[k] != v
                 }
-            found[f"{seed} {lin.robot} {dt:g}"] = decided
-    print(json.dumps(found))
+            result[f"{seed} {lin.robot} {dt:g}"] = decided
+    print(json.dumps(result))
 
 
 if __name__ == "__main__":

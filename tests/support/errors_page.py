@@ -11,8 +11,8 @@ LONGEST = 160
 
 def rows():
     """Return class and sentence of each row; dots in a sentence stand for what may differ."""
-    found = ROW.findall(PAGE.read_text(encoding="utf-8"))
-    return [(kind, re.sub(r"\\([|<])", r"\1", words)) for kind, words in found]
+    result = ROW.findall(PAGE.read_text(encoding="utf-8"))
+    return [(kind, re.sub(r"\\([|<])", r"\1", words)) for kind, words in result]
 
 
 def agrees(row, kind, sentence):
@@ -23,14 +23,14 @@ def agrees(row, kind, sentence):
 
 def write(heard):
     """Put the sentences that the rows' tests met into the rows that say something else."""
-    said = {}
+    message = {}
     for test, sentences in heard.items():
         row = re.fullmatch(r"tests/test_errors_page\.py::.*\[row_(\d+)\]", test)
         if row:
-            said[int(row[1])] = sentences[0].partition(": ")[::2]
-    for k, row in enumerate(rows() if said else []):
-        if k in said and not agrees(row, *said[k]):
-            _replace(k, *said[k])
+            message[int(row[1])] = sentences[0].partition(": ")[::2]
+    for k, row in enumerate(rows() if message else []):
+        if k in message and not agrees(row, *message[k]):
+            _replace(k, *message[k])
 
 
 def _replace(k, kind, sentence):

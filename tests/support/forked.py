@@ -28,7 +28,7 @@ def forking(**environment):
 
         def run(arguments, folder, out, err, limits):
             """Run a command in a folder, its output into files; limits are in s and bytes."""
-            job = [list(map(str, each)) for each in (arguments, (folder, out, err))]
+            job = [list(map(str, item)) for item in (arguments, (folder, out, err))]
             with finishing(server, f"fflin {' '.join(job[0])}"):
                 print(json.dumps([*job, limits]), file=server.stdin, flush=True)
                 answer = server.stdout.readline()

@@ -78,7 +78,7 @@ def light(folder):
     motion = fflin.simulate(robot, fflin.StateFeedback(lin, gain.K), duration=0.05)
     sensitive = fflin.sensitivity(lin)
     uncertain = fflin.uncertain(robot, {"base.mass": 0.1})
-    found = {"robot": robot, "q": q, "v": v, "u": u}
+    result = {"robot": robot, "q": q, "v": v, "u": u}
     place = {"frame": "hybrid", "reference": pin.SE3.Identity(), "moving": False}
     weights = {"Q": 1.0, "R": 1.0}
     filtered_model = fflin.linearize(robot.replace(stiffness=1.0, damping=1.0))
@@ -151,7 +151,7 @@ def light(folder):
         "JointTorque": {"joint": joint, "max": 1.0, "min": -0.5},
         "JointVelocities": {"joints": (joint,)},
         "kalman": {"lin": lin, "W": 1.0, "V": 1.0, "G": lin.B},
-        "linearize": found | place,
+        "linearize": result | place,
         "linearize_trajectory": knots
         | {"robot": robot, "strict": False, "hold": "previous", "frame": "world"},
         "Linearizer": {"robot": robot} | place,
@@ -201,7 +201,7 @@ def light(folder):
             "compensator": fflin.lqg(gain, filtered),
             "noise": None,
         },
-        "outputs": {"lin": lin} | found,
+        "outputs": {"lin": lin} | result,
         "plot_loops": {"gain": gain, "path": None},
         "plot_matrices": {"lin": lin, "path": None},
         "plot_motion": {"motion": motion, "path": None, "show": None},
@@ -390,7 +390,7 @@ def sound(folder):
     uncertain = fflin.uncertain(robot, {"base.mass": 0.1})
     batch = fflin.sweep(robot, [q, q])
     campaign = fflin.monte_carlo(robot, None, {"q_b": 0.01}, runs=2, duration=0.02)
-    found = {"robot": robot, "q": q, "v": v, "u": u}
+    result = {"robot": robot, "q": q, "v": v, "u": u}
     place = {"frame": "hybrid", "reference": pin.SE3.Identity(), "moving": False}
     weights = {"Q": 1.0, "R": 1.0}
     filtered_model = fflin.linearize(robot.replace(stiffness=1.0, damping=1.0))
@@ -481,7 +481,7 @@ def sound(folder):
         "plot_check": {"check": fflin.check(robot, lin), "path": None},
         "plot_modes": {"modes": fflin.modes(filtered_model), "path": None},
         "ScheduledFeedback": {"lin": lin, "gains": fflin.lqr_batch(batch, **weights)},
-        "sweep": found
+        "sweep": result
         | {"q": [q]}
         | place
         | dict.fromkeys(("executor", "threads", "chunk", "progress", "out")),

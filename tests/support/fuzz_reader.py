@@ -87,14 +87,14 @@ TOKENS = [
 
 def seeds() -> list[bytes]:
     """Small documents, right and wrong, without those for xacro, which evaluates expressions."""
-    found = [path.read_bytes() for path in sorted(ROBOTS.glob("*.urdf"))]
+    result = [path.read_bytes() for path in sorted(ROBOTS.glob("*.urdf"))]
     for case in CASES:
         document = case.document
         raw = document.encode() if isinstance(document, str) else document
         if not callable(raw) and len(raw) < 5_000 and "xacro" not in case.name:
             # The wrong ones are refused whatever is done to them.
-            found.extend([raw] * (1 if case.expected == REFUSE else 10))
-    return found
+            result.extend([raw] * (1 if case.expected == REFUSE else 10))
+    return result
 
 
 def mutate(document: bytes, other: bytes, rng: random.Random) -> bytes:

@@ -105,9 +105,9 @@ def warns(*arguments, **options):
     __tracebackhide__ = True
     with WARNS(*arguments, **options) as caught:
         yield caught
-    for each in caught:
-        if issubclass(each.category, fflin.FflinWarning):
-            hear(str(each.message), each.category.__name__)
+    for item in caught:
+        if issubclass(item.category, fflin.FflinWarning):
+            hear(str(item.message), item.category.__name__)
 
 
 class Snapshot:
@@ -128,7 +128,9 @@ class Snapshot:
         """Add sentences; if all tests were run (`whole`), also remove those that were not heard."""
         new = {template(sentence): sentence for sentence in heard}
         kept = {
-            key: said for key, said in self.sentences.items() if key in new or not whole
+            key: message
+            for key, message in self.sentences.items()
+            if key in new or not whole
         }
         text = json.dumps(sorted((new | kept).values()), indent=1, ensure_ascii=False)
         self.path.write_text(text + "\n", encoding="utf-8")
@@ -179,7 +181,7 @@ class Messages:
                 exitstatus == 0 and not self.narrowed and self.config.args == default
             )
             self.snapshot.write(
-                [each for heard in self.heard.values() for each in heard], whole
+                [item for heard in self.heard.values() for item in heard], whole
             )
             errors_page.write(self.heard)
 

@@ -33,9 +33,9 @@ def settling(robot, duration, *, reference=HOME, predicted=False):
     home[7:] = robot.neutral()[7:]
     decay = np.exp(-t / 5)
     q = [pin.integrate(robot.model, home, s * v) for s in decay]
-    for each in q:
-        robot.follow(each)
-    x = np.array([state.to_state(each, np.zeros(robot.nv)) for each in q])
+    for item in q:
+        robot.follow(item)
+    x = np.array([state.to_state(item, np.zeros(robot.nv)) for item in q])
     size = len(actuation.names)
     strength = np.r_[-40, -15, 9, -20, 14, 3, rng.uniform(-5, 5, max(size - 6, 0))][
         :size

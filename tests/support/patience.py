@@ -31,25 +31,25 @@ class Family:
             process = psutil.Process(self._pid)
             self._seen |= {process, *process.children(recursive=True)}
         total = -time.thread_time() if self._pid == os.getpid() else 0.0
-        for each in self._seen:
+        for item in self._seen:
             with contextlib.suppress(psutil.Error):
-                total += sum(each.cpu_times()[:4])  # own and of children that ended
+                total += sum(item.cpu_times()[:4])  # own and of children that ended
         return total
 
     def busy(self):
         """Return whether one of them computes, or waits for a processor or a disk."""
         states = (psutil.STATUS_RUNNING, psutil.STATUS_DISK_SLEEP)
-        for each in self._seen:
+        for item in self._seen:
             with contextlib.suppress(psutil.Error):
-                if each.pid != os.getpid() and each.status() in states:
+                if item.pid != os.getpid() and item.status() in states:
                     return True
         return False
 
     def kill(self):
         """Kill those that have been seen."""
-        for each in self._seen:
+        for item in self._seen:
             with contextlib.suppress(psutil.Error):
-                each.kill()
+                item.kill()
 
 
 class Patience:
@@ -98,8 +98,8 @@ def finishing(process, what="", *, limit=LIMIT, stall=STALL):
 
     def watch():
         while not ended.wait(min(1.0, 0.05 * stall)):
-            if said := patience.out():
-                reason.append(said)
+            if message := patience.out():
+                reason.append(message)
                 family.kill()
                 return
 

@@ -91,8 +91,8 @@ def between_gains(robot):
     axes = {names[0]: [-0.3, 0.1, 0.2, 0.4]} | {name: [-0.2, 0.3] for name in names[1:]}
     batch = fflin.sweep(robot, fflin.grid(robot, axes))
     lin = fflin.linearize(robot)
-    by = fflin.lqr(lin)
-    gains = fflin.lqr_batch(batch, by.Q, by.R)
+    controller = fflin.lqr(lin)
+    gains = fflin.lqr_batch(batch, controller.Q, controller.R)
     # So that they differ more.
     sizes = 1.0 + 0.1 * np.arange(len(gains))[:, None, None]
     return (
@@ -106,25 +106,31 @@ def compensated(robot, dt=SAMPLE):
     robot = seen(robot)
     lin = fflin.linearize(robot).discretize(dt)
     gain = fflin.lqr(lin)
-    by = fflin.lqg(gain, fflin.kalman(lin, 1e-3, 1e-4))
-    return robot, lin, coarsened(by, "A", "B", "C")
+    controller = fflin.lqg(gain, fflin.kalman(lin, 1e-3, 1e-4))
+    return robot, lin, coarsened(controller, "A", "B", "C")
 
 
 def outputs(robot):
-    robot, lin, by = compensated(robot)
+    robot, lin, controller = compensated(robot)
     size = len(lin.output_names)
-    return robot, fflin.OutputFeedback(lin, by, lambda t: noise(t)[:size]), {"dt": 0.01}
+    return (
+        robot,
+        fflin.OutputFeedback(lin, controller, lambda t: noise(t)[:size]),
+        {"dt": 0.01},
+    )
 
 
 def controlled(robot):
     """A continuous law with a direct term: a filtered estimate, and the rates of it damped."""
     robot = seen(robot)
     lin = fflin.linearize(robot)
-    by = fflin.lqg(fflin.lqr(lin), fflin.kalman(lin, 1e-3, 1e-2))
+    controller = fflin.lqg(fflin.lqr(lin), fflin.kalman(lin, 1e-3, 1e-2))
     damping = -0.05 * np.linalg.pinv(lin.B) @ np.linalg.pinv(lin.C)
     return (
         robot,
-        fflin.LinearController((*map(coarse, (by.A, by.B, by.C, damping)),), lin),
+        fflin.LinearController(
+            (*map(coarse, (controller.A, controller.B, controller.C, damping)),), lin
+        ),
         {},
     )
 
@@ -164,12 +170,14 @@ def followed_outputs(robot):
     robot = seen(robot)
     along, start = path(robot)
     gains = coarsened(fflin.tvlqr(along, sample=SAMPLE), "K", "P")
-    by = fflin.tvkalman(along, 1e-3, 1e-4, P0=1e-4, sample=SAMPLE)
-    by = coarsened(by, "L", "P")
-    size = len(by.output_names)
+    controller = fflin.tvkalman(along, 1e-3, 1e-4, P0=1e-4, sample=SAMPLE)
+    controller = coarsened(controller, "L", "P")
+    size = len(controller.output_names)
     return (
         robot,
-        fflin.TrajectoryOutputFeedback(along, gains, by, lambda t: noise(t)[:size]),
+        fflin.TrajectoryOutputFeedback(
+            along, gains, controller, lambda t: noise(t)[:size]
+        ),
         start,
     )
 

@@ -144,7 +144,7 @@ def _numbers(vector):
 
 def _appendages(links, rng):
     """Arrays and tanks on some links; the remaining rigid inertia stays positive definite."""
-    found = []
+    result = []
     for link in links:
         if rng.random() < 0.4:
             # Spatial inertia about the link's origin. L is at most 0.6 of its Cholesky factor, so
@@ -154,7 +154,7 @@ def _appendages(links, rng):
             columns = np.linalg.qr(rng.normal(size=(6, count)))[0]
             columns *= 0.6 * 10.0 ** rng.uniform(-6.0, 0.0, count)
             L = np.linalg.cholesky(body.matrix()) @ columns
-            found.append(
+            result.append(
                 fflin.FlexibleAppendage(
                     link.name,
                     10.0 ** rng.uniform(-2.0, 1.5, count),
@@ -167,7 +167,7 @@ def _appendages(links, rng):
         elif rng.random() < 0.3:
             shift = 0.3 * np.sqrt(np.linalg.eigvalsh(link.inertia)[0] / link.mass)
             pendulum = rng.random() < 0.5
-            found.append(
+            result.append(
                 fflin.Slosh(
                     link.name,
                     link.mass * 10.0 ** rng.uniform(-4.0, -0.7),
@@ -178,7 +178,7 @@ def _appendages(links, rng):
                     name=f"tank_{link.name}",
                 )
             )
-    return found
+    return result
 
 
 def _with_inputs(robot, links, rng):

@@ -92,11 +92,11 @@ def test_octave_takes_the_model_of_the_page(followed):
         text=True,
     )
     assert done.returncode == 0, done.stderr
-    found = loadmat(folder / "out.mat", squeeze_me=True)
+    result = loadmat(folder / "out.mat", squeeze_me=True)
     ends = {"first": np.array([1.0, 0.0, 0.0, 0.0]), "second": delta, "plant": delta}
     for name, row in ends.items():
         for got, expected in zip(
-            (found[name]["A"], found[name]["B"]), lft.at(row), strict=False
+            (result[name]["A"], result[name]["B"]), lft.at(row), strict=False
         ):
             assert np.abs(got.item() - expected).max() < 1e-12 * np.abs(expected).max()
     assert names["lft"].parameters == lft.parameters

@@ -22,10 +22,10 @@ def weighed_by_hand(robot, q, v, bodies):
         place, p = data.oMi[joint], bodies[joint]
         total += p[0]
         first += p[0] * place.translation + place.rotation @ p[1:4]
-        own = spatial(p) @ (J @ v)
-        h[3:] += place.rotation @ own[:3]
-        h[:3] += place.rotation @ own[3:] + np.cross(
-            place.translation, place.rotation @ own[:3]
+        momentum = spatial(p) @ (J @ v)
+        h[3:] += place.rotation @ momentum[:3]
+        h[:3] += place.rotation @ momentum[3:] + np.cross(
+            place.translation, place.rotation @ momentum[:3]
         )
     h[:3] -= np.cross(first / total, h[3:])
     return np.concatenate((first / total, h))
@@ -114,15 +114,15 @@ def test_sampled_models_as_by_complex_steps(at):
         block[:nx] = 1j * H * np.column_stack((slope.dA, slope.dB, slope.df0))
         block[:nx] += np.column_stack((lin.A, lin.B, lin.f0))
         expected = expm(0.1 * block)[:nx].imag / H
-        for found, part in (
+        for result, part in (
             (got.dA, expected[:, :nx]),
             (got.dB, expected[:, nx:-1]),
             (got.df0, expected[:, -1]),
         ):
             assert (
-                np.abs(found - part).max() <= 1e-10 * np.abs(expected).max() + 1e-300
+                np.abs(result - part).max() <= 1e-10 * np.abs(expected).max() + 1e-300
             ), name
-            assert np.abs(found - part).max() <= 1e-8 * np.abs(part).max(), name
+            assert np.abs(result - part).max() <= 1e-8 * np.abs(part).max(), name
     index = list(D.names).index("link_3.mass")
     assert (
         np.abs(D.dB[index] - D["link_3.mass"].dB).max()
@@ -158,8 +158,8 @@ def test_sampled_models_of_other_masses_and_their_poles():
 
     def poles_at(size):
         other = fflin.linearize(changed(robot, one.bodies, size)).discretize(0.2)
-        found = np.linalg.eigvals(other.A - other.B @ gain.K)
-        return found[np.abs(found[:, None] - poles).argmin(axis=0)]
+        result = np.linalg.eigvals(other.A - other.B @ gain.K)
+        return result[np.abs(result[:, None] - poles).argmin(axis=0)]
 
     sure = np.isfinite(moved[0])
     assert np.abs(poles).max() < 1.0 and sure.sum() > 10

@@ -23,7 +23,7 @@ def free_flying():
 NAMES = ("boom_mode_2", "left_mode_1", "tank_x")
 
 
-def test_frequencies_and_ratios_are_those_of_the_appendages():
+def test_frequencies_and_ratios_match_the_appendages():
     S = fflin.sensitivity(fflin.linearize(full()))
     assert S["left_mode_3.frequency"].value == pytest.approx(0.9, rel=1e-14)
     assert S["left_mode_3.damping"].value == pytest.approx(0.3, rel=1e-14)
@@ -37,15 +37,15 @@ def test_frequencies_and_ratios_are_those_of_the_appendages():
 
 @pytest.mark.parametrize("part", ["frequency", "damping"])
 @pytest.mark.parametrize("name", NAMES)
-def test_derivatives_are_those_of_relinearised_robots(name, part):
+def test_derivatives_match_relinearised_robots(name, part):
     robot = free_flying()
     q, v = displaced(robot)
     lin = fflin.linearize(robot, q=q, v=v)
     slope = fflin.sensitivity(lin)[f"{name}.{part}"]
     h = 1e-4
-    of = fflin.uncertain(robot, {f"{name}.{part}": (0.01, 1.0)})
+    uncertain = fflin.uncertain(robot, {f"{name}.{part}": (0.01, 1.0)})
     ends = [
-        fflin.linearize(of.at({f"{name}.{part}": slope.value + step}), q=q, v=v)
+        fflin.linearize(uncertain.at({f"{name}.{part}": slope.value + step}), q=q, v=v)
         for step in (-h, h)
     ]
     for given, key in ((slope.dA, "A"), (slope.df0, "f0")):
@@ -56,8 +56,10 @@ def test_derivatives_are_those_of_relinearised_robots(name, part):
 
 def test_a_changed_frequency_keeps_the_damping_ratio():
     robot = free_flying()
-    of = fflin.uncertain(robot, {"boom_mode_1.frequency": 0.2, "tank_x.damping": 0.5})
-    other = of.at({"boom_mode_1.frequency": 0.33, "tank_x.damping": 0.03})
+    uncertain = fflin.uncertain(
+        robot, {"boom_mode_1.frequency": 0.2, "tank_x.damping": 0.5}
+    )
+    other = uncertain.at({"boom_mode_1.frequency": 0.33, "tank_x.damping": 0.03})
     omega = 2.0 * math.pi * 0.33
     assert other.stiffness["boom_mode_1"] == pytest.approx(omega**2, rel=1e-14)
     tank = 2.0 * math.pi * 0.2
@@ -90,7 +92,7 @@ def test_a_body_made_anew_keeps_the_springs_that_were_set():
 
 def test_the_lft_is_exact_in_frequency_and_ratio():
     robot = free_flying()
-    of = fflin.uncertain(
+    uncertain = fflin.uncertain(
         robot,
         {
             "boom_mode_*.frequency": 0.2,
@@ -101,11 +103,11 @@ def test_the_lft_is_exact_in_frequency_and_ratio():
             "base.mass": 0.1,
         },
     )
-    form = of.lft()
+    form = uncertain.lft()
     assert form.repeats[0] == 2.0
-    for delta in of.draws(4, seed=5)[0]:
-        lin = fflin.linearize(of.at(of.values(delta)))
-        A, B, *_ = form.at(of.values(delta))
+    for delta in uncertain.draws(4, seed=5)[0]:
+        lin = fflin.linearize(uncertain.at(uncertain.values(delta)))
+        A, B, *_ = form.at(uncertain.values(delta))
         np.testing.assert_allclose(A, lin.A, atol=1e-11 * np.abs(lin.A).max())
         np.testing.assert_allclose(B, lin.B, atol=1e-11 * np.abs(lin.B).max())
 
@@ -163,15 +165,15 @@ def test_compiled_runs_have_their_frequencies_and_ratios():
 
 
 @pytest.mark.parametrize(
-    ("name", "said"),
+    ("name", "message"),
     [("wheel", "no frequency"), ("swing_x", "is 0"), ("joint_1", "no frequency")],
 )
-def test_frequencies_that_do_not_exist_are_not_dispersed(name, said):
+def test_frequencies_that_do_not_exist_are_not_dispersed(name, message):
     robot = full()
     policy = fflin.StateFeedback(
         fflin.linearize(robot), np.zeros((16, 2 * (6 + robot.n)))
     )
-    with pytest.raises((InputError, fflin.UnknownNameError), match=said):
+    with pytest.raises((InputError, fflin.UnknownNameError), match=message):
         fflin.monte_carlo(
             robot, policy, {f"{name}.frequency": 0.1}, runs=2, duration=1.0
         )
@@ -189,6 +191,6 @@ def test_a_changed_body_keeps_the_coordinates_of_its_modes():
     other = fflin.configuration(mounted, {"joint_2": 0.4})
     expected = fflin.linearize(mounted, other).A
     changed_at_rest = fflin.configuration(changed, {"joint_2": 0.4})
-    found = fflin.linearize(changed, changed_at_rest)
-    np.testing.assert_allclose(found.A, expected, atol=1e-11 * np.abs(expected).max())
+    result = fflin.linearize(changed, changed_at_rest)
+    np.testing.assert_allclose(result.A, expected, atol=1e-11 * np.abs(expected).max())
     assert fflin.check(changed, fflin.linearize(changed, q)).ok

@@ -24,10 +24,11 @@ def changed(robot, bodies, size):
     return replace(robot, model=model)
 
 
-def fourth_order(of, step):
-    return (8.0 * (of(step) - of(-step)) - (of(2.0 * step) - of(-2.0 * step))) / (
-        12.0 * step
-    )
+def fourth_order(source, step):
+    return (
+        8.0 * (source(step) - source(-step))
+        - (source(2.0 * step) - source(-2.0 * step))
+    ) / (12.0 * step)
 
 
 def everything(lin):
@@ -117,7 +118,7 @@ def test_in_motion_as_by_differences(name, frame, moving):
         one = S.parameters[name]
         joints = motions(robot.model, np.r_[[0.0] * 3, q[3:]])
         kept = {j: robot.model.inertias[j].toDynamicParameters() for j in joints}
-        none = {j: 0.0 * each for j, each in kept.items()}
+        none = {j: 0.0 * item for j, item in kept.items()}
         M_p = inertia(robot.model, joints, none | one.bodies)
         step = (
             2e-3
@@ -129,8 +130,8 @@ def test_in_motion_as_by_differences(name, frame, moving):
         )
 
         def at(size, one=one):
-            found = everything(of(changed(robot, one.bodies, size)))
-            return np.concatenate([part.ravel() for part in found])
+            result = everything(of(changed(robot, one.bodies, size)))
+            return np.concatenate([part.ravel() for part in result])
 
         expected = fourth_order(at, step)
         got = np.concatenate([part.ravel() for part in derived(S[name])])
@@ -189,10 +190,12 @@ def test_springs_dampers_thrusters_and_wheels():
         ),
     }
     rounding = 1e-14 * np.abs(S.lin.A).max()
-    for name, (of, step) in cases.items():
+    for name, (source, step) in cases.items():
         expected = [
             fourth_order(
-                lambda s, k=k, of=of: everything(fflin.linearize(of(s), q, v, u))[k],
+                lambda s, k=k, source=source: everything(
+                    fflin.linearize(source(s), q, v, u)
+                )[k],
                 step,
             )
             for k in (0, 1, 4)
@@ -219,7 +222,7 @@ def test_a_single_body_in_closed_form():
 
 
 @pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
-def test_links_that_are_fixed_to_each_other_have_parameters_of_their_own():
+def test_links_that_are_fixed_to_each_other_have_separate_parameters():
     robot = fflin.load("planar_detumble")
     S = fflin.sensitivity(fflin.linearize(robot))
     parts = S["link_3.density"].dB + S["hand.density"].dB + S["target.density"].dB
@@ -264,8 +267,8 @@ def test_poles_move_as_differences_say():
 
     def poles_at(size):
         other = fflin.linearize(changed(robot, bodies, size))
-        found = np.linalg.eigvals(other.A - other.B @ gain.K)
-        return found[np.abs(found[:, None] - poles).argmin(axis=0)]
+        result = np.linalg.eigvals(other.A - other.B @ gain.K)
+        return result[np.abs(result[:, None] - poles).argmin(axis=0)]
 
     expected = fourth_order(poles_at, step)
     sure = np.isfinite(slopes[at])
@@ -276,7 +279,7 @@ def test_poles_move_as_differences_say():
     )
 
 
-def test_its_own_check_finds_it_right_and_what_is_wrong_wrong():
+def test_correct_models_pass_check_and_wrong_models_fail():
     robot = fflin.load("ets_vii")
     q, v, _ = random_point(robot, np.random.default_rng(4), degrees=30.0, speed=0.2)
     S = fflin.sensitivity(fflin.linearize(robot, q, v))
@@ -287,7 +290,7 @@ def test_its_own_check_finds_it_right_and_what_is_wrong_wrong():
     assert min(S.check(names).values()) > 1e-6
 
 
-def test_what_is_wrong_is_one_line():
+def test_errors_are_one_line():
     robot = fflin.load("ets_vii")
     lin = fflin.linearize(robot)
     S = fflin.sensitivity(lin)
@@ -304,11 +307,11 @@ def test_what_is_wrong_is_one_line():
 
 @pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
 def test_its_check_takes_wheels_whose_bodies_have_no_mass():
-    robot = fflin.load("inspector.toml")
-    found = fflin.sensitivity(fflin.linearize(robot)).check(
+    robot = fflin.load("robots/inspector.toml")
+    result = fflin.sensitivity(fflin.linearize(robot)).check(
         ["wheel_x.inertia", "wheel_z.inertia"]
     )
-    assert len(found) == 2 and max(found.values()) < 1e-8
+    assert len(result) == 2 and max(result.values()) < 1e-8
 
 
 def test_a_body_whose_joint_has_a_dot_in_its_name_is_found_by_it():
@@ -335,29 +338,30 @@ def test_a_thruster_that_burns_on_a_link_and_a_spring_out_of_rest():
         return robot.replace(stiffness={"joint_3": 5.0 + step})
 
     S = fflin.sensitivity(fflin.linearize(robot, q, v, [3.0]))
-    for name, of in (("jet.position.x", moved), ("joint_3.stiffness", stiffer)):
+    for name, source in (("jet.position.x", moved), ("joint_3.stiffness", stiffer)):
         # In both all is linear.
         ends = [
-            everything(fflin.linearize(of(step), q, v, [3.0])) for step in (0.5, -0.5)
+            everything(fflin.linearize(source(step), q, v, [3.0]))
+            for step in (0.5, -0.5)
         ]
         for high, low, got in zip(*ends, derived(S[name]), strict=True):
             expected = high - low
             assert np.abs(got - expected).max() <= 1e-10 * np.abs(expected).max(), name
 
 
-def test_rotors_are_no_parameters_of_bodies():
+def test_rotors_are_not_parameters_of_bodies():
     model = fflin.load("ets_vii").model.copy()
     model.armature = np.r_[np.zeros(6), np.linspace(0.1, 2.0, model.nv - 6)]
     robot = fflin.from_model(model)
     q, v, u = random_point(robot, np.random.default_rng(2))
-    found = fflin.sensitivity(fflin.linearize(robot, q, v, u)).check(
+    result = fflin.sensitivity(fflin.linearize(robot, q, v, u)).check(
         ["base.mass", "joint_3.com.x"]
     )
-    assert max(found.values()) < 1e-8
+    assert max(result.values()) < 1e-8
 
 
 @pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
-def test_its_table_has_what_a_tenth_of_each_changes_and_the_most_first():
+def test_the_table_shows_the_effect_of_a_ten_percent_change_in_descending_order():
     S = fflin.sensitivity(fflin.linearize(fflin.load("servicer_7dof")))
     _, rows = S.table(len(S.names)).split("B [%]\n")
     rows = rows.splitlines()
@@ -378,7 +382,7 @@ def test_its_table_has_what_a_tenth_of_each_changes_and_the_most_first():
 
 
 @pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
-def test_its_table_ranks_links_or_what_is_asked_for():
+def test_the_table_ranks_links_or_the_requested_parameters():
     S = fflin.sensitivity(fflin.linearize(fflin.load("planar_detumble")))
 
     def shown(only=None):
@@ -433,10 +437,10 @@ def test_every_place_and_direction_of_a_thruster(axis, torque):
         drawn = fflin.uncertain(
             robot.replace(inputs=[jet]), {"jet.torque": 0.5}
         ).samples(3, seed=1)
-        assert all(0.15 < -each.inputs[0].torque < 0.45 for each in drawn)
+        assert all(0.15 < -item.inputs[0].torque < 0.45 for item in drawn)
 
 
-def test_in_orbit_masses_change_what_the_field_does():
+def test_in_orbit_masses_change_the_gravity_gradient():
     robot, rng = in_orbit(fflin.load("servicer_7dof")), np.random.default_rng(6)
     joints = {name: rng.uniform(-1.0, 1.0) for name in robot.joint_names}
     for speed, frame in ((0.0, "hill"), (0.4, "lvlh")):
@@ -445,7 +449,7 @@ def test_in_orbit_masses_change_what_the_field_does():
         v = speed * rng.normal(size=robot.nv)
         for reference in (None, base):
             lin = fflin.linearize(robot, q, v, frame=frame, reference=reference)
-            found = fflin.sensitivity(lin).check(
+            result = fflin.sensitivity(lin).check(
                 ["link_3.mass", "base.inertia.xy", "link_7.com.x"]
             )
-            assert max(found.values()) < 2e-9
+            assert max(result.values()) < 2e-9

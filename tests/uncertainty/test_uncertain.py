@@ -59,13 +59,13 @@ def test_the_fraction_is_the_model_linearised_again(name):
     robot = fflin.load(name)
     if name == "servicer_7dof":
         robot = robot.replace(stiffness={"panel_right": 50.0})
-    of = fflin.uncertain(robot, CASES[name])
+    uncertain = fflin.uncertain(robot, CASES[name])
     q = posed(robot)
-    lft = of.lft(q)
-    draws, _ = of.draws(6, seed=1)
-    for delta, made in zip(draws, of.samples(6, seed=1), strict=True):
+    lft = uncertain.lft(q)
+    draws, _ = uncertain.draws(6, seed=1)
+    for delta, made in zip(draws, uncertain.samples(6, seed=1), strict=True):
         lin = fflin.linearize(made, q)
-        A, B, C, D = lft.at(of.values(delta))
+        A, B, C, D = lft.at(uncertain.values(delta))
         assert np.abs(A - lin.A).max() < 1e-11 * np.abs(lin.A).max()
         assert np.abs(B - lin.B).max() < 1e-11 * np.abs(lin.B).max()
         assert (C == lin.C).all() and (D == lin.D).all()
@@ -77,7 +77,7 @@ def test_the_fraction_is_the_model_linearised_again(name):
 
 
 @pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
-def test_no_block_is_larger_than_the_rank_of_what_it_changes():
+def test_no_block_is_larger_than_the_rank_of_its_effect():
     robot = fflin.load("planar_detumble")
     q = posed(robot)
     S = fflin.sensitivity(fflin.linearize(robot, q))
@@ -91,21 +91,23 @@ def test_no_block_is_larger_than_the_rank_of_what_it_changes():
         assert lft.repeats == [np.sum(sizes > 1e-9 * sizes[0])]
     # M is quadratic in a centre of mass: the order of the least realisation of d M1 + d^2 M2 is
     # the rank of [[M1, M2], [M2, 0]].
-    of = fflin.uncertain(robot, {"link_2.com.x": (-0.1, 0.1)})
+    uncertain = fflin.uncertain(robot, {"link_2.com.x": (-0.1, 0.1)})
     value = S.parameters["link_2.com.x"].value
     more, less, now = (
-        np.linalg.inv(fflin.linearize(of.at({"link_2.com.x": value + d}), q).B[-9:])
+        np.linalg.inv(
+            fflin.linearize(uncertain.at({"link_2.com.x": value + d}), q).B[-9:]
+        )
         for d in (0.1, -0.1, 0.0)
     )
     M1, M2 = 0.5 * (more - less), 0.5 * (more + less) - now
     sizes = np.linalg.svd(np.block([[M1, M2], [M2, 0.0 * M2]]), compute_uv=False)
-    assert of.lft(q).repeats == [np.sum(sizes > 1e-9 * sizes[0])]
+    assert uncertain.lft(q).repeats == [np.sum(sizes > 1e-9 * sizes[0])]
 
 
 def test_it_is_printed_saved_and_handed_on(tmp_path):
     robot = fflin.load("cubesat")
-    of = fflin.uncertain(robot, CASES["cubesat"])
-    lft = of.lft()
+    uncertain = fflin.uncertain(robot, CASES["cubesat"])
+    lft = uncertain.lft()
     assert all(len(line) <= 80 for line in str(lft).splitlines())
     assert "Delta is 14 x 14" in str(lft)
     for ending in ("npz", "mat", "json"):
@@ -128,31 +130,31 @@ def test_it_is_printed_saved_and_handed_on(tmp_path):
 
 def test_samples_are_rigid_bodies_and_corners_that_are_none_are_counted():
     robot = fflin.load("servicer_7dof")
-    of = fflin.uncertain(robot, {"link_3.inertia.xx": 0.3, "link_3.mass": 0.3})
-    draws, lost = of.draws(30, seed=2)
-    assert lost > 0 and (of.draws(30, seed=2)[0] == draws).all()
-    for made in of.samples(5, seed=2):
+    uncertain = fflin.uncertain(robot, {"link_3.inertia.xx": 0.3, "link_3.mass": 0.3})
+    draws, lost = uncertain.draws(30, seed=2)
+    assert lost > 0 and (uncertain.draws(30, seed=2)[0] == draws).all()
+    for made in uncertain.samples(5, seed=2):
         body = made.model.inertias[made.model.getJointId("joint_3")]
         second = 0.5 * np.trace(body.inertia) * np.eye(3) - body.inertia
         assert np.linalg.eigvalsh(second)[0] > -1e-9
     # Corners by the triangle inequality of the moments; mass alone makes none impossible.
     body = robot.model.inertias[robot.model.getJointId("joint_3")]
     moments = np.linalg.eigvalsh(body.inertia)
-    xx = of.ranges[0].parameter.value
+    xx = uncertain.ranges[0].parameter.value
     others = np.delete(moments, np.abs(moments - xx).argmin())
     bad = 2 * sum(
         2.0 * max(m) > sum(m) for m in ([*others, 0.7 * xx], [*others, 1.3 * xx])
     )
-    worst = of.worst(fflin.lqr(fflin.linearize(robot)), samples=20)
+    worst = uncertain.worst(fflin.lqr(fflin.linearize(robot)), samples=20)
     assert bad and worst.tried == 20 + 4 - bad + 1
-    assert worst.excluded == of.draws(20)[1] + bad
+    assert worst.excluded == uncertain.draws(20)[1] + bad
     assert says(str(worst), f"{worst.excluded} samples and corners")
 
 
 @pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
-def test_what_is_wrong_is_one_line():
+def test_errors_are_one_line():
     robot = fflin.load("servicer_7dof")
-    of = fflin.uncertain(robot, {"base.mass": 0.2})
+    uncertain = fflin.uncertain(robot, {"base.mass": 0.2})
     cases = [
         (lambda: fflin.uncertain(robot, {}), "ranges"),
         (lambda: fflin.uncertain(robot, {"link_99.mass": 0.1}), "link_99"),
@@ -160,15 +162,15 @@ def test_what_is_wrong_is_one_line():
         (lambda: fflin.uncertain(robot, {"link_1.com.y": 0.1}), "(least, largest)"),
         (lambda: fflin.uncertain(robot, {"base.mass": (-3.0, 2.0)}), "base.mass"),
         (lambda: fflin.uncertain(robot, {"base.inertia.xx": (1e-3, 2e-3)}), "robot"),
-        (lambda: of.at({"base.mass": -1.0}), "'base'"),
-        (lambda: of.worst(np.zeros((2, 2))), "(2, 2)"),
-        (lambda: of.worst(np.zeros((15, 30))), "unstable"),
-        (lambda: of.lft().at([0.0, 0.0]), "deltas"),
+        (lambda: uncertain.at({"base.mass": -1.0}), "'base'"),
+        (lambda: uncertain.worst(np.zeros((2, 2))), "(2, 2)"),
+        (lambda: uncertain.worst(np.zeros((15, 30))), "unstable"),
+        (lambda: uncertain.lft().at([0.0, 0.0]), "deltas"),
     ]
-    for call, said in cases:
+    for call, message in cases:
         with pytest.raises(fflin.FflinError) as error:
             call()
-        assert said in str(error.value) and "\n" not in str(error.value)
+        assert message in str(error.value) and "\n" not in str(error.value)
     sprung = robot.replace(stiffness={"panel_left": 80.0}, gravity=(0.0, 0.0, -9.8))
     with pytest.raises(fflin.InputError, match="gravity"):
         fflin.uncertain(sprung, {"base.mass": 0.1}).lft()
@@ -195,65 +197,77 @@ def test_a_range_that_no_robot_has_is_refused():
     ):
         with pytest.raises(fflin.InputError) as error:
             fflin.uncertain(robot, {name: value})
-        said = str(error.value)
+        message = str(error.value)
         least = "0 or more" if "hinge" in name else "above 0"
-        assert f"'{name}' is {ends}" in said and f"{least};" in said
-        assert "0.2 for 20 %" in said and "LEAST:LARGEST" in said and "\n" not in said
+        assert f"'{name}' is {ends}" in message and f"{least};" in message
+        assert (
+            "0.2 for 20 %" in message
+            and "LEAST:LARGEST" in message
+            and "\n" not in message
+        )
     for name in ("stiffness", "damping"):
         fflin.uncertain(robot, {f"hinge_left_1.{name}": (0.0, 1.0)})
-    of = fflin.uncertain(robot, {"base.inertia.xx": 0.9, "base.com.x": (-1.0, 1.0)})
-    assert len(of.samples(3)) == 3 and of.draws(30)[1] > 0
+    uncertain = fflin.uncertain(
+        robot, {"base.inertia.xx": 0.9, "base.com.x": (-1.0, 1.0)}
+    )
+    assert len(uncertain.samples(3)) == 3 and uncertain.draws(30)[1] > 0
 
 
-def test_a_wheel_with_friction_is_no_thruster():
+def test_a_wheel_with_friction_is_not_a_thruster():
     wheel = fflin.ReactionWheel((0.0, 0.0, 1.0), inertia=1e-3, name="w")
     robot = fflin.load("servicer_7dof", inputs=[wheel])
-    of = fflin.uncertain(robot, {"w.damping": (0.1, 0.3)})
-    for delta, made in zip(of.draws(3)[0], of.samples(3), strict=True):
-        lin, values = fflin.linearize(made), of.values(delta)
+    uncertain = fflin.uncertain(robot, {"w.damping": (0.1, 0.3)})
+    for delta, made in zip(uncertain.draws(3)[0], uncertain.samples(3), strict=True):
+        lin, values = fflin.linearize(made), uncertain.values(delta)
         assert made.damping["w"] == values["w.damping"]
         assert (
-            np.abs(of.lft().at(values)[0] - lin.A).max() < 1e-11 * np.abs(lin.A).max()
+            np.abs(uncertain.lft().at(values)[0] - lin.A).max()
+            < 1e-11 * np.abs(lin.A).max()
         )
 
 
 def test_rotors_count_in_the_fraction():
     model = fflin.load("ets_vii").model.copy()
     model.armature = np.linspace(0.1, 2.0, model.nv)
-    of = fflin.uncertain(
+    uncertain = fflin.uncertain(
         fflin.from_model(model), {"base.mass": 0.3, "joint_2.density": 0.3}
     )
     delta = np.array([0.6, -0.8])
-    lin, (A, B, *_) = fflin.linearize(of.at(of.values(delta))), of.lft().at(delta)
+    lin, (A, B, *_) = (
+        fflin.linearize(uncertain.at(uncertain.values(delta))),
+        uncertain.lft().at(delta),
+    )
     assert (
         np.abs(A - lin.A).max() <= 1e-11
         and np.abs(B - lin.B).max() < 1e-11 * np.abs(B).max()
     )
 
 
-def test_a_wheel_too_large_for_its_carrier_is_no_robot():
+def test_a_wheel_too_large_for_its_carrier_is_not_a_robot():
     wheel = fflin.ReactionWheel((0.0, 0.0, 1.0), inertia=1e-3)
     robot = fflin.load("cubesat", inputs=[wheel])
     largest = robot._bare.model.inertias[1].inertia[2, 2]
-    of = fflin.uncertain(robot, {"wheel_1.inertia": (1e-4, 1.5 * largest)})
-    assert not of.refusal(np.array([-0.9])) and of.refusal(np.array([0.9]))
+    uncertain = fflin.uncertain(robot, {"wheel_1.inertia": (1e-4, 1.5 * largest)})
+    assert not uncertain.refusal(np.array([-0.9])) and uncertain.refusal(
+        np.array([0.9])
+    )
     with pytest.raises(fflin.InputError, match=r"density .*'base'"):
-        of.at({"base.density": -1.0})
+        uncertain.at({"base.density": -1.0})
 
 
 def test_a_range_that_leaves_hardly_any_robot_is_one_line():
     rod = {"inertia": np.diag([1.0, 1.0, 1e-9])}
     robot = fflin.load("cubesat").with_mass_properties({"base": rod})
-    of = fflin.uncertain(robot, {"base.inertia.xx": 0.5, "base.inertia.yy": 0.5})
+    uncertain = fflin.uncertain(robot, {"base.inertia.xx": 0.5, "base.inertia.yy": 0.5})
     for call in (
-        lambda: of.samples(1),
-        lambda: of.worst(fflin.lqr(fflin.linearize(robot))),
+        lambda: uncertain.samples(1),
+        lambda: uncertain.worst(fflin.lqr(fflin.linearize(robot))),
     ):
         with pytest.raises(fflin.InputError, match="physical"):
             call()
 
 
-def test_stored_momentum_is_no_fixed_point():
+def test_stored_momentum_is_not_a_fixed_point():
     wheel = fflin.ReactionWheel((0.0, 0.0, 1.0), momentum=2.0)
     robot = fflin.load("cubesat", inputs=[wheel])
     with pytest.raises(fflin.InputError, match="momentum"):
@@ -261,7 +275,7 @@ def test_stored_momentum_is_no_fixed_point():
 
 
 @pytest.mark.parametrize("output", [fflin.CenterOfMass(), fflin.Momentum()])
-def test_an_output_that_weighs_the_robot_is_no_fraction(output):
+def test_an_output_that_weighs_the_robot_is_not_a_fraction(output):
     robot = fflin.load("cubesat", outputs=[output])
     with pytest.raises(fflin.InputError, match="masses"):
         fflin.uncertain(robot, {"base.mass": 0.1}).lft()
@@ -282,15 +296,15 @@ def test_a_point_mass_that_moves_is_a_body(tmp_path):
     (tmp_path / "tank.urdf").write_text(SLOSH)
     robot = fflin.load(tmp_path / "tank.urdf", stiffness={"slosh": 4.0})
     parts = {"mass": 0.3, "density": 0.2, "com.z": (0.0, 0.2)}
-    of = fflin.uncertain(robot, {"fuel": parts, "slosh.stiffness": 0.2})
-    draws, lost = of.draws(5, seed=1)
+    uncertain = fflin.uncertain(robot, {"fuel": parts, "slosh.stiffness": 0.2})
+    draws, lost = uncertain.draws(5, seed=1)
     assert not lost
-    for delta, made in zip(draws, of.samples(5, seed=1), strict=True):
-        lin, (A, B, *_) = fflin.linearize(made), of.lft().at(delta)
+    for delta, made in zip(draws, uncertain.samples(5, seed=1), strict=True):
+        lin, (A, B, *_) = fflin.linearize(made), uncertain.lft().at(delta)
         assert np.abs(A - lin.A).max() < 1e-12 and np.abs(B - lin.B).max() < 1e-12
     # Its mass may not be none, and an inertia about one axis alone is no body's.
     with pytest.raises(fflin.InputError, match="mass of 'fuel'"):
-        of.at({"fuel.mass": 0.0})
+        uncertain.at({"fuel.mass": 0.0})
     with pytest.raises(fflin.InputError, match="realisable"):
         fflin.uncertain(robot, {"fuel.inertia.xx": (1e-3, 2e-3)})
 
@@ -301,15 +315,17 @@ PANELS = {"panel_left": 60.0, "panel_right": 80.0}
 def test_tied_parameters_have_one_delta():
     robot = fflin.load("servicer_7dof", stiffness=PANELS)
     tied = {"panel_*.stiffness": {"range": 0.2, "tied": True}, "base.mass": 0.1}
-    of = fflin.uncertain(robot, tied)
+    uncertain = fflin.uncertain(robot, tied)
     lft, apart = (
-        of.lft(),
+        uncertain.lft(),
         fflin.uncertain(robot, {"panel_*.stiffness": 0.2, "base.mass": 0.1}),
     )
-    assert of.names == lft.parameters == ("base.mass", "panel_*.stiffness")
+    assert uncertain.names == lft.parameters == ("base.mass", "panel_*.stiffness")
     assert lft.repeats.tolist() == [3.0, 2.0] and len(apart.names) == 3
     assert lft.units == ("kg", "1") and (lft.middle[1], lft.half[1]) == (1.0, 0.2)
-    for delta, made in zip(of.draws(5, seed=3)[0], of.samples(5, seed=3), strict=True):
+    for delta, made in zip(
+        uncertain.draws(5, seed=3)[0], uncertain.samples(5, seed=3), strict=True
+    ):
         factor = 1.0 + 0.2 * delta[1]
         assert made.stiffness == pytest.approx(
             {name: factor * k for name, k in PANELS.items()}
@@ -318,46 +334,49 @@ def test_tied_parameters_have_one_delta():
         # By deltas, by the names of the set, and by the same delta for each of them.
         for A, B, *_ in (
             lft.at(delta),
-            lft.at(of.values(delta)),
+            lft.at(uncertain.values(delta)),
             apart.lft().at(delta[[1, 1, 0]]),
         ):
             assert np.abs(A - lin.A).max() < 1e-11 * np.abs(lin.A).max()
             assert np.abs(B - lin.B).max() < 1e-11 * np.abs(lin.B).max()
-    assert of.at({"panel_left.stiffness": 5.0}).stiffness["panel_left"] == 5.0
+    assert uncertain.at({"panel_left.stiffness": 5.0}).stiffness["panel_left"] == 5.0
 
 
 def test_tied_parameters_share_a_value_between_ends_and_the_worst_names_it():
     robot = fflin.load("servicer_7dof", stiffness=PANELS)
-    of = fflin.uncertain(
+    uncertain = fflin.uncertain(
         robot, {"panel_*.stiffness": {"range": (50.0, 90.0), "tied": True}}
     )
-    assert of.lft().units == ("N m/rad",)
-    for made in of.samples(3):
+    assert uncertain.lft().units == ("N m/rad",)
+    for made in uncertain.samples(3):
         left, right = made.stiffness.values()
         assert left == right and 50.0 <= left <= 90.0
-    worst = of.worst(fflin.lqr(fflin.linearize(robot)), samples=3)
+    worst = uncertain.worst(fflin.lqr(fflin.linearize(robot)), samples=3)
     assert (
         list(worst.gain.parameters) == ["panel_*.stiffness"]
         and worst.tried == 3 + 2 + 1
     )
 
 
-def test_a_tied_share_takes_what_is_below_zero_further_from_it():
+def test_a_tied_fraction_moves_negative_values_away_from_zero():
     robot = fflin.load("cubesat")
     robot = robot.with_mass_properties({"base": {"com": [0.01, -0.02, 0.03]}})
-    of = fflin.uncertain(robot, {"base.com.*": {"range": 0.5, "tied": True}})
-    more = of.at({"base.com.*": 1.5})._bare.model.inertias[1].lever
-    assert more == pytest.approx([0.015, -0.03, 0.045]) and not of.refusal(
+    uncertain = fflin.uncertain(robot, {"base.com.*": {"range": 0.5, "tied": True}})
+    more = uncertain.at({"base.com.*": 1.5})._bare.model.inertias[1].lever
+    assert more == pytest.approx([0.015, -0.03, 0.045]) and not uncertain.refusal(
         np.array([1.0])
     )
-    lin, (_, B, *_) = fflin.linearize(of.at({"base.com.*": 1.5})), of.lft().at([1.0])
+    lin, (_, B, *_) = (
+        fflin.linearize(uncertain.at({"base.com.*": 1.5})),
+        uncertain.lft().at([1.0]),
+    )
     assert np.abs(B - lin.B).max() < 1e-11 * np.abs(B).max()
 
 
 def test_a_tie_that_is_unclear_is_refused():
     robot = fflin.load("servicer_7dof", stiffness=PANELS)
     pattern = "panel_*.stiffness"
-    for given, said in (
+    for given, message in (
         ({pattern: {"range": 0.2}}, "tied"),
         ({pattern: {"range": 0.2, "tied": "yes"}}, "tied"),
         (
@@ -366,7 +385,7 @@ def test_a_tie_that_is_unclear_is_refused():
         ),
         ({"link_3.*": {"range": (1.0, 2.0), "tied": True}}, "units"),
     ):
-        with pytest.raises(fflin.InputError, match=said):
+        with pytest.raises(fflin.InputError, match=message):
             fflin.uncertain(robot, given)
     loose = fflin.uncertain(robot, {pattern: {"range": 0.2, "tied": False}})
     assert len(loose.names) == 2

@@ -21,9 +21,9 @@ FOUR = {
 def servicer():
     """A robot, its gain, four parameters, and their loops."""
     robot = fflin.load("servicer_7dof")
-    of = fflin.uncertain(robot, FOUR)
+    uncertain = fflin.uncertain(robot, FOUR)
     gain = fflin.lqr(fflin.linearize(robot.replace(stiffness={"panel_left": 100.0})))
-    return of, gain, Loops(of.lft(), gain.K)
+    return uncertain, gain, Loops(uncertain.lft(), gain.K)
 
 
 def disk_of(gain):
@@ -38,17 +38,18 @@ def whole_of(loops):
 
 @pytest.mark.parametrize("drawn", [80, pytest.param(400, marks=pytest.mark.exhaustive)])
 @pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
-def test_nothing_that_is_drawn_is_worse_than_what_is_found(servicer, drawn):
-    of, gain, loops = servicer
-    found = of.worst(gain, samples=30)
-    draws, frequencies = of.draws(drawn, seed=9)[0], np.geomspace(0.02, 3.0, 20)
-    assert found.damping.value <= -loops.undamped(draws).max()
-    assert found.gain.value >= loops.gains(whole_of(loops), draws, frequencies).max()
+def test_no_draw_is_worse_than_the_result(servicer, drawn):
+    uncertain, gain, loops = servicer
+    result = uncertain.worst(gain, samples=30)
+    draws, frequencies = uncertain.draws(drawn, seed=9)[0], np.geomspace(0.02, 3.0, 20)
+    assert result.damping.value <= -loops.undamped(draws).max()
+    assert result.gain.value >= loops.gains(whole_of(loops), draws, frequencies).max()
     assert (
-        found.margin.value <= 1.0 / loops.gains(disk_of(gain), draws, frequencies).max()
+        result.margin.value
+        <= 1.0 / loops.gains(disk_of(gain), draws, frequencies).max()
     )
     # What is said is of the robot that is said.
-    robot = of.at(found.margin.parameters)
+    robot = uncertain.at(result.margin.parameters)
     lin = fflin.linearize(robot)
     F, scale = lin.A - lin.B @ gain.K, disk_of(gain).scale
     peaks = [
@@ -60,7 +61,7 @@ def test_nothing_that_is_drawn_is_worse_than_what_is_found(servicer, drawn):
         )
         for w in np.geomspace(0.01, 10.0, 800)
     ]
-    assert found.margin.value == pytest.approx(1.0 / max(peaks), rel=1e-3)
+    assert result.margin.value == pytest.approx(1.0 / max(peaks), rel=1e-3)
 
 
 @pytest.mark.exhaustive
@@ -69,16 +70,18 @@ def test_of_many_signals_the_bound_asks_no_more_of_slycot_than_it_can(
     monkeypatch, servicer
 ):
     slycot = pytest.importorskip("slycot")
-    asked, own = [], slycot.ab13md
-    monkeypatch.setattr(slycot, "ab13md", lambda *a: asked.append(len(a[0])) or own(*a))
-    of, gain, _ = servicer
-    four = of.worst(gain, samples=2)
+    asked, ab13md = [], slycot.ab13md
+    monkeypatch.setattr(
+        slycot, "ab13md", lambda *a: asked.append(len(a[0])) or ab13md(*a)
+    )
+    uncertain, gain, _ = servicer
+    four = uncertain.worst(gain, samples=2)
     assert 0 < len(asked) < 60 and set(asked) == {14}
     asked.clear()
     many = {
         f"link_{i}.{part}": 0.2 for i in range(1, 8) for part in ("mass", "density")
     }
-    lft = fflin.uncertain(of.robot, many).lft()
+    lft = fflin.uncertain(uncertain.robot, many).lft()
     bound = 1.0 / worst._safe(Loops(lft, gain.K))
     assert not asked and len(lft.D11) == 63
     assert 0.2 <= bound < 0.4 and four.safe > 1.0
@@ -96,15 +99,15 @@ SETS = {
 
 def peak(F, B, C, D):
     """Return a gain that is reached, from a grid of frequencies and finer ones about its best."""
-    found, w = (
+    result, w = (
         0.0,
         np.concatenate(((0.0,), np.abs(np.linalg.eigvals(F)), np.geomspace(1e-4, 1e3))),
     )
     for width in (0.1, 0.01, 1e-3):
         sizes = response_size(w, F, B, C, D)
-        found = max(found, sizes.max())
+        result = max(result, sizes.max())
         w = w[sizes.argmax()] * (1.0 + np.linspace(-width, width, 41))
-    return found
+    return result
 
 
 def response_size(w, F, B, C, D):
@@ -119,37 +122,35 @@ def springy(request):
     robot = fflin.load(request.param)
     if "joint_3" in robot.joint_names:
         robot = robot.replace(stiffness={"joint_3": 50.0}, damping={"joint_3": 0.1})
-    of, gain = (
+    uncertain, gain = (
         fflin.uncertain(robot, SETS[request.param]),
         fflin.lqr(fflin.linearize(robot)),
     )
     scale = np.sqrt(gain.R.diagonal())
     corners = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
-    rows, figures = np.vstack((corners, of.draws(40, seed=0)[0])), []
+    rows, figures = np.vstack((corners, uncertain.draws(40, seed=0)[0])), []
     for delta in rows:
-        lin = fflin.linearize(of.at(of.values(delta)))
+        lin = fflin.linearize(uncertain.at(uncertain.values(delta)))
         F, poles = lin.A - lin.B @ gain.K, np.linalg.eigvals(lin.A - lin.B @ gain.K)
         disk = peak(
             F, lin.B / scale, -scale[:, None] * gain.K, 0.5 * np.eye(len(scale))
         )
         damping = (-poles.real / np.abs(poles)).min()
         figures.append((damping, 1.0 / disk, -peak(F, lin.B, lin.C, lin.D)))
-    return of, gain, np.array(figures)
+    return uncertain, gain, np.array(figures)
 
 
 @pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
-def test_no_corner_and_no_draw_built_again_is_worse_than_what_is_found(
-    monkeypatch, springy
-):
+def test_no_rebuilt_corner_or_draw_is_worse_than_the_result(monkeypatch, springy):
     monkeypatch.setattr(worst, "_safe", lambda loops: np.inf)
-    of, gain, figures = springy
-    least = of.worst(gain, samples=40)
-    found = np.array((least.damping.value, least.margin.value, -least.gain.value))
+    uncertain, gain, figures = springy
+    least = uncertain.worst(gain, samples=40)
+    result = np.array((least.damping.value, least.margin.value, -least.gain.value))
     assert least.tried == len(figures) + 1
     # The gains are to five digits; the damping is by eigenvalues alone.
-    assert (found <= figures.min(axis=0) + 2e-5 * np.abs(found)).all()
+    assert (result <= figures.min(axis=0) + 2e-5 * np.abs(result)).all()
     # The figures are those of the robots that are named.
-    lin = fflin.linearize(of.at(least.gain.parameters))
+    lin = fflin.linearize(uncertain.at(least.gain.parameters))
     named = peak(lin.A - lin.B @ gain.K, lin.B, lin.C, lin.D)
     assert least.gain.value == pytest.approx(named, rel=1e-4)
 
@@ -157,25 +158,25 @@ def test_no_corner_and_no_draw_built_again_is_worse_than_what_is_found(
 @pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
 def test_more_samples_never_find_less(monkeypatch, springy):
     monkeypatch.setattr(worst, "_safe", lambda loops: np.inf)
-    of, gain, _ = springy
-    assert (of.draws(40, seed=3)[0][:7] == of.draws(7, seed=3)[0]).all()
-    found = [of.worst(gain, samples=n, seed=3) for n in (1, 5, 40)]
-    for fewer, more in itertools.pairwise(found):
+    uncertain, gain, _ = springy
+    assert (uncertain.draws(40, seed=3)[0][:7] == uncertain.draws(7, seed=3)[0]).all()
+    result = [uncertain.worst(gain, samples=n, seed=3) for n in (1, 5, 40)]
+    for fewer, more in itertools.pairwise(result):
         assert more.damping.value <= fewer.damping.value
         assert more.margin.value <= fewer.margin.value
         assert more.gain.value >= fewer.gain.value
 
 
-def test_what_exceeds_a_bound_is_told_from_what_does_not(servicer):
-    of, _, loops = servicer
-    figures, draws = loops.figures(whole_of(loops)), of.draws(12, seed=4)[0]
+def test_violations_are_distinguished_from_values_within_a_bound(servicer):
+    uncertain, _, loops = servicer
+    figures, draws = loops.figures(whole_of(loops)), uncertain.draws(12, seed=4)[0]
     exact = np.array([figures.exact(row[None])[0] for row in draws])
     for bound in exact:
         clear = np.abs(exact / bound - 1.0) > 1e-4
         assert (figures.above(draws, bound) == (exact > bound))[clear].all()
 
 
-def test_the_bound_by_scaling_is_that_of_textbooks():
+def test_the_bound_by_scaling_matches_textbooks():
     # Packard and Doyle, Automatica 29(1), 1993: of diagonal blocks the bound by D Z D^-1.
     def scaled(Z):
         d = worst.perron(Z)
@@ -192,7 +193,7 @@ def test_the_bound_by_scaling_is_that_of_textbooks():
     assert scaled(np.zeros((2, 2)))[1] == 0.0
 
 
-def test_slycot_gives_the_structured_singular_value_of_its_own_example():
+def test_slycot_gives_the_structured_singular_value_of_its_example():
     slycot = pytest.importorskip("slycot")
     rows = (
         (-1 + 6j, 2 - 3j, 3 + 8j, 3 + 8j, -5 - 9j, -6 + 2j),
@@ -206,8 +207,8 @@ def test_slycot_gives_the_structured_singular_value_of_its_own_example():
     # Real numbers and full blocks, as `worst` asks it: what it returns makes its bound.
     blocks = np.array(blocks)
     bound = slycot.ab13md(Z, blocks, np.where(blocks == 1, 1, 2))[0]
-    by = worst._scalings(Z, blocks)[-1]
-    assert worst.bound_of(Z[None], by) == pytest.approx(bound, rel=1e-6)
+    scalings = worst._scalings(Z, blocks)[-1]
+    assert worst.bound_of(Z[None], scalings) == pytest.approx(bound, rel=1e-6)
     assert bound <= 41.74753408 * (1.0 + 1e-6)
 
 
@@ -216,11 +217,11 @@ def test_the_worst_loop_of_one_parameter_is_at_its_end():
     robot = fflin.load("cubesat")
     lin = fflin.linearize(robot)
     gain = fflin.lqr(lin)
-    of = fflin.uncertain(robot, {"base.density": (0.5, 2.0)})
-    worst = of.worst(gain, samples=40)
+    uncertain = fflin.uncertain(robot, {"base.density": (0.5, 2.0)})
+    worst = uncertain.worst(gain, samples=40)
     damping, gains = [], []
     for density in np.linspace(0.5, 2.0, 61):
-        other = fflin.linearize(of.at({"base.density": density}))
+        other = fflin.linearize(uncertain.at({"base.density": density}))
         F = other.A - other.B @ gain.K
         poles = np.linalg.eigvals(F)
         damping.append((-poles.real / np.abs(poles)).min())
@@ -234,7 +235,7 @@ def test_the_worst_loop_of_one_parameter_is_at_its_end():
     assert worst.unstable == 0
 
 
-def test_the_bound_is_that_of_the_structured_singular_value():
+def test_the_bound_matches_the_structured_singular_value():
     ab13md = pytest.importorskip("slycot").ab13md
     # A real number that multiplies one signal: only at frequencies without end, where M is
     # singular for an inertia of 0, is the loop at its limit.
@@ -249,14 +250,14 @@ def test_the_bound_is_that_of_the_structured_singular_value():
     assert ab13md(Z, [1, 1], [2, 2])[0] == pytest.approx(2.0, rel=1e-6)
 
 
-def test_what_is_safe_is_stable_and_no_more_is_promised():
+def test_loops_within_the_stability_bound_are_stable():
     pytest.importorskip("slycot")
     robot = fflin.load("ets_vii")
     gain = fflin.lqr(fflin.linearize(robot))
-    of = fflin.uncertain(
+    uncertain = fflin.uncertain(
         robot, {"base.mass": 0.5, "link_6.mass": 0.5, "link_6.com.z": (-0.3, 0.3)}
     )
-    worst, lft = of.worst(gain, samples=10), of.lft()
+    worst, lft = uncertain.worst(gain, samples=10), uncertain.lft()
     rng = np.random.default_rng(5)
     for delta in min(worst.safe, 1.0) * rng.uniform(-1.0, 1.0, (200, 3)):
         A, B, *_ = lft.at(delta)
@@ -282,8 +283,10 @@ def test_of_many_parameters_some_corners_are_tried(monkeypatch):
     monkeypatch.setattr(worst, "_CORNERS", 4)
     robot = fflin.load("cubesat")
     parts = ["mass", "inertia.xx", "inertia.yy"]
-    of = fflin.uncertain(robot, {f"base.{part}": 0.01 for part in parts})
-    assert of.worst(fflin.lqr(fflin.linearize(robot)), samples=2).tried == 2 + 4 + 1
+    uncertain = fflin.uncertain(robot, {f"base.{part}": 0.01 for part in parts})
+    assert (
+        uncertain.worst(fflin.lqr(fflin.linearize(robot)), samples=2).tried == 2 + 4 + 1
+    )
 
 
 def wheeled(others=(), **fields):
@@ -314,7 +317,7 @@ WHEELED = {
         pytest.param("position regulated", marks=pytest.mark.exhaustive),
     ],
 )
-def test_stability_is_that_of_the_regulated_states(layout):
+def test_stability_matches_the_regulated_states(layout):
     """Worst figures compared with loops of robots built again, over their regulated states."""
     robot = WHEELED[layout]()
     ranges = {
@@ -323,15 +326,15 @@ def test_stability_is_that_of_the_regulated_states(layout):
         "wheel_3.inertia": 0.5,
     }
     gain = fflin.lqr(fflin.linearize(robot))
-    of = fflin.uncertain(robot, ranges)
-    found = of.worst(gain, samples=5)
+    uncertain = fflin.uncertain(robot, ranges)
+    result = uncertain.worst(gain, samples=5)
     kept = [gain.state_names.index(name) for name in gain.regulated]
     assert len(kept) < len(gain.state_names)
     K, scale = gain.K[:, kept], np.sqrt(gain.R.diagonal())
     frequencies = np.geomspace(1e-3, 10.0, 60)
     damping, margins, gains = [], [], []
-    for delta in of.draws(25, seed=7)[0]:
-        lin = fflin.linearize(of.at(of.values(delta)))
+    for delta in uncertain.draws(25, seed=7)[0]:
+        lin = fflin.linearize(uncertain.at(uncertain.values(delta)))
         A, B = lin.A[np.ix_(kept, kept)], lin.B[kept]
         F = A - B @ K
         poles = np.linalg.eigvals(F)
@@ -341,15 +344,15 @@ def test_stability_is_that_of_the_regulated_states(layout):
             gains.append(np.linalg.norm(x, 2))
             loop = 0.5 * np.eye(len(K)) - scale[:, None] * K @ x / scale
             margins.append(1.0 / np.linalg.norm(loop, 2))
-    assert found.unstable == 0 and found.safe > 0.0
-    assert 0.0 < found.damping.value <= min(damping) * (1.0 + 1e-9)
-    assert found.margin.value <= min(*margins, 2.0) * (1.0 + 1e-9)
-    assert found.gain.value >= max(gains) * (1.0 - 1e-9)
+    assert result.unstable == 0 and result.safe > 0.0
+    assert 0.0 < result.damping.value <= min(damping) * (1.0 + 1e-9)
+    assert result.margin.value <= min(*margins, 2.0) * (1.0 + 1e-9)
+    assert result.gain.value >= max(gains) * (1.0 - 1e-9)
     # The figures are of the robots at the parameters that the result names.
-    lin = fflin.linearize(of.at(found.damping.parameters))
+    lin = fflin.linearize(uncertain.at(result.damping.parameters))
     poles = np.linalg.eigvals(lin.A[np.ix_(kept, kept)] - lin.B[kept] @ K)
     assert (-poles.real / np.abs(poles)).min() == pytest.approx(
-        found.damping.value, rel=1e-6
+        result.damping.value, rel=1e-6
     )
 
 
@@ -361,23 +364,23 @@ def test_unstable_loops_of_wheels_are_counted():
     rotation = np.eye(3)
     rotation[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
     rotated = replace(gain, K=rotation @ gain.K)
-    of = fflin.uncertain(robot, {"base.density": (0.5, 2.0)})
-    found = of.worst(rotated, samples=10)
+    uncertain = fflin.uncertain(robot, {"base.density": (0.5, 2.0)})
+    result = uncertain.worst(rotated, samples=10)
     kept = [gain.state_names.index(name) for name in gain.regulated]
-    tried = [np.zeros(1), -np.ones(1), np.ones(1), *of.draws(10, seed=0)[0]]
+    tried = [np.zeros(1), -np.ones(1), np.ones(1), *uncertain.draws(10, seed=0)[0]]
     growth = []
     for delta in tried:
-        lin = fflin.linearize(of.at(of.values(delta)))
+        lin = fflin.linearize(uncertain.at(uncertain.values(delta)))
         loop = lin.A[np.ix_(kept, kept)] - lin.B[kept] @ rotated.K[:, kept]
         growth.append(np.linalg.eigvals(loop).real.max())
     count = np.count_nonzero(np.array(growth) >= 0.0)
-    assert found.tried == len(tried) and 0 < count < len(tried)
-    assert found.unstable == count and found.margin.value == 0.0
+    assert result.tried == len(tried) and 0 < count < len(tried)
+    assert result.unstable == count and result.margin.value == 0.0
     # The limit of stability lies outside the guaranteed ranges.
     unstable = [
         abs(delta[0]) for delta, rate in zip(tried, growth, strict=True) if rate >= 0.0
     ]
-    assert 0.0 < found.safe <= min(unstable)
+    assert 0.0 < result.safe <= min(unstable)
 
 
 @pytest.mark.parametrize("sign, given", [(-1.0, "Gain"), (1.0, "array")])

@@ -116,17 +116,17 @@ def test_appendages_of_the_root_link_and_slosh_are_balls():
 
 def test_the_page_of_modes_plays_the_arrays():
     robot = fflin.load("inspector_flexible.toml", lock=["arm_*"])
-    found = fflin.modes(fflin.linearize(robot))
-    html, notes = mode_page(robot, found, "space", None)
+    result = fflin.modes(fflin.linearize(robot))
+    html, notes = mode_page(robot, result, "space", None)
     assert not notes
     packed = re.findall(r'"poses":"([^"]+)"', html)
-    assert len(packed) == len(found.vibrations)
+    assert len(packed) == len(result.vibrations)
     arrays = [
         robot.model.getJointId(f"{side}_mode_1") - ROOT for side in ("left", "right")
     ]
     swings = []
-    for each in packed[:2]:
-        poses = np.frombuffer(base64.b64decode(each), "<f4").reshape(48, -1, 7)
+    for item in packed[:2]:
+        poses = np.frombuffer(base64.b64decode(item), "<f4").reshape(48, -1, 7)
         turns = [
             pin.log3(pin.XYZQUATToSE3(pose.astype(float)).rotation) for pose in poses[0]
         ]
@@ -140,7 +140,9 @@ def test_the_page_of_a_motion_plots_modal_amplitudes():
     robot = fflin.load("inspector_flexible.toml", lock=["arm_*"])
     q = fflin.configuration(robot, {"left_mode_1": 0.1})
     motion = fflin.simulate(robot, q0=q, duration=2.0, dt=0.1)
-    found = panel(robot, motion, np.arange(len(motion.t)), np.zeros((0, robot.nq)))
-    chart = next(each for each in found["plots"] if each["title"] == "modal amplitudes")
+    result = panel(robot, motion, np.arange(len(motion.t)), np.zeros((0, robot.nq)))
+    chart = next(
+        item for item in result["plots"] if item["title"] == "modal amplitudes"
+    )
     assert chart["unit"] == "kg^0.5 m"
     assert "left_mode_1" in {line["label"] for line in chart["lines"]}

@@ -55,8 +55,8 @@ def test_along_a_trajectory_pictures_are_taken_all_the_way(
     monkeypatch.setattr(
         "fflin.view.capture.take_png", lambda _, at: taken.append(at) or b""
     )
-    for each in (motion, led(motion)):
-        fflin.visualize(robots["planar_detumble"], each, png=tmp_path / "m.png")
+    for item in (motion, led(motion)):
+        fflin.visualize(robots["planar_detumble"], item, png=tmp_path / "m.png")
     np.testing.assert_allclose(
         taken, np.array([[0, 0.08, 0.25, 1.0], [0, 0.35, 0.7, 1.0]]) * 4.0
     )
@@ -153,7 +153,7 @@ def running(argument):
     for file in Path("/proc").glob("[0-9]*/cmdline"):
         with contextlib.suppress(OSError):
             if any(
-                each.startswith(argument) for each in file.read_bytes().split(b"\0")
+                item.startswith(argument) for item in file.read_bytes().split(b"\0")
             ):
                 return True
     return False

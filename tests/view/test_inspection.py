@@ -157,16 +157,16 @@ def test_a_hidden_curve_leaves_the_chart_and_its_csv(flown, watched):
 def test_the_bar_keeps_its_rows_while_the_motion_plays(watched):
     def tops():
         return [
-            each.bounding_box()["y"] for each in watched.page.locator("#bar > *").all()
+            item.bounding_box()["y"] for item in watched.page.locator("#bar > *").all()
         ]
 
-    found = []
+    result = []
     for time in (0.0, 9.99, 20.0):
         watched.do(f"fflin.seek({time})")
-        found.append(tops())
-    assert found[0] == found[1] == found[2]
+        result.append(tops())
+    assert result[0] == result[1] == result[2]
     button, slider, clock, speed = watched.page.locator("#bar > *").all()[:4]
-    one_row = [each.bounding_box() for each in (button, slider, clock, speed)]
+    one_row = [item.bounding_box() for item in (button, slider, clock, speed)]
     middles = [box["y"] + box["height"] / 2 for box in one_row]
     assert max(middles) - min(middles) < 4.0
 
@@ -174,7 +174,7 @@ def test_the_bar_keeps_its_rows_while_the_motion_plays(watched):
 def test_a_large_window_has_charts_that_can_be_read(flown, browser):
     with Watched(browser, flown[2].as_uri() + "#pause", size=(1600, 900)) as watched:
         tall = [
-            each.bounding_box() for each in watched.page.locator(".plot canvas").all()
+            item.bounding_box() for item in watched.page.locator(".plot canvas").all()
         ]
         assert min(box["height"] for box in tall) > 46.0
         panel = watched.page.locator("#panel").bounding_box()
@@ -214,9 +214,9 @@ def test_a_link_is_named_on_hover_and_a_click_shows_its_mass_and_pose(flown, wat
         pin.framesForwardKinematics(robot.model, data, q)
         mass, place, angles = card.locator("dd").all_text_contents()
         assert mass == "24.00 kg"
-        place = [float(each) for each in place.removesuffix(" m").split(",")]
+        place = [float(item) for item in place.removesuffix(" m").split(",")]
         np.testing.assert_allclose(place, data.oMf[panel].translation, atol=1e-3)
-        angles = [float(each) for each in angles.removesuffix("°").split(",")]
+        angles = [float(item) for item in angles.removesuffix("°").split(",")]
         expected = np.degrees(pin.rpy.matrixToRpy(data.oMf[panel].rotation))
         np.testing.assert_allclose(angles, expected, atol=0.06)
     watched.page.mouse.click(20, 250)  # the sky

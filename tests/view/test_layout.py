@@ -52,11 +52,11 @@ def watched(request, browser, tmp_path_factory):
 
 def boxes(watched, selector):
     """Return left, top, right, bottom of what is to be seen of each element (N, 4)."""
-    found = watched.do(f"""[...document.querySelectorAll({selector!r})].map((each) => {{
+    result = watched.do(f"""[...document.querySelectorAll({selector!r})].map((each) => {{
         const box = each.getBoundingClientRect();
         return [box.left, box.top, box.right, box.bottom];
     }}).filter(([left, top, right, bottom]) => right > left && bottom > top)""")
-    return np.array(found).reshape(-1, 4)
+    return np.array(result).reshape(-1, 4)
 
 
 def overlap(one, other):
@@ -173,9 +173,11 @@ def test_every_curve_can_be_told(watched):
     box = canvas.bounding_box()
     watched.page.mouse.move(box["x"] + box["width"] - 30, box["y"] + 1)
     highest = max(plots[at]["lines"], key=lambda line: line[2][-1])
-    told = watched.page.locator(".plot .at").nth(at).text_content()
-    assert told.split()[0] == highest[0]
-    assert float(told.split()[1]) == pytest.approx(highest[2][-1], rel=6e-3, abs=1e-12)
+    messages = watched.page.locator(".plot .at").nth(at).text_content()
+    assert messages.split()[0] == highest[0]
+    assert float(messages.split()[1]) == pytest.approx(
+        highest[2][-1], rel=6e-3, abs=1e-12
+    )
 
 
 def test_thrusters_are_named_by_the_colour_of_their_plume(watched):
@@ -193,7 +195,7 @@ def test_thrusters_are_named_by_the_colour_of_their_plume(watched):
     assert len(tints) == len(keys) == (12 if watched.name == "cubesat" else 4)
     # to the last digit of a byte
     for tint, (_, colour) in zip(tints, keys, strict=True):
-        shown, named = (bytes.fromhex(each[1:]) for each in (tint, colour))
+        shown, named = (bytes.fromhex(item[1:]) for item in (tint, colour))
         np.testing.assert_allclose([*shown], [*named], atol=1)
 
 
@@ -228,7 +230,7 @@ def test_frames_of_a_strip_have_their_time_and_the_first_a_legend(watched, size)
     assert not watched.page.locator("#legend label.strip:visible").count()
 
 
-def test_what_was_passed_leads_to_its_time(watch, tmp_path):
+def test_a_violation_links_to_its_time(watch, tmp_path):
     robot = fflin.load("ets_vii")
     motion = settling(robot, 20.0)
     names = ("tau_m.joint_1", "tau_m.joint_2")
@@ -318,7 +320,7 @@ def test_a_reference_is_pale_under_its_curve_and_a_line_is_where_it_rests(
     assert titles[:3] == ["attitude error", "position error", "largest joint error"]
     plot = titles.index("joints")
     (colour,) = watched.do(f"fflin.plots[{plot}].lines.map(({{ colour }}) => colour)")
-    low, high = (each + 0.06 * 4.0 * s for each, s in ((-2.5, -1), (1.5, 1)))
+    low, high = (item + 0.06 * 4.0 * s for item, s in ((-2.5, -1), (1.5, 1)))
     near, values, _ = rows_of(watched, plot, colour, low, high, least=85)
     band, _, _ = rows_of(watched, plot, colour, low, high, least=30)
     full, _, _ = rows_of(watched, plot, colour, low, high, least=150)
@@ -337,8 +339,8 @@ def test_a_reference_is_pale_under_its_curve_and_a_line_is_where_it_rests(
     ) == pytest.approx(15.0)
     line, _, _ = rows_of(watched, plot, "#93a1ba", low, high, least=60)
     free = line[np.abs(values + 0.7) < 0.5]  # between the curves
-    found = np.flatnonzero(free.mean(axis=0) > 0.2)
-    assert len(found) and np.abs(times[found] - 15.0).max() < 0.2
+    result = np.flatnonzero(free.mean(axis=0) > 0.2)
+    assert len(result) and np.abs(times[result] - 15.0).max() < 0.2
 
 
 @pytest.mark.parametrize("name", ["servicer_7dof", "talos"])

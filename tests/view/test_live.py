@@ -161,7 +161,7 @@ def test_it_sends_where_the_robot_is_and_takes_the_sliders(live, robots):
 
 
 @pytest.mark.parametrize("opening", ["[", '{"joints":', '{"joints": {"joint_2": ['])
-def test_what_is_nested_too_deep_ends_its_connection_alone(opening, live, caplog):
+def test_too_deeply_nested_data_close_only_their_connection(opening, live, caplog):
     async def play():
         connection, other = await websocket(live), await websocket(live)
         await connection.write_message(opening * 100_000)
@@ -172,8 +172,8 @@ def test_what_is_nested_too_deep_ends_its_connection_alone(opening, live, caplog
         await other.write_message(json.dumps({"joints": {"joint_2": 10**400}}))
         await other.write_message(json.dumps({"joints": {"joint_2": 0.5}}))
         after = await state(other)
-        for each in (connection, other):
-            each.close()
+        for item in (connection, other):
+            item.close()
         while await received(other) is not None:
             pass
         return connection.close_code, connection.close_reason, after

@@ -94,10 +94,12 @@ def test_a_mesh_that_is_mended_is_read_again(tmp_path):
         load_mesh(path)
 
 
-def test_dust_is_no_mesh(tmp_path):
+def test_dust_is_not_a_mesh(tmp_path):
     path = tmp_path / "m.obj"
     corners = ("0 0 0", "1e-4 0 0", "0 1e-4 0", "1 1 1", "1.0001 1 1", "1 1.0001 1")
-    path.write_text("".join(f"v {each}\n" for each in corners) + "f 1 2 3\nf 4 5 6\n")
+    path.write_text(
+        "".join(f"v {corner}\n" for corner in corners) + "f 1 2 3\nf 4 5 6\n"
+    )
     with pytest.raises(ValueError, match="triangle"):
         load_mesh(path)
 
@@ -120,7 +122,7 @@ NODES = """<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version
 
 
 @pytest.mark.parametrize(
-    ("nodes", "said"),
+    ("nodes", "message"),
     [
         ('<node id="a"><instance_node url="#a"/></node>', "contains itself"),
         (
@@ -139,10 +141,10 @@ NODES = """<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version
         ),
     ],
 )
-def test_nodes_that_would_be_drawn_without_end_are_refused(nodes, said, tmp_path):
+def test_nodes_that_would_be_drawn_without_end_are_refused(nodes, message, tmp_path):
     path = tmp_path / "a.dae"
     path.write_text(NODES.format(nodes))
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         load_mesh(path)
 
 

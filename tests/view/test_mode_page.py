@@ -22,11 +22,11 @@ def shown(browser, tmp_path_factory):
     robot = fflin.load("servicer_7dof", stiffness=STIFF, damping={"panel_left": 8.0})
     base = pin.SE3(pin.rpy.rpyToMatrix(0.3, -0.2, 0.5), np.array([1.0, 2.0, 3.0]))
     q = fflin.configuration(robot, {"joint_4": 0.6}, base)
-    found = fflin.modes(fflin.linearize(robot, q))
+    result = fflin.modes(fflin.linearize(robot, q))
     path = tmp_path_factory.mktemp("modes") / "modes.html"
-    assert fflin.visualize(robot, found, html=path) == path
+    assert fflin.visualize(robot, result, html=path) == path
     with Watched(browser, path.as_uri() + "#pause", painted=True) as watched:
-        yield robot, found, watched
+        yield robot, result, watched
 
 
 def poses(robot, q):
@@ -39,8 +39,8 @@ def drawn(watched, robot, mode, phase):
     """Return where the page has the bodies (k, 4, 4)."""
     watched.do(f"fflin.pick({mode}), fflin.seek({phase!r})")
     names = list(robot.model.names)[ROOT:]
-    found = [watched.pose(["meshcat", "robot", name]) for name in names]
-    return np.array([pin.XYZQUATToSE3(np.array(pose)).homogeneous for pose in found])
+    result = [watched.pose(["meshcat", "robot", name]) for name in names]
+    return np.array([pin.XYZQUATToSE3(np.array(pose)).homogeneous for pose in result])
 
 
 def deflected(robot, lin, mode, amplitude, phase):
@@ -54,27 +54,27 @@ def deflected(robot, lin, mode, amplitude, phase):
 
 @pytest.mark.browser
 def test_the_robot_swings_as_the_eigenvector_says(shown):
-    robot, found, watched = shown
-    rest = poses(robot, found.lin.q)
-    assert len(found.vibrations) == 3
-    for index, mode in enumerate(found.vibrations):
+    robot, result, watched = shown
+    rest = poses(robot, result.lin.q)
+    assert len(result.vibrations) == 3
+    for index, mode in enumerate(result.vibrations):
         at = drawn(watched, robot, index, 0.0)
 
         def away(amplitude, mode=mode, at=at):
             return np.abs(
-                poses(robot, deflected(robot, found.lin, mode, amplitude, 0.0)) - at
+                poses(robot, deflected(robot, result.lin, mode, amplitude, 0.0)) - at
             ).max()
 
         amplitude = minimize_scalar(away, bounds=(0.01, 1.0), options={"xatol": 1e-9}).x
         assert away(amplitude) < 1e-5
         assert np.abs(at - rest).max() > 0.05  # it is to be seen
         for phase in (0.25, 0.5, 0.75, 13 / 48):
-            q = deflected(robot, found.lin, mode, amplitude, phase)
+            q = deflected(robot, result.lin, mode, amplitude, phase)
             np.testing.assert_allclose(
                 drawn(watched, robot, index, phase), poses(robot, q), atol=1e-5
             )
         # Between the poses that are sent too.
-        q = deflected(robot, found.lin, mode, amplitude, 0.3)
+        q = deflected(robot, result.lin, mode, amplitude, 0.3)
         moved = np.abs(at - rest).max()
         np.testing.assert_allclose(
             drawn(watched, robot, index, 0.3), poses(robot, q), atol=5e-3 * moved
@@ -82,9 +82,9 @@ def test_the_robot_swings_as_the_eigenvector_says(shown):
 
 
 @pytest.mark.browser
-def test_the_base_swings_against_what_bends(shown):
+def test_the_base_oscillates_against_the_flexible_mode(shown):
     """Nothing pushes from outside: the centre of mass stays while the base moves."""
-    robot, found, watched = shown
+    robot, result, watched = shown
     data = robot.model.createData()
     inertias = robot.model.inertias.tolist()[ROOT:]
 
@@ -95,13 +95,15 @@ def test_the_base_swings_against_what_bends(shown):
         ]
         return np.average(points, axis=0, weights=masses)
 
-    rest = poses(robot, found.lin.q)
-    com = pin.centerOfMass(robot.model, data, found.lin.q)
+    rest = poses(robot, result.lin.q)
+    com = pin.centerOfMass(robot.model, data, result.lin.q)
     np.testing.assert_allclose(centre(rest), com, atol=1e-12)
-    for index in range(len(found.vibrations)):
-        there, back = (drawn(watched, robot, index, phase) for phase in (0.0, 0.5))
+    for index in range(len(result.vibrations)):
+        expected_value, back = (
+            drawn(watched, robot, index, phase) for phase in (0.0, 0.5)
+        )
         # Half of there less back is the swing to the second order.
-        swing = (there - back) / 2.0
+        swing = (expected_value - back) / 2.0
         held = rest + swing
         # as if the base did not move
         held[:] = np.linalg.inv(rest[0] + swing[0]) @ held
@@ -113,7 +115,7 @@ def test_the_base_swings_against_what_bends(shown):
 
 @pytest.mark.browser
 def test_a_mode_is_picked_by_name_and_frequency(shown):
-    _, found, watched = shown
+    _, result, watched = shown
     rows = watched.page.locator(".choices button")
     assert rows.count() == 3
     assert watched.page.locator(".figures").first.locator(
@@ -121,7 +123,7 @@ def test_a_mode_is_picked_by_name_and_frequency(shown):
     ).all_text_contents() == [
         *("rad/s", "Hz", "damping"),
     ]
-    for index, mode in enumerate(found.vibrations):
+    for index, mode in enumerate(result.vibrations):
         row = rows.nth(index)
         row.click()
         assert watched.do("fflin.state.mode") == index
@@ -130,7 +132,7 @@ def test_a_mode_is_picked_by_name_and_frequency(shown):
         expected = [mode.frequency, mode.frequency / (2.0 * np.pi), mode.damping_ratio]
         np.testing.assert_allclose(figures, expected, rtol=6e-3, atol=1e-9)
         half = len(mode.shape) // 2
-        largest = found.state_names[int(np.abs(mode.shape[:half]).argmax())]
+        largest = result.state_names[int(np.abs(mode.shape[:half]).argmax())]
         body, part = next(iter(mode.energy.items()))
         assert (
             row.locator("b")
@@ -163,12 +165,14 @@ def test_it_plays_at_a_rate_to_be_watched(shown):
     assert text.startswith("shown at 0.50 Hz, ")
 
 
-def test_what_cannot_be_shown_is_one_line_and_no_file(robots, tmp_path, monkeypatch):
+def test_an_invalid_animation_gives_a_one_line_error_and_no_file(
+    robots, tmp_path, monkeypatch
+):
     # without Chromium the reasons are the same
     monkeypatch.setenv("PATH", str(tmp_path))
     page, bent = tmp_path / "m.html", fflin.load("servicer_7dof", stiffness=STIFF)
     rigid = robots["ets_vii"]
-    found = fflin.modes(fflin.linearize(bent))
+    result = fflin.modes(fflin.linearize(bent))
     reduced = fflin.modes(
         fflin.momentum_reduction(
             fflin.linearize(bent.replace(inputs=[fflin.JointTorque("joint_1")]))
@@ -176,9 +180,9 @@ def test_what_cannot_be_shown_is_one_line_and_no_file(robots, tmp_path, monkeypa
     )
     for robot, given, match, files in (
         (rigid, fflin.modes(fflin.linearize(rigid)), "vibration", {"html": page}),
-        (rigid, found, "'ets_vii'", {"html": page}),
+        (rigid, result, "'ets_vii'", {"html": page}),
         (bent, reduced, "'servicer_7dof'", {"html": page}),
-        (bent, found, "modes", {"png": tmp_path / "m.png"}),
+        (bent, result, "modes", {"png": tmp_path / "m.png"}),
     ):
         with pytest.raises(fflin.InputError, match=match) as caught:
             fflin.visualize(robot, given, **files)
@@ -210,6 +214,6 @@ def test_every_bundled_robot_that_bends_can_be_shown(robots, tmp_path):
             if robot.n == 0:
                 continue
             bent = robot.replace(stiffness=10.0)
-            found = fflin.modes(fflin.linearize(bent))
-            fflin.visualize(bent, found, html=tmp_path / f"{name}.html")
+            result = fflin.modes(fflin.linearize(bent))
+            fflin.visualize(bent, result, html=tmp_path / f"{name}.html")
             assert (tmp_path / f"{name}.html").stat().st_size < 5e6

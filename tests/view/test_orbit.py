@@ -15,13 +15,13 @@ def pages(tmp_path_factory):
     """A page in each frame, and one of the same robot without an orbit."""
     folder, robot = tmp_path_factory.mktemp("orbit"), fflin.load("cubesat")
     for frame in ("lvlh", "hill", "hybrid"):
-        own = robot if frame == "hybrid" else robot.replace(orbit=700e3)
-        motion = fflin.simulate(own, duration=40.0, dt=0.5, frame=frame)
-        fflin.visualize(own, motion, html=folder / f"{frame}.html", open=False)
+        flown = robot if frame == "hybrid" else robot.replace(orbit=700e3)
+        motion = fflin.simulate(flown, duration=40.0, dt=0.5, frame=frame)
+        fflin.visualize(flown, motion, html=folder / f"{frame}.html", open=False)
     return folder
 
 
-def test_what_pages_are_told(pages):
+def test_the_messages_to_pages_are_complete(pages):
     lvlh, hill, plain = (
         page_data(pages / f"{x}.html") for x in ("lvlh", "hill", "hybrid")
     )

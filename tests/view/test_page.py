@@ -147,7 +147,7 @@ def test_slider_play_speed_and_keys_work(settled, watched):
 
 
 @pytest.mark.browser
-def test_the_panel_says_what_the_motion_says(settled, watched):
+def test_the_panel_agrees_with_the_motion(settled, watched):
     _, motion, _ = settled
     for t in (0.0, 4.0):
         watched.do(f"fflin.seek({t})")
@@ -322,7 +322,7 @@ def test_forces_trails_and_the_legend(settled, watched):
 
 
 @pytest.mark.browser
-def test_the_camera_follows_the_base_when_it_is_told_to(settled, watched):
+def test_the_camera_follows_the_base_on_request(settled, watched):
     target = "viewer.controls.target.toArray()"
     watched.do("fflin.seek(0)")
     fixed = watched.do(target)
@@ -457,13 +457,13 @@ def test_the_floor_lies_below_all_of_the_motion_and_the_target(tmp_path):
     assert not shown["follow"]
 
 
-def test_on_a_long_way_the_camera_follows_unless_it_is_told_not_to(robots, tmp_path):
+def test_on_a_long_way_the_camera_follows_unless_switched_off(robots, tmp_path):
     robot = robots["servicer_7dof"]
     v0 = fflin.velocity(robot, {"v_b.x": 1000.0})
     motion = fflin.simulate(robot, None, v0=v0, duration=10.0, dt=0.1)
     path = tmp_path / "away.html"
-    for told, expected in ((None, True), (False, False), (True, True)):
-        fflin.visualize(robot, motion, html=path, follow=told)
+    for messages, expected in ((None, True), (False, False), (True, True)):
+        fflin.visualize(robot, motion, html=path, follow=messages)
         shown = page_data(path)
         assert shown["follow"] is expected
         assert (np.ptp(shown["points"], axis=0).max() > 5e3) is not expected
@@ -483,7 +483,7 @@ def test_two_minutes_at_2048_rows_a_second_are_below_5_megabytes(robots, tmp_pat
 
 
 @pytest.mark.browser
-def test_without_a_target_there_is_no_ghost(robots, watch, tmp_path):
+def test_without_a_target_no_ghost_is_drawn(robots, watch, tmp_path):
     robot = robots["planar_detumble"]
     motion = replace(settling(robot, duration=2.0), target=np.zeros(0))
     path = tmp_path / "free.html"
@@ -544,15 +544,15 @@ def middle_of(watched, *path, mesh):
 
 
 @pytest.mark.browser
-def test_the_paths_of_the_reference_are_dashed_beside_those_flown(led_page):
+def test_the_paths_of_the_reference_are_dashed_next_to_those_flown(led_page):
     robot, motion, watched, _ = led_page
     state = fflin.StateMap(robot, reference=motion.reference, frame=motion.frame)
     data, tool = robot.model.createData(), robot.model.getFrameId(tool_frame(robot))
 
     def course(q):
         ends = []
-        for each in q:
-            pin.framesForwardKinematics(robot.model, data, each)
+        for item in q:
+            pin.framesForwardKinematics(robot.model, data, item)
             ends.append(data.oMf[tool].translation.copy())
         return {"base": q[:, :3], "tool": np.array(ends)}
 
@@ -561,12 +561,12 @@ def test_the_paths_of_the_reference_are_dashed_beside_those_flown(led_page):
     for k, name in enumerate(("base", "tool")):
         reference, share = middle_of(watched, "target", f"path {k}", mesh=0)
         assert 0.2 < share < 0.9  # gaps between
-        own, whole = middle_of(watched, "trails", name, mesh=1)
+        middle, whole = middle_of(watched, "trails", name, mesh=1)
         assert whole == 1.0
-        for points, expected in ((reference, followed[name]), (own, flown[name])):
+        for points, expected in ((reference, followed[name]), (middle, flown[name])):
             away = np.linalg.norm(points[:, None] - expected, axis=2)
             assert away.min(axis=1).max() < 4e-3
-            assert away[0, 0] < EXACT < 4e-3 < np.linalg.norm(reference[0] - own[0])
+            assert away[0, 0] < EXACT < 4e-3 < np.linalg.norm(reference[0] - middle[0])
             assert away[-1, -1] < 4e-3
     # They are named, and the reference's go with its ghost.
     named = watched.page.locator("#legend label").all_text_contents()
@@ -584,7 +584,7 @@ def test_a_reference_adds_little_to_the_page(led_page):
     _, motion, _, shown = led_page
     rows = len(shown["t"]) * 3 / 16
     assert rows < 130 < len(motion.t)
-    added = sum(len(each["points"]) for each in shown["followed"])
+    added = sum(len(item["points"]) for item in shown["followed"])
     added += sum(
         len(line["reference"]) for plot in shown["plots"] for line in plot["lines"]
     )

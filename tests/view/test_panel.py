@@ -45,7 +45,7 @@ def limited(motion, limits):
     )
 
 
-def test_errors_are_those_of_the_pose(robots):
+def test_errors_match_the_pose(robots):
     rng = np.random.default_rng(2)
     robot = robots["ets_vii"]  # its joints are continuous
     turns = dict(zip(robot.joint_names, (0.3, 3.0, -1.0, 0.0, 1.0, -3.0), strict=True))
@@ -57,18 +57,18 @@ def test_errors_are_those_of_the_pose(robots):
     q = pin.integrate(robot.model, target, v)
     base = pin.XYZQUATToSE3(target[:7]) * pin.SE3(pin.exp3(step[3:]), step[:3])
     q[:7] = pin.SE3ToXYZQUAT(base)
-    found = errors(robot, np.array([target, q]), target[None], robot.wheels)
-    np.testing.assert_allclose(found["attitude"][1], [0, 37.0], atol=1e-6)
+    result = errors(robot, np.array([target, q]), target[None], robot.wheels)
+    np.testing.assert_allclose(result["attitude"][1], [0, 37.0], atol=1e-6)
     np.testing.assert_allclose(
-        found["position"][1], [0, np.linalg.norm(step[:3])], atol=1e-12
+        result["position"][1], [0, np.linalg.norm(step[:3])], atol=1e-12
     )
     np.testing.assert_allclose(
-        found["largest joint"][1], np.degrees([0, 1.1]), atol=1e-7
+        result["largest joint"][1], np.degrees([0, 1.1]), atol=1e-7
     )
-    assert "largest prismatic joint" not in found
+    assert "largest prismatic joint" not in result
 
 
-def test_errors_from_a_target_that_moves_are_those_of_the_same_moment(robots):
+def test_errors_from_a_moving_target_are_relative_to_the_same_instant(robots):
     robot = robots["ets_vii"]
     rng = np.random.default_rng(3)
     targets = np.array(
@@ -81,12 +81,12 @@ def test_errors_from_a_target_that_moves_are_those_of_the_same_moment(robots):
         (np.zeros(3), np.radians(20.0) * np.array([0, 0.6, 0.8]), 0.2 * np.ones(6))
     )
     q = np.array(
-        [pin.integrate(robot.model, each, s * step) for s, each in enumerate(targets)]
+        [pin.integrate(robot.model, item, s * step) for s, item in enumerate(targets)]
     )
-    found = errors(robot, q, targets, robot.wheels)
-    np.testing.assert_allclose(found["attitude"][1], [0, 20, 40, 60], atol=1e-6)
+    result = errors(robot, q, targets, robot.wheels)
+    np.testing.assert_allclose(result["attitude"][1], [0, 20, 40, 60], atol=1e-6)
     np.testing.assert_allclose(
-        found["largest joint"][1], np.degrees([0, 0.2, 0.4, 0.6]), atol=1e-7
+        result["largest joint"][1], np.degrees([0, 0.2, 0.4, 0.6]), atol=1e-7
     )
 
 
@@ -98,12 +98,12 @@ def test_metres_are_not_taken_for_degrees_nor_wheels_for_joints():
     target = robot.neutral()
     q = fflin.configuration(robot, {"panda_joint2": -0.1, "panda_finger_joint1": 0.03})
     robot.joint("wheel_1").place(q, 2.0)
-    found = errors(robot, np.array([q]), target[None], robot.wheels)
-    assert found["largest joint"][1] == pytest.approx(np.degrees(0.1))
-    assert found["largest prismatic joint"][1] == pytest.approx(0.03)
+    result = errors(robot, np.array([q]), target[None], robot.wheels)
+    assert result["largest joint"][1] == pytest.approx(np.degrees(0.1))
+    assert result["largest prismatic joint"][1] == pytest.approx(0.03)
     motion = settling(robot, 1.0)
     shown = panel(robot, motion, every(motion), target[None])
-    labels = {each["label"]: each["unit"] for each in shown["readouts"]}
+    labels = {item["label"]: item["unit"] for item in shown["readouts"]}
     assert (
         labels["largest joint error"] == "°"
         and labels["largest prismatic joint error"] == "m"
@@ -115,7 +115,7 @@ def test_a_free_flyer_alone_has_no_joint_error():
     robot = fflin.load("cubesat", inputs=fflin.load_inputs("cubesat"))
     motion = settling(robot, 1.0)
     shown = panel(robot, motion, every(motion), robot.neutral()[None])
-    assert not any("joint" in each["label"] for each in shown["readouts"])
+    assert not any("joint" in item["label"] for item in shown["readouts"])
     assert subtitle(robot) == "0 joints, 3 wheels, 3.5 kg"
 
 
@@ -141,18 +141,18 @@ def test_plots_have_the_units_of_the_model():
     assert {(plot["title"], plot["unit"]) for plot in shown[2:]} == expected
     drawn = charts({"plots": shown})
     for joint in robot.joints:
-        of, by = (
+        source, by_key = (
             ("prismatic joints", "joint forces")
             if joint.prismatic
             else ("joints", "joint torques")
         )
         x = motion.x[every(motion), motion.state_names.index(f"q_m.{joint.name}")]
         u = motion.u[every(motion), motion.input_names.index(f"tau_m.{joint.name}")]
-        np.testing.assert_allclose(drawn[of][joint.name], x, rtol=1e-6)
-        np.testing.assert_allclose(drawn[by][joint.name], u, rtol=1e-6)
+        np.testing.assert_allclose(drawn[source][joint.name], x, rtol=1e-6)
+        np.testing.assert_allclose(drawn[by_key][joint.name], u, rtol=1e-6)
 
 
-def test_wheels_have_charts_of_their_own():
+def test_wheels_have_separate_charts():
     """Speed, torque and momentum against saturation, and nothing of them among the joints."""
     wheels = [
         fflin.ReactionWheel((0, 0, 1), name=f"w{k}", inertia=1e-3 * k) for k in (1, 2)
@@ -222,7 +222,7 @@ def test_thrusters_that_never_fire_are_not_drawn():
     u[:, motion.input_names.index("y_plus_back")] = 1e-9  # what an allocation leaves
     motion = replace(motion, u=u)
     plots = panel(robot, motion, every(motion), robot.neutral()[None])["plots"]
-    (plot,) = (each for each in plots if each["title"] == "thrusters")
+    (plot,) = (item for item in plots if item["title"] == "thrusters")
     assert [line["label"] for line in plot["lines"]] == ["x_plus_top", "z_minus_left"]
     assert [floats(line["values"])[3] for line in plot["lines"]] == [1.0, 2.0]
 
@@ -231,8 +231,8 @@ def test_without_a_target_nothing_is_called_an_error(robots):
     robot = robots["planar_detumble"]
     motion = settling(robot, 1.0)
     shown = panel(robot, motion, every(motion), np.zeros((0, robot.nq)))
-    labels = [each["label"] for each in shown["readouts"]]
-    titles = [each["title"] for each in shown["plots"]]
+    labels = [item["label"] for item in shown["readouts"]]
+    titles = [item["title"] for item in shown["plots"]]
     assert labels[0] == titles[0] == "attitude change"
     assert not any("error" in text for text in labels + titles)
     expected = errors(robot, motion.q[every(motion)], motion.q[:1], motion.wheels)[
@@ -244,7 +244,7 @@ def test_without_a_target_nothing_is_called_an_error(robots):
     )
 
 
-def test_what_was_passed_is_told_with_its_time(robots):
+def test_violations_are_reported_with_their_time(robots):
     robot = robots["planar_detumble"]
     motion = settling(robot, 1.0)
     name = f"tau_m.{robot.joint_names[0]}"
@@ -255,7 +255,7 @@ def test_what_was_passed_is_told_with_its_time(robots):
     assert time == motion.t[700] and text == f"{name} 3 N m at 0.35 s, limit 2"
 
 
-def test_what_is_followed_goes_with_joints_and_wheels():
+def test_references_include_joints_and_wheels():
     wheel = fflin.ReactionWheel((0, 0, 1), name="w", inertia=1e-3)
     robot = fflin.load("planar_detumble")
     robot = robot.replace(inputs=[*robot.inputs, wheel])
@@ -278,7 +278,7 @@ def test_what_is_followed_goes_with_joints_and_wheels():
     speed = motion.target[rows, motion.state_names.index("qdot_m.w")]
     np.testing.assert_allclose(followed["wheel speed"]["w"], speed, rtol=1e-6)
     np.testing.assert_allclose(followed["wheel momentum"]["w"], 1e-3 * speed, rtol=1e-6)
-    assert not any(each.size for each in followed["joint torques"].values())
+    assert not any(item.size for item in followed["joint torques"].values())
     assert shown["rest"] == motion.t[-251]
     titles = [plot["title"] for plot in shown["plots"]]
     assert titles[:3] == ["attitude error", "position error", "largest joint error"]

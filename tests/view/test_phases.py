@@ -51,21 +51,23 @@ def test_a_body_flies_to_the_grasp_and_is_held(watch, tmp_path):
         R = grasp.rotation @ turned.matrix()
         at = center + spin * (t - 4.0) - R @ DEBRIS.lever
         assert apart(body, pin.SE3(R, at)) < EXACT, t
-        here = frames(flown.robot, flown.approach.q[row_at(flown.approach, t)])
-        assert apart(shown(watched, "robot", "joint_7"), here["joint_7"]) < EXACT
+        frames_now = frames(flown.robot, flown.approach.q[row_at(flown.approach, t)])
+        assert apart(shown(watched, "robot", "joint_7"), frames_now["joint_7"]) < EXACT
     for part, start, t in (
         (flown.held, 4.0, 4.0),
         (flown.held, 4.0, 8.3),
         (flown.after, 10.0, 12.0),
     ):
         watched.do(f"fflin.seek({t})")
-        here = frames(part._robot, part.q[row_at(part, t - start)])
+        frames_now = frames(part._robot, part.q[row_at(part, t - start)])
         assert (
-            apart(shown(watched, "held", "payload", "root_joint"), here["payload"])
+            apart(
+                shown(watched, "held", "payload", "root_joint"), frames_now["payload"]
+            )
             < EXACT
         ), t
         for joint in ("joint_3", "joint_7"):  # jammed or not
-            assert apart(shown(watched, "robot", joint), here[joint]) < EXACT, (
+            assert apart(shown(watched, "robot", joint), frames_now[joint]) < EXACT, (
                 joint,
                 t,
             )
@@ -79,7 +81,7 @@ def test_a_body_flies_to_the_grasp_and_is_held(watch, tmp_path):
     for k, time in enumerate((0.0, 4.0, 10.0)):
         buttons.nth(k).click()
         assert watched.do("fflin.state.time") == pytest.approx(time)
-        pressed = [each.get_attribute("aria-pressed") for each in buttons.all()]
+        pressed = [item.get_attribute("aria-pressed") for item in buttons.all()]
         assert pressed == [str(k == other).lower() for other in range(3)]
     assert "joint_3 jammed" in watched.page.locator("#stamp").text_content()
     # What flies is named and weighed, and what is caught has a colour of its own and edges.
@@ -88,11 +90,11 @@ def test_a_body_flies_to_the_grasp_and_is_held(watch, tmp_path):
         (4.5, "servicer_7dof + payload", 500.0),
     ):
         watched.do(f"fflin.seek({t})")
-        said = [
+        message = [
             watched.page.locator(f"header {tag}").text_content() for tag in ("h1", "p")
         ]
-        assert said[0] == name
-        assert f", {flown.robot.mass + kept:.4g} kg, 13 s" in said[1]
+        assert message[0] == name
+        assert f", {flown.robot.mass + kept:.4g} kg, 13 s" in message[1]
         body, edges = watched.do(
             "(() => { const found = [], path = ['meshcat', 'held', 'payload'];"
             "viewer.scene_tree.find(path).object.traverse((x) => { if (x.material) "
@@ -129,10 +131,10 @@ def test_a_payload_with_joints_comes_with_them(watch, tmp_path):
     watched.do("fflin.seek(0)")
     first = {name: shown(watched, "held", "payload", name) for name in names}
     watched.do("fflin.seek(4)")
-    here = frames(flown.caught.robot, flown.caught.q)
+    frames_now = frames(flown.caught.robot, flown.caught.q)
     for name in names[1:]:
         body = shown(watched, "held", "payload", name)
-        assert apart(body, here[f"payload.{name}"]) < EXACT
+        assert apart(body, frames_now[f"payload.{name}"]) < EXACT
     undamped = other.replace(damping=0.0)
     back = fflin.simulate(
         undamped, None, q0=flown.caught.payload_q, v0=-v, duration=4.0

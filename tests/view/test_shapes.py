@@ -35,9 +35,9 @@ def write(folder, mesh="missing.stl", more=""):
 @pytest.mark.parametrize(
     "name", ["ets_vii", "canadarm2", "dual_arm", *exhaustive("talos", "panda", "tiago")]
 )
-def test_shapes_stand_where_pinocchio_puts_them(name):
+def test_shapes_are_at_the_placements_of_pinocchio(name):
     robot = fflin.load(name)
-    found, notes = shapes(robot)
+    result, notes = shapes(robot)
     file = find_robot(name)
     model = pin.buildModelFromUrdf(str(file.path), pin.JointModelFreeFlyer())
     geometry = pin.buildGeomFromUrdf(
@@ -52,7 +52,7 @@ def test_shapes_stand_where_pinocchio_puts_them(name):
     )
     ours = sorted(
         (robot.model.names[s.joint], *np.round(s.placement.homogeneous, 9).ravel())
-        for s in found
+        for s in result
     )
     assert not notes
     assert [row[0] for row in ours] == [row[0] for row in theirs]
@@ -89,10 +89,10 @@ def test_inertia_boxes_have_the_inertia_of_the_bodies():
         if k < 3:
             joint = root.addJoint(joint, pin.JointModelRX(), pin.SE3.Random(), f"j{k}")
     robot = fflin.from_model(root, name="code")
-    found, notes = shapes(robot)
+    result, notes = shapes(robot)
     assert "geometry" in notes[0]
-    assert [s.joint for s in found] == [1, 2, 3, 4]
-    for shape in found:
+    assert [s.joint for s in result] == [1, 2, 3, 4]
+    for shape in result:
         inertia = root.inertias[shape.joint]
         box = shape.placement.act(pin.Inertia.FromBox(inertia.mass, *shape.size))
         assert box.isApprox(inertia, 1e-9)
@@ -125,8 +125,8 @@ def test_a_quaternion_turns_a_visual_as_it_turns_a_link(tmp_path):
 
 def test_a_missing_mesh_and_a_malformed_visual_leave_the_rest(tmp_path):
     more = "<visual><geometry><sphere radius='x'/></geometry></visual><visual/>"
-    found, notes = shapes(fflin.load(write(tmp_path, "package://nowhere/a.stl", more)))
-    assert [shape.kind for shape in found] == ["box"]
+    result, notes = shapes(fflin.load(write(tmp_path, "package://nowhere/a.stl", more)))
+    assert [shape.kind for shape in result] == ["box"]
     assert len(notes) == 2
     assert "package://nowhere/a.stl" in notes[0] and "line 8, 8" in notes[1]
 
@@ -139,8 +139,8 @@ def test_where_no_mesh_can_be_read_there_are_boxes(ending, tmp_path):
     path.write_text(text[:start] + text[text.index("</visual>") + 9 :])
     (tmp_path / f"m.{ending}").write_bytes(b"garbage" * 20)
     robot = fflin.load(path)
-    found, notes = shapes(robot)
-    assert [shape.finish for shape in found] == ["inertia"]
+    result, notes = shapes(robot)
+    assert [shape.finish for shape in result] == ["inertia"]
     assert f"m.{ending}" in notes[0] and "read" in notes[0]
     assert "boxes" in notes[1]
     page = tmp_path / "m.html"
@@ -186,10 +186,10 @@ def test_a_mesh_is_scaled_and_mirrored_and_then_placed(tmp_path):
 
     robot = fflin.load(path)
     page = Page(robot, robot.neutral(), "space", None, None)
-    pieces = [umsgpack.unpackb(each) for each in page.window.commands()]
-    pieces = [each["object"] for each in pieces if each["type"] == "set_object"]
+    pieces = [umsgpack.unpackb(item) for item in page.window.commands()]
+    pieces = [item["object"] for item in pieces if item["type"] == "set_object"]
     (piece,) = (
-        each for each in pieces if each["geometries"][0]["type"] == "BufferGeometry"
+        item for item in pieces if item["geometries"][0]["type"] == "BufferGeometry"
     )
     data = piece["geometries"][0]["data"]["attributes"]["position"]["array"].data
     vertices = np.frombuffer(data, dtype="<f4").reshape(-1, 3)
@@ -199,22 +199,26 @@ def test_a_mesh_is_scaled_and_mirrored_and_then_placed(tmp_path):
     np.testing.assert_allclose(cKDTree(theirs).query(ours)[0], 0.0, atol=1e-6)
 
 
-def test_what_was_grasped_is_drawn_where_it_is_held():
+def test_a_captured_payload_is_drawn_at_its_grasp():
     robot, other = fflin.load("servicer_7dof"), fflin.load("ets_vii")
     at = pin.SE3(pin.rpy.rpyToMatrix(0.1, 0.2, 0.3), np.array([0.0, 0.1, 0.5]))
     whole = fflin.capture(robot, "tool", other, placement=at).robot
-    own, theirs = len(shapes(robot)[0]), shapes(other)[0]
-    found = shapes(whole)[0]
-    assert len(found) == own + len(theirs)
+    count, theirs = len(shapes(robot)[0]), shapes(other)[0]
+    result = shapes(whole)[0]
+    assert len(result) == count + len(theirs)
     data, alone = whole.create_data(), other.create_data()
     pin.framesForwardKinematics(whole.model, data, whole.neutral())
     pin.forwardKinematics(other.model, alone, other.neutral())
     held = data.oMf[whole.model.getFrameId("tool")] * at
-    for shape, before in zip(found[own:], theirs, strict=True):
-        there = data.oMi[shape.joint] * shape.placement
-        assert there.isApprox(held * alone.oMi[before.joint] * before.placement, 1e-9)
+    for shape, before in zip(result[count:], theirs, strict=True):
+        placement = data.oMi[shape.joint] * shape.placement
+        assert placement.isApprox(
+            held * alone.oMi[before.joint] * before.placement, 1e-9
+        )
     body = pin.Inertia(5.0, np.zeros(3), np.eye(3))
-    assert shapes(fflin.capture(robot, "tool", body).robot)[0][own].finish == "inertia"
+    assert (
+        shapes(fflin.capture(robot, "tool", body).robot)[0][count].finish == "inertia"
+    )
 
 
 def test_the_links_of_missing_meshes_are_named(tmp_path):

@@ -199,7 +199,7 @@ def test_simulate_on_the_command_line(capsys, tmp_path, monkeypatch):
 
 
 @pytest.mark.process
-def test_files_are_written_even_where_nobody_reads_what_is_said(tmp_path):
+def test_files_are_written_even_if_stdout_is_closed(tmp_path):
     page = tmp_path / "m.html"
     command = ["simulate", "cubesat", "--rpy", "10", "0", "0", "--duration", "1"]
     read, write = os.pipe()
@@ -213,7 +213,7 @@ def test_files_are_written_even_where_nobody_reads_what_is_said(tmp_path):
     assert (done.returncode, done.stderr) == (0, b"") and page.is_file()
 
 
-def test_a_name_that_is_no_files_name_does_no_harm(robots, monkeypatch):
+def test_a_name_that_is_not_a_files_name_does_no_harm(robots, monkeypatch):
     robot = fflin.from_model(robots["planar_detumble"].model, name="../a/b \u2603" * 99)
     with pytest.warns(fflin.FflinWarning, match="boxes"):
         path = fflin.visualize(robot, settling(robot, 1.0), open=False)

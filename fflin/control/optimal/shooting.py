@@ -104,11 +104,12 @@ class Shooting:
 
     def missed(self, q: Array, v: Array, motions: Motions) -> Array:
         """Return the gaps (N, nx): the steps from a knot to the end of the motion before it."""
-        knots, ends = (
-            zip(q[1:], v[1:], strict=True),
-            zip(*(x[:, -1] for x in motions), strict=True),
-        )
-        return np.array([self.between(*pair) for pair in zip(knots, ends, strict=True)])
+        configurations, velocities = motions
+        gaps = []
+        for k in range(1, len(q)):
+            end = configurations[k - 1, -1], velocities[k - 1, -1]
+            gaps.append(self.between((q[k], v[k]), end))
+        return np.array(gaps)
 
     def flown(self, start: Point, u: Array) -> Point:
         """Integrate the motion from a point under the inputs u; return q and v at the knots."""
@@ -135,8 +136,9 @@ class Shooting:
 
         The values have the shape (N, parts, nx).
         """
-        every = (motions[0].shape[1] - 1) // parts
-        return self.limited_values(*(points[:, every::every] for points in motions))
+        q, v = motions
+        every = (q.shape[1] - 1) // parts
+        return self.limited_values(q[:, every::every], v[:, every::every])
 
     def refine(self, q: Array, v: Array, u: Array, accuracy: float) -> None:
         """Double the number of steps until the interval ends have the given accuracy [rad, m, s].
@@ -218,10 +220,8 @@ class Shooting:
         rates[1, PIN_ANGULAR] = np.linalg.lstsq(
             jacobian, rates[1, PIN_ANGULAR], rcond=1e-6
         )[0]
-        late, bend = (
-            3 * difference - 2 * rates[0] - rates[1],
-            rates.sum(axis=0) - 2 * difference,
-        )
+        late = 3 * difference - 2 * rates[0] - rates[1]
+        bend = rates.sum(axis=0) - 2 * difference
         displacements = s * (rates[0] + s * (late + s * bend))
         v = (rates[0] + s * (2 * late + 3 * s * bend)) / T
         q = np.array([pin.integrate(model, start[0], step) for step in displacements])

@@ -56,8 +56,16 @@ _CHILD = str(Path(__file__).with_name("xacro_child.py"))
 
 # These elements do not affect the model, so a "${" inside them does not require xacro.
 _IGNORED = {
-    *("visual", "collision", "material", "gazebo", "transmission", "ros2_control"),
-    *("sensor", "plugin", "safety_controller", "calibration"),
+    "visual",
+    "collision",
+    "material",
+    "gazebo",
+    "transmission",
+    "ros2_control",
+    "sensor",
+    "plugin",
+    "safety_controller",
+    "calibration",
 }
 
 

@@ -106,9 +106,9 @@ H = math.sqrt(0.5)
 def test_two_ways_to_say_the_same(document, meaning):
     if b"${" in (document if isinstance(document, bytes) else document.encode()):
         pytest.importorskip("xacrodoc")
-    for found, expected in zip(hinge(document), hinge(meaning), strict=True):
+    for result, expected in zip(hinge(document), hinge(meaning), strict=True):
         # Six digits of mass and inertia of order one, in double precision.
-        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-15)
+        np.testing.assert_allclose(result, expected, rtol=0, atol=1e-15)
 
 
 def test_the_inertia_is_turned_by_the_quaternion():
@@ -119,7 +119,7 @@ def test_the_inertia_is_turned_by_the_quaternion():
 
 
 @pytest.mark.parametrize("kind", ["revolute", "prismatic"])
-def test_without_a_limit_there_is_none(kind):
+def test_without_a_limit_nothing_is_limited(kind):
     model = read(arm(kind=kind, inside=AXIS)).model
     assert model.lowerPositionLimit[7] < -1e300 and model.upperPositionLimit[7] > 1e300
     assert model.effortLimit[6] > 1e300 and model.velocityLimit[6] > 1e300
@@ -232,9 +232,9 @@ def test_turns_of_a_continuous_leader_count(tmp_path, kind, multiplier, counted)
 
 
 def test_damping_and_friction_are_recorded_and_noted():
-    found = read(arm(inside=AXIS + '<dynamics damping="0.25" friction="0.5"/>'))
-    assert found.joints["hinge"].damping == 0.25
-    texts = [note for _, _, note in ignored(found.joints, "arm")]
+    result = read(arm(inside=AXIS + '<dynamics damping="0.25" friction="0.5"/>'))
+    assert result.joints["hinge"].damping == 0.25
+    texts = [note for _, _, note in ignored(result.joints, "arm")]
     assert ["damping" in text for text in texts] == [True, False]
     assert all("'hinge'" in text for text in texts)
     assert read(arm()).notes == (*ignored(read(arm()).joints, "arm"),) == ()
@@ -292,7 +292,7 @@ def test_info_lists_the_warnings(tmp_path):
     assert says(text, "r: ", "'hinge'")
 
 
-def test_info_lists_mimic_joints_and_what_hangs_on_them(tmp_path):
+def test_info_lists_mimic_joints_and_their_children(tmp_path):
     from fflin.robot.summary import robot_info
 
     path = tmp_path / "r.urdf"
@@ -364,7 +364,7 @@ def test_the_stack_size_of_threads_is_left_as_it_was():
     assert threading.stack_size() == before
 
 
-def test_wrong_and_infinite_limits_are_none():
+def test_wrong_and_infinite_limits_are_ignored():
     for limit in (
         'lower="-inf" upper="inf" effort="inf"',
         'lower="" upper="-" effort="-1"',
@@ -376,7 +376,7 @@ def test_wrong_and_infinite_limits_are_none():
         assert model.effortLimit[6] > 1e300
 
 
-def test_a_note_is_told_once_for_all_its_lines():
+def test_a_note_is_reported_once_for_all_its_lines():
     document = robot(
         *(link(name) for name in "abc"), joint("j", "a", "b"), joint("k", "a", "c")
     )
@@ -418,7 +418,7 @@ def test_arguments_of_xacro_are_given_in_python_and_in_robot_files(tmp_path):
     }
     for mass, loaded in cases.items():
         assert loaded.model.inertias[2].mass == mass
-    assert len({each.urdf_sha256 for each in cases.values()}) == 4
+    assert len({item.urdf_sha256 for item in cases.values()}) == 4
     with pytest.raises(fflin.UnknownNameError, match="arn"):
         fflin.load(path, xacro={"arn": 4})
     assert main(["info", str(path), "--xacro", "arm=4"]) == 0

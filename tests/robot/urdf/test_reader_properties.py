@@ -211,9 +211,9 @@ def test_mutated(path, mutations, tmp_path, capfd):
         assert sorted([*robot.joint_names, *followers]) == sorted(moving)
         assert math.isclose(robot.mass, _mass(root), rel_tol=1e-12)
         try:
-            found = fflin.check(robot, fflin.linearize(robot))
+            result = fflin.check(robot, fflin.linearize(robot))
         except fflin.SingularInertiaError:
             pass
         else:
-            assert found.ok, str(found)
+            assert result.ok, str(result)
     assert capfd.readouterr() == ("", "")
