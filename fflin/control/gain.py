@@ -483,8 +483,12 @@ def guaranteed_margin(gain: Gain) -> float:
     W = gain.R
     if gain.dt:
         W = W + gain.B.T @ gain.P @ gain.B
-    lowest = np.linalg.eigvalsh(least / np.outer(scale, scale))[0]
-    highest = np.linalg.eigvalsh(W / np.outer(scale, scale))[-1]
+    with np.errstate(over="ignore", invalid="ignore"):
+        least, W = (X / np.outer(scale, scale) for X in (least, W))
+    if not np.isfinite(least + W).all():
+        return 0.0
+    lowest = float(np.linalg.eigvalsh(least)[0])
+    highest = float(np.linalg.eigvalsh(W)[-1])
     if lowest <= 0.0:
         return 0.0
     return 1.0 / (math.sqrt(highest / lowest) + 0.5)
