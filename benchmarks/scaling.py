@@ -3,7 +3,8 @@
 Run as ``python -m benchmarks.scaling [--sizes 10 30 60 100 200] [--kind chain]``. Each cell is the
 CPU time of one call in milliseconds, the shortest of a few calls. The last two columns are the
 exponents e of a cost proportional to n^e: by least squares over all sizes, and between the last
-two. The row of SciPy is the cost of its general solver for the Riccati equation of the row above.
+two. The rows of SciPy are the costs of its general solvers for the Riccati equation of the row
+above. They are nan if SciPy finds no solution, as for long chains that are sampled.
 """
 
 import argparse
@@ -17,7 +18,7 @@ os.environ |= {
 }
 
 import numpy as np
-from scipy.linalg import solve_continuous_are
+from scipy.linalg import solve_continuous_are, solve_discrete_are
 
 import fflin
 from benchmarks.robots import generated
@@ -25,6 +26,7 @@ from benchmarks.robots import generated
 SIZES = (10, 20, 40, 60, 80, 100, 140, 200)
 STIFFNESS = 100.0  # [N m/rad] of every joint, for the modes
 STEPS = 20  # of a simulation, at rest with a rotating base
+SAMPLE = 0.01  # [s], of the sampled regulator
 POINTS = 8  # of a sweep, which are computed together
 SECONDS = 1.0  # a call that takes longer is not repeated
 
@@ -57,6 +59,11 @@ def tasks(kind: str, n: int) -> Tasks:
     def riccati() -> object:
         return solve_continuous_are(lin.A, lin.B, Q, R)
 
+    sampled, cost = lin.discretize(SAMPLE), fflin.sampled_cost(lin, SAMPLE, Q, R)
+
+    def sampled_riccati() -> object:
+        return solve_discrete_are(sampled.A, sampled.B, cost.Q, cost.R, s=cost.N)
+
     return {
         "linearize": lambda: fflin.linearize(robot),
         "linearize, rotating": lambda: fflin.linearize(robot, v=v),
@@ -64,6 +71,8 @@ def tasks(kind: str, n: int) -> Tasks:
         "controllability": lambda: fflin.controllability(lin),
         "lqr": lambda: fflin.lqr(lin, Q, R),
         "SciPy's Riccati solver": riccati,
+        "lqr, sampled": lambda: fflin.lqr(sampled, *cost),
+        "SciPy's, sampled": sampled_riccati,
         "lqr, margins printed": lambda: str(fflin.lqr(lin, Q, R)),
         "modes": lambda: fflin.modes(sprung),
         f"simulate, {STEPS} steps": motion,
@@ -72,11 +81,14 @@ def tasks(kind: str, n: int) -> Tasks:
 
 
 def shortest(call: Callable[[], object], repetitions: int = 3) -> float:
-    """Return the shortest CPU time of a call [s]."""
+    """Return the shortest CPU time of a call [s], or nan if SciPy finds no solution."""
     times: list[float] = []
     for _ in range(repetitions):
         start = time.process_time()
-        call()
+        try:
+            call()
+        except (ValueError, np.linalg.LinAlgError):
+            return np.nan
         times.append(time.process_time() - start)
         if times[-1] > SECONDS:
             break
@@ -84,7 +96,9 @@ def shortest(call: Callable[[], object], repetitions: int = 3) -> float:
 
 
 def exponent(sizes: list[int], seconds: list[float]) -> float:
-    """Return e of the power law n^e that fits the times."""
+    """Return e of the power law n^e that fits the times, or nan if a time is nan."""
+    if not np.isfinite(seconds).all():
+        return np.nan
     return float(np.polyfit(np.log(sizes), np.log(np.maximum(seconds, 1e-6)), 1)[0])
 
 
@@ -113,8 +127,13 @@ def main() -> None:
         cells = [f"{1e3 * each:>9.3g}" for each in seconds]
         fits = [exponent(sizes, seconds), exponent(sizes[-2:], seconds[-2:])]
         print(f"{name:<24}{''.join(cells)}{''.join(f'{each:>8.1f}' for each in fits)}")
-    ratios = np.divide(times["SciPy's Riccati solver"], times["lqr"])
-    print(f"{'SciPy / lqr':<24}{''.join(f'{each:>9.2f}' for each in ratios)}")
+    for theirs, name in (
+        ("SciPy's Riccati solver", "lqr"),
+        ("SciPy's, sampled", "lqr, sampled"),
+    ):
+        ratios = np.divide(times[theirs], times[name])
+        title = f"SciPy / {name}"
+        print(f"{title:<24}{''.join(f'{each:>9.2f}' for each in ratios)}")
 
 
 if __name__ == "__main__":

@@ -38,6 +38,10 @@ Part = TypeVar("Part", bound=LinearModel)
 # consists of rows of an orthonormal basis.
 _ROUNDING = 1e-9
 
+# An entry of M B_u that exceeds this fraction of its terms and of its column is not a rounding
+# error.
+_CLEAR = 1e-3
+
 # `momentum_reduction` requires that the part of f0 which the reduced states cannot represent is at
 # most this fraction of the largest entry of f0.
 _DRIFT = 1e-9
@@ -406,6 +410,8 @@ def unpushed_positions(lin: LinearModel) -> Indices:
     if not positions:
         return np.zeros(0, dtype=np.intp)
     source = lin.generator or lin
+    if _clearly_pushed(source, positions):
+        return np.zeros(0, dtype=np.intp)
     forces = mechanics.second_order(source).S.values
     driven = np.count_nonzero(forces, axis=1)
     base = np.array([i for i in positions if not driven[i]], dtype=np.intp)
@@ -420,6 +426,21 @@ def unpushed_positions(lin: LinearModel) -> Indices:
     if np.abs(on_others).max(initial=0.0) > _ROUNDING:
         return base[:0]  # in rotating axes, each direction affects the others
     return base
+
+
+def _clearly_pushed(lin: LinearModel, positions: list[int]) -> bool:
+    """Return whether inputs push all these positions, without doubt about rounding errors.
+
+    It is a quick test for most models, which need no second-order form then.
+    """
+    inputs = lin.B[len(lin.M) :]
+    forces = lin.M @ inputs
+    size = np.sqrt(lin.M.diagonal())
+    columns = np.linalg.norm(forces / size[:, None], axis=0)
+    terms = np.abs(lin.M[positions]) @ np.abs(inputs)
+    scale = np.maximum(np.outer(size[positions], columns), terms)
+    clear = np.abs(forces[positions]) > _CLEAR * scale
+    return bool(clear.any(axis=1).all())
 
 
 def rigid_forces(body: LinearModel) -> Noisy:

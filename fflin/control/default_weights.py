@@ -10,7 +10,7 @@ from scipy.linalg import eigh
 from fflin.analysis.mechanics import rate_matrix, second_order
 from fflin.base.errors import InputError, listed
 from fflin.base.names import state_keys
-from fflin.base.validation import Array, Complex, Mask
+from fflin.base.validation import Array, Complex, Indices, Mask
 from fflin.control.channel import warn_beyond
 from fflin.control.optimal.riccati import rates_of, solve
 from fflin.linear.model import LinearModel
@@ -25,8 +25,8 @@ BANDWIDTH, _HELD = 0.2, 0.3
 _OF_FALL = 0.25
 
 # Design displacements, from which the robot must return without exceeding a limit: the ROTATION of
-# the base [deg], its OFFSET in radii of gyration, and the ANGLE [rad] or LENGTH [m] of a joint. A
-# joint displacement is at most TRAVEL times the joint's position limit.
+# the base about the centre of mass [deg], its OFFSET in radii of gyration, and the ANGLE [rad] or
+# LENGTH [m] of a joint. A joint displacement is at most TRAVEL times the joint's position limit.
 ROTATION, OFFSET, ANGLE, LENGTH, TRAVEL = 30.0, 0.1, 0.3, 0.1, 0.25
 
 # If a mode is unstable, the initial bandwidth is at least _OF_GROWTH times the growth rate of the
@@ -41,7 +41,7 @@ _OF_GROWTH, _LEAST_OF_GROWTH = 0.4, 0.25
 _LEAST_REACH = 1e-3
 
 # The inputs count as having no effect on coordinate i if the diagonal entry i of S R^-1 S' is at
-# most this times D_i (10.7).
+# most this times the entry i of D (10.7), both about the centre of mass.
 _IDLE = 1e-12
 
 # Nor do the inputs have an effect in a direction in which the eigenvalue of S R^-1 S', in units of
@@ -146,13 +146,17 @@ def _of_inertia(
     h = lin.dt or 1.0
     m = len(M)
     size = displacements(lin, pace.fraction)
-    theta = np.abs(inverse) @ size
-    D = np.abs(M) @ theta / theta
+    # The displacements are rotations about the centre of mass, displacements of the centre of mass,
+    # and joint displacements. `shift` maps them to the coordinates of the model.
+    X = _about_center_of_mass(lin)
+    shift = np.linalg.solve(inverse, X @ inverse)
+    D = _upper_bound(lin, M, X, np.abs(inverse) @ size)
     S = lin.M @ lin.B[m:] / h
     cost = _input_costs(lin, S, D)
-    reach, idle = _effect_of_inputs(S, cost, D)
-    ratios, T = eigh(reach, M)
-    back = T.T @ M  # T^-1
+    idle = _idle(X.T @ S, cost, X.T @ D @ X)
+    reach = _definite((S / cost) @ S.T, D)
+    ratios, T = _modes(M, _definite(_reference_effect(lin, S, D), D), reach)
+    back = np.linalg.inv(T)
     # Scale the cost so that the frequency of the slowest mode is the bandwidth w.
     unit = ratios[0]
     cost, reach, ratios = cost * unit, reach / unit, ratios / unit
@@ -161,23 +165,17 @@ def _of_inertia(
     on_positions = 0.5 * (on_positions + on_positions.T)
     # Gain (nu, m) from coordinates to inputs, for a bandwidth of 1 rad/s.
     gain = (S / cost).T @ np.linalg.solve(
-        reach, back.T @ (ratios[:, None] ** 0.75 * to_modes)
+        reach, M @ T @ (ratios[:, None] ** 0.75 * to_modes)
     )
     rates = ratios**0.375
-    mass = np.ones(m) if (lin.M == M).all() else np.diag(T.T @ lin.M @ T)
-    # `room` contains the limits on the rates of the coordinates, and on the momenta that the inputs
-    # add to wheels.
-    room = {name: lin.limits.get(name, math.inf) for name in lin.state_names[m:]} | {
-        **momenta
-    }
+    damped = (lin.M != M).any()
+    mass = np.diag(back @ np.linalg.solve(M, lin.M @ T)) if damped else np.ones(m)
+    room, motors = _speed_limits(lin, momenta)
     added = (S / cost).T @ np.linalg.solve(reach, lin.M @ T)
-    motors = [
-        motor_of(lin.input_names, name.removeprefix("qdot_m.")) for name in momenta
-    ]
-    taken = np.vstack((T, added[np.array(motors, dtype=np.intp)]))
-    use = _largest_use(gain, size, lin.state_names)
+    taken = np.vstack((T, added[motors]))
+    use = _largest_use(gain @ shift, size, lin.state_names)
     speeds = _limits_on(
-        "speed", room, _fastest(taken, rates, to_modes, size, lin, mass), 1.0
+        "speed", room, _fastest(taken, rates, to_modes @ shift, size, lin, mass), 1.0
     )
     efforts = _limits_on("effort", _efforts_left(lin), use, 2.0)
     limit = min([Limit(pace.bandwidth, ""), *speeds, *efforts])
@@ -192,7 +190,6 @@ def _of_inertia(
             limit,
             Limit(pace.held / (pace.hold * float(rates[-1])), "the sampling time"),
         )
-    damped = (lin.M != M).any()
     on_velocities = _on_velocities(lin, S, cost, D / unit, damped) if loaded else None
 
     def costs(w: float) -> tuple[Array, Array]:
@@ -204,7 +201,7 @@ def _of_inertia(
 
     if loaded:
         least = min(Limit(_LEAST_OF_GROWTH * growth, mode), limit)
-        limit, achieved = _slowed(lin, costs, size, size * ~idle, limit, least)
+        limit, achieved = _slowed(lin, costs, shift, size, size * ~idle, limit, least)
     rule = _rule(lin, size, limit, achieved, pace.fraction * ROTATION)
     if damped:
         rule += "; joint damping is included"
@@ -212,12 +209,76 @@ def _of_inertia(
     return *costs(limit.bandwidth), rule, limit.bandwidth, terms
 
 
+def _speed_limits(
+    lin: LinearModel, momenta: Mapping[str, float]
+) -> tuple[dict[str, float], Indices]:
+    """Return the limits on the rates of the coordinates and on the momenta of wheels.
+
+    The second result contains the indices of the motors of these wheels among the inputs.
+    """
+    limits = {
+        name: lin.limits.get(name, math.inf) for name in lin.state_names[len(lin.M) :]
+    }
+    motors = [
+        motor_of(lin.input_names, name.removeprefix("qdot_m.")) for name in momenta
+    ]
+    return limits | dict(momenta), np.array(motors, dtype=np.intp)
+
+
+def _about_center_of_mass(lin: LinearModel) -> Array:
+    """Return X (m, m), which maps velocities about the centre of mass to the model's velocities.
+
+    The velocity of the base about the centre of mass is the velocity of the point of the base that
+    coincides with the centre of mass of the robot. X is the identity if the states do not contain
+    the attitude and the position of the base.
+    """
+    X = np.eye(len(lin.M))
+    if _has_free_base(lin):
+        X[3:6, :3] = -lin.M[3:6, :3] / lin.M[3, 3]
+    return X
+
+
+def _has_free_base(lin: LinearModel) -> bool:
+    return list(lin.state_names[:6]) == list(state_keys(())[:6])
+
+
+def _upper_bound(lin: LinearModel, M: Array, X: Array, theta: Array) -> Array:
+    """Return D (m, m) of (10.7), for design displacements `theta` (m,) of the quasi-coordinates.
+
+    In coordinates about the centre of mass, D has one diagonal block for the attitude of the base,
+    one for its position, and one entry for each joint.
+    """
+    about_center = X.T @ M @ X
+    D = np.zeros_like(M)
+    for block in (blocks := _blocks(lin)):
+        at = np.ix_(block, block)
+        D[at] = about_center[at]
+        for other in blocks:
+            if other is not block:
+                coupling = np.linalg.norm(about_center[np.ix_(block, other)], 2)
+                ratio = theta[other].max() / theta[block].max()
+                D[block, block] += coupling * ratio
+    back = np.linalg.inv(X)
+    bound: Array = back.T @ D @ back
+    return bound
+
+
+def _blocks(lin: LinearModel) -> list[Indices]:
+    """Return the indices of the base attitude, of the base position, and of each joint."""
+    blocks: dict[str, list[int]] = {}
+    for index, name in enumerate(lin.state_names[: len(lin.M)]):
+        group = name.partition(".")[0]
+        block = group if group in ("q_b", "r_b") else name
+        blocks.setdefault(block, []).append(index)
+    return [np.array(indices, dtype=np.intp) for indices in blocks.values()]
+
+
 def _input_costs(lin: LinearModel, S: Array, D: Array) -> Array:
     """Return the diagonal of R (nu,), up to a factor.
 
-    The weight of an input is the sum of the squares of its generalised forces, divided by D (10.7).
+    The weight of an input is s' D^-1 s (10.7), with the generalised forces s of the input.
     """
-    cost: Array = (S**2 / D[:, None]).sum(axis=0)
+    cost: Array = (S * np.linalg.solve(D, S)).sum(axis=0)
     if not cost.all():
         raise InputError(
             f"input {lin.input_names[int(cost.argmin())]} has no effect on any coordinate; remove "
@@ -226,26 +287,65 @@ def _input_costs(lin: LinearModel, S: Array, D: Array) -> Array:
     return cost
 
 
-def _effect_of_inputs(S: Array, cost: Array, D: Array) -> tuple[Array, Mask]:
-    """Return S R^-1 S' (m, m), and a mask of the coordinates on which no input has an effect."""
-    reach = (S / cost) @ S.T
-    idle = reach.diagonal() <= _IDLE * D
-    reach[idle, idle] = D[idle]
-    return _definite(reach, np.sqrt(D)), idle
+def _reference_effect(lin: LinearModel, S: Array, D: Array) -> Array:
+    """Return the effect (m, m) of inputs of which the base force acts at the centre of mass.
+
+    The torque and the force on the base have one weight matrix each instead of weights for single
+    axes, so the effect does not depend on the position and the axes of the root frame (10.7).
+    """
+    names = list(lin.input_names)
+    torque, force = (
+        [names.index(axis) for axis in axes if axis in names]
+        for axes in (("tau_b.x", "tau_b.y", "tau_b.z"), ("F_b.x", "F_b.y", "F_b.z"))
+    )
+    S = S.copy()
+    if len(torque) == len(force) == 3 and _has_free_base(lin):
+        S[:, force] += S[:, torque] @ lin.M[:3, 3:6] / lin.M[3, 3]
+    blocks = [axes for axes in (torque, force) if len(axes) == 3]
+    together = [index for axes in blocks for index in axes]
+    blocks += [[index] for index in range(len(names)) if index not in together]
+    effect = np.zeros_like(D)
+    for block in blocks:
+        forces = S[:, block]
+        weight = forces.T @ np.linalg.solve(D, forces)
+        effect += forces @ np.linalg.solve(weight, forces.T)
+    return effect
 
 
-def _definite(reach: Array, sizes: Array) -> Array:
+def _modes(M: Array, reference: Array, reach: Array) -> tuple[Array, Array]:
+    """Return the eigenvalues (m,) of the `reference` effect, and the modes (m, m) of the loop.
+
+    `reach` is the effect of the inputs. The modes are the columns of T V Lambda^(-1/2) of (10.7).
+    If the two effects are equal, the modes are T, the eigenvectors of the reference effect.
+    """
+    ratios, T = eigh(reference, M)
+    V = np.linalg.cholesky((T.T @ reach @ T)[::-1, ::-1])[::-1, ::-1]
+    modes: Array = T @ V / np.sqrt(ratios)
+    return ratios, modes
+
+
+def _idle(S: Array, cost: Array, D: Array) -> Mask:
+    """Return a mask (m,) of the coordinates on which no input has an effect.
+
+    S and D are in coordinates about the centre of mass.
+    """
+    idle: Mask = (S**2 / cost).sum(axis=1) <= _IDLE * D.diagonal()
+    return idle
+
+
+def _definite(reach: Array, D: Array) -> Array:
     """Return the effect S R^-1 S' (m, m) of the inputs, made positive definite.
 
-    The gain needs its inverse. In directions without an effect, it becomes D, which is the square
-    of `sizes` (m,). All other directions keep their effect, so that a weak one is not mistaken for
-    a strong one.
+    The gain needs its inverse. In directions without an effect, it becomes D (m, m). All other
+    directions keep their effect, so that a weak one is not mistaken for a strong one.
     """
-    effects, directions = np.linalg.eigh(reach / np.outer(sizes, sizes))
+    factor = np.linalg.cholesky(D)
+    unit = np.linalg.inv(factor)
+    effects, directions = np.linalg.eigh(unit @ reach @ unit.T)
     if effects[0] >= _NO_EFFECT:
         return reach
     effects[effects < _NO_EFFECT] = 1.0
-    root = sizes[:, None] * directions * np.sqrt(effects)
+    root = factor @ directions * np.sqrt(effects)
     definite: Array = root @ root.T
     return definite
 
@@ -255,9 +355,10 @@ def _on_velocities(
 ) -> Callable[[float], Array]:
     """Return a function that maps a bandwidth w to the weight (m, m) on velocities (10.8)."""
     m, X = len(lin.M), rate_matrix(lin)
-    size = np.sqrt(least)
-    values, directions = np.linalg.eigh((S / cost) @ S.T / np.outer(size, size))
-    root = size[:, None] * directions * np.sqrt(values.clip(_LEAST_REACH))
+    factor = np.linalg.cholesky(least)
+    forces = np.linalg.solve(factor, S)
+    values, directions = np.linalg.eigh((forces / cost) @ forces.T)
+    root = factor @ directions * np.sqrt(values.clip(_LEAST_REACH))
     L = np.linalg.solve(lin.M, root)
     F = np.linalg.solve(L, X[m:, :m] @ X[:m, m:] @ L)
     H = np.linalg.solve(L, X[m:, m:] @ L)
@@ -277,8 +378,7 @@ def _on_velocities(
 
 def _rate_of_fall(lin: LinearModel) -> float:
     """Return sqrt(g / r) [rad/s], with the gravity g that the inputs balance; 0 without gravity."""
-    names = list(lin.state_names)
-    if names[:6] != [*state_keys(())[:6]]:
+    if not _has_free_base(lin):
         return 0.0
     m = len(lin.M)
     # A rotation by the angle 2 q_b turns the force that balances gravity.
@@ -292,11 +392,8 @@ def _radius_of_gyration(lin: LinearModel) -> float:
     It is the radius of a thin spherical shell with the robot's mass and trace of inertia.
     """
     M = lin.M
-    mass = lin.M[3, 3]
-    center = np.array((M[4, 2] - M[5, 1], M[5, 0] - M[3, 2], M[3, 1] - M[4, 0])) / (
-        2.0 * mass
-    )
-    moment = np.trace(M[:3, :3]) - 2.0 * mass * center @ center
+    mass = float(M[3, 3])
+    moment = np.trace(M[:3, :3] - M[:3, 3:6] @ M[3:6, :3] / mass)
     return math.sqrt(max(float(moment) / (2.0 * mass), 1e-300))
 
 
@@ -306,7 +403,7 @@ def displacements(lin: LinearModel, fraction: float) -> Array:
     names, units = lin.state_names[:m], lin.state_units[:m]
     radius = 1.0
     size = np.empty(m)
-    if names[:6] == state_keys(())[:6]:
+    if _has_free_base(lin):
         radius = _radius_of_gyration(lin)
     for i, (name, unit) in enumerate(zip(names, units, strict=True)):
         if name.startswith("q_b."):
@@ -436,6 +533,7 @@ def _growth(lin: LinearModel) -> Limit:
 def _slowed(
     lin: LinearModel,
     costs: Callable[[float], tuple[Array, Array]],
+    shift: Array,
     size: Array,
     driven: Array,
     limit: Limit,
@@ -446,8 +544,9 @@ def _slowed(
     The bandwidth starts at `limit` and is not reduced below `least`. The efforts at the start of
     the return are computed for displacements `size` (m,). The efforts during the return are
     computed for displacements `driven` (m,). Entries of `driven` are zero for coordinates on which
-    no input acts, because only springs or gravity can return such coordinates. The results are the
-    bandwidth and a description of the loop.
+    no input acts, because only springs or gravity can return such coordinates. `shift` (m, m) maps
+    the displacements to the coordinates of the model. The results are the bandwidth and a
+    description of the loop.
     """
     # A trial contains the factor `left` (see `_TRIALS`), the name of the first effort that reaches
     # its limit, the bandwidth, a description of the loop, and the largest magnitudes (nu,) of the
@@ -465,8 +564,8 @@ def _slowed(
         decaying = (K @ modes) * np.exp(rates * time[:, None])[:, None]
         later = (decaying @ np.linalg.inv(modes)[:, : len(size)]).real
         use = np.maximum(
-            _largest_use(K, size, lin.state_names),
-            _largest_use(later, driven, lin.state_names).max(axis=0),
+            _largest_use(K[:, : len(size)] @ shift, size, lin.state_names),
+            _largest_use(later @ shift, driven, lin.state_names).max(axis=0),
         )
         efforts = _limits_on("effort", _efforts_left(lin), use, 2.0)
         left, effort = min(efforts, default=Limit(1.0, ""))

@@ -16,7 +16,7 @@ from fflin.base.names import group_of, input_keys, with_units
 from fflin.base.record import Design
 from fflin.base.tables import cut, folded, grid, matrix, signals
 from fflin.base.validation import Array, Mask, Poles, Values, Vector
-from fflin.control.optimal.largest_gain import largest_gain
+from fflin.control.optimal.largest_gain import gain_crossings, largest_gain
 from fflin.control.optimal.riccati import Solution, rates_of
 from fflin.control.policy import Policy
 from fflin.dynamics.coordinates import frame_of
@@ -244,25 +244,7 @@ class Gain(ModelDesign):
     @cached_property
     def margins(self) -> Margins:
         """Gain and phase margins at the inputs, computed at first access."""
-        # The disk margin is the inverse H-infinity norm of half the difference between sensitivity
-        # and complementary sensitivity at the inputs. The inputs are scaled by sqrt(R_ii). See
-        # Seiler, Packard and Gahinet, IEEE Control Systems 40(5), 2020. The norm is computed from
-        # eigenvalues of Hamiltonian matrices, without a grid of frequencies. See Bruinsma and
-        # Steinbuch, Systems and Control Letters 14(4), 1990.
-        S = selection(self.regulated or self.state_names, self.state_names)
-        scale = np.sqrt(self.R.diagonal())
-        F = S @ self.closed_loop @ S.T
-        G = S @ self.B / scale
-        H = -scale[:, None] * self.K @ S.T
-        D = 0.5 * np.eye(len(H))
-        if self.dt:
-            # The bilinear map s = (z - 1)/(z + 1) preserves the H-infinity norm.
-            inverse, unit = np.linalg.inv(F + np.eye(len(F))), np.eye(len(F))
-            D = D - H @ inverse @ G
-            F = inverse @ (F - unit)
-            G = 2.0**0.5 * inverse @ G
-            H = 2.0**0.5 * H @ inverse
-        disk = min(1.0 / largest_gain(F, G, H, D)[0], 2.0)
+        disk = min(1.0 / largest_gain(*_asymmetry(self))[0], 2.0)
         most = math.inf
         if disk < 2.0:
             most = (2.0 + disk) / (2.0 - disk)
@@ -334,7 +316,7 @@ def make_gain(
 def cautions(gain: Gain) -> list[str]:
     """Return warnings about a small disk margin at the inputs, and about negative thrust."""
     messages: list[str] = []
-    if not _has_margin_of_kalman(gain) and (margins := gain.margins).disk < _FRAGILE:
+    if _may_be_fragile(gain) and (margins := gain.margins).disk < _FRAGILE:
         remedy = "give a diagonal R, such as the R of the default weights"
         if gain.dt:
             remedy = "shorten dt, or slow the loop as the default weights do"
@@ -476,17 +458,89 @@ def table_of_poles(design: HasPoles, matrix: str) -> str:
     return f"poles of {matrix}, slowest first\n\n{grid(cut(table), 'l')}"
 
 
-def _has_margin_of_kalman(gain: Gain) -> bool:
-    """Return whether the weights alone guarantee a disk margin of 2/3 at the inputs.
+def _asymmetry(gain: Gain) -> tuple[Array, Array, Array, Array]:
+    """Return a continuous system (F, G, H, D), whose largest gain is the inverse disk margin.
 
-    With the inputs scaled by the square roots of a diagonal R, Kalman's inequality bounds the
-    sensitivity of a continuous regulator without cross weights by 1. The disk margin is then at
-    least 1 / (1 + 1/2). See Safonov and Athans, IEEE Trans. Automatic Control 22(2), 1977.
+    Its transfer function is half the difference between sensitivity and complementary sensitivity
+    at the inputs. The inputs are scaled by sqrt(R_ii). See Seiler, Packard and Gahinet, IEEE
+    Control Systems 40(5), 2020. The largest gain is computed from eigenvalues of Hamiltonian
+    matrices, without a grid of frequencies. See Bruinsma and Steinbuch, Systems and Control Letters
+    14(4), 1990.
     """
-    diagonal = np.count_nonzero(gain.R) == np.count_nonzero(gain.R.diagonal())
-    return bool(
-        diagonal and not gain.dt and not gain.N.any() and gain.residual <= _SOLVED
+    S = _regulated(gain)
+    scale = np.sqrt(gain.R.diagonal())
+    F, G, H = (
+        S @ gain.closed_loop @ S.T,
+        S @ gain.B / scale,
+        -scale[:, None] * gain.K @ S.T,
     )
+    D = 0.5 * np.eye(len(H))
+    if not gain.dt:
+        return F, G, H, D
+    # The bilinear map s = (z - 1)/(z + 1) preserves the H-infinity norm.
+    inverse, unit = np.linalg.inv(F + np.eye(len(F))), np.eye(len(F))
+    D = D - H @ inverse @ G
+    F, G, H = (
+        inverse @ (F - unit),
+        2.0**0.5 * inverse @ G,
+        2.0**0.5 * H @ inverse,
+    )
+    return F, G, H, D
+
+
+def _regulated(gain: Gain) -> Array:
+    """Return the matrix that selects the regulated states from all states."""
+    return selection(gain.regulated or gain.state_names, gain.state_names)
+
+
+def _may_be_fragile(gain: Gain) -> bool:
+    """Return whether the disk margin may be below _FRAGILE.
+
+    Both conditions below exclude it, and are quicker than the margin itself.
+    """
+    if guaranteed_margin(gain) >= _FRAGILE:
+        return False
+    F, G, H, D = _asymmetry(gain)
+    bound = 1.0 / _FRAGILE
+    if np.linalg.norm(D, 2) >= bound:
+        return True
+    _, on_axis = gain_crossings(F, G, H, D, bound)
+    return bool(on_axis.any())
+
+
+def guaranteed_margin(gain: Gain) -> float:
+    """Return a lower bound on the disk margin, which follows from the weights and P alone.
+
+    Let L be the loop gain at the inputs, let S = (I + L)^-1 be the sensitivity, and let W be R in
+    continuous time and R + B' P B for a sampled system. At every frequency, Kalman's equality and
+    the weights imply (I + L)* W (I + L) >= R - N' Q^-1 N. This bounds the largest singular value of
+    S. The disk margin is at least 1 / (|S| + 1/2). See Safonov and Athans, IEEE Trans. Automatic
+    Control 22(2), 1977. The inputs are scaled by sqrt(R_ii).
+    """
+    if gain.residual > _SOLVED:
+        return 0.0
+    scale = np.sqrt(gain.R.diagonal())
+    least = gain.R
+    if gain.N.any():
+        S = _regulated(gain)
+        try:
+            factor = np.linalg.cholesky(S @ gain.Q @ S.T)
+        except np.linalg.LinAlgError:
+            return 0.0
+        root = np.linalg.solve(factor, S @ gain.N)
+        least = least - root.T @ root
+    W = gain.R
+    if gain.dt:
+        W = W + gain.B.T @ gain.P @ gain.B
+    with np.errstate(over="ignore", invalid="ignore"):
+        least, W = (X / np.outer(scale, scale) for X in (least, W))
+    if not np.isfinite(least + W).all():
+        return 0.0
+    lowest = float(np.linalg.eigvalsh(least)[0])
+    highest = float(np.linalg.eigvalsh(W)[-1])
+    if lowest <= 0.0:
+        return 0.0
+    return 1.0 / (math.sqrt(highest / lowest) + 0.5)
 
 
 class Margins(NamedTuple):

@@ -63,12 +63,13 @@ def lqr(
     If no weights are given, fflin chooses weights that respect the limits of the URDF, see (10.7)
     of docs/derivation.md. The slowest closed-loop motion then has a bandwidth of 0.2 rad/s, or more
     if the inputs hold the robot against gravity. The bandwidth is lower if the robot would
-    otherwise exceed an effort or speed limit while it returns from a displacement of 30 deg of the
-    base and 0.3 rad of each joint. If the model is continuous, each input has a phase margin of at
-    least 60 deg and tolerates any gain factor above one half. A sampled regulator has smaller
-    margins; see ``gain.margins``. With springs or gravity, the controllable modes decay as fast as
-    without them (10.8). ``gain.weights`` states the bandwidth, decay rate and damping of the loop,
-    and lists any modes that still decay more slowly.
+    otherwise exceed an effort or speed limit while it returns from a rotation of 30 deg about its
+    centre of mass and 0.3 rad of each joint. Without springs, gravity and such limits, the
+    bandwidths do not depend on the root frame of the URDF. If the model is continuous, each input
+    has a phase margin of at least 60 deg and tolerates any gain factor above one half. A sampled
+    regulator has smaller margins; see ``gain.margins``. With springs or gravity, the controllable
+    modes decay as fast as without them (10.8). ``gain.weights`` states the bandwidth, decay rate
+    and damping of the loop, and lists any modes that still decay more slowly.
 
     If no input pushes the base, its position and velocity are not regulated. Such inputs are, for
     example, a base torque or reaction wheels, with or without joint torques. Of a model with

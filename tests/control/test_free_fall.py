@@ -72,11 +72,11 @@ def test_gains_in_free_fall_are_the_gains_without_gravity(inputs, sample):
 
 
 def test_tracking_in_free_fall_returns_the_joints_and_attitude():
-    along, _, _ = flights(MOTORS, duration=0.8)
-    schedule = fflin.tvlqr(along, sample=0.04)
+    along, _, _ = flights(MOTORS, duration=1.0)
+    schedule = fflin.tvlqr(along, sample=0.05)
     policy = fflin.TrajectoryFeedback(along, schedule)
     q0, v0 = policy.beside({"q_m.arm_proximal": 0.02, "q_m.arm_distal": -0.02})
-    motion = fflin.simulate(along.robot, policy, q0=q0, v0=v0, duration=0.8, dt=0.01)
+    motion = fflin.simulate(along.robot, policy, q0=q0, v0=v0, duration=1.0, dt=0.01)
     e = motion.x[-1, 6:8] - along[-1].q[7:9]
     assert np.abs(e).max() < 0.004
 

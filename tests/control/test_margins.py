@@ -7,6 +7,8 @@ import pytest
 from scipy.optimize import minimize_scalar
 
 import fflin
+from fflin.control.gain import guaranteed_margin
+from fflin.control.lqr import regulator
 from fflin.control.optimal.largest_gain import ACCURACY, _largest_among, largest_gain
 from fflin.control.plots import input_loops
 from tests.support.weights import unit_weights
@@ -211,22 +213,48 @@ def test_the_disk_margin_is_the_least_over_a_sweep_and_exact_on_both_sides(case)
             )
 
 
-def test_margins_are_computed_for_the_warning_only_if_the_weights_do_not_guarantee_them():
-    """Kalman's inequality needs a diagonal R, no cross weights, and continuous inputs."""
-    lin = fflin.linearize(fflin.load("cubesat"))
+@pytest.mark.parametrize("name", ["cubesat", "ets_vii", "planar_detumble"])
+@pytest.mark.parametrize("dt", [0.0, 0.01, 0.1, 1.0])
+def test_the_margin_that_the_weights_guarantee_is_a_lower_bound(name, dt):
+    lin = fflin.linearize(fflin.load(name))
+    model = lin.discretize(dt) if dt else lin
     nx, nu = lin.B.shape
+    rng = np.random.default_rng(8)
     full = np.eye(nu) + 0.1
-    cross = np.zeros((nx, nu))
-    cross[0, 0] = 0.1
-    guaranteed = fflin.lqr(lin, np.eye(nx), np.eye(nu))
-    others = [
-        fflin.lqr(lin, np.eye(nx), full),
-        fflin.lqr(lin, np.eye(nx), np.eye(nu), cross),
-        fflin.lqr(lin.discretize(0.1), np.eye(nx), np.eye(nu)),
+    cross = 0.05 * rng.normal(size=(nx, nu))
+    costs = [
+        (np.eye(nx), np.eye(nu), None),
+        (np.eye(nx), np.diag(10.0 ** rng.uniform(-2.0, 2.0, nu)), None),
+        (np.eye(nx), full, None),
+        (np.eye(nx), full, cross),
     ]
-    assert "margins" not in vars(guaranteed)
-    assert all("margins" in vars(gain) for gain in others)
-    assert guaranteed.margins.disk >= 2.0 / 3.0 - 1e-9
+    if dt:
+        costs.append(tuple(fflin.sampled_cost(lin, dt, np.eye(nx), full)))
+    for cost in costs:
+        gain = regulator(model, *cost)
+        assert 0.0 < guaranteed_margin(gain) <= gain.margins.disk * (1.0 + ACCURACY)
+    # Of a mass without cross weights, the continuous guarantee is Kalman's.
+    if not dt:
+        assert guaranteed_margin(regulator(lin, *costs[0])) == pytest.approx(2.0 / 3.0)
+
+
+@pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
+def test_margins_are_computed_only_for_a_warning():
+    lin = fflin.linearize(fflin.load("canadarm2"))
+    nx, nu = lin.B.shape
+    sturdy = [
+        fflin.lqr(lin, np.eye(nx), np.eye(nu)),
+        fflin.lqr(lin, np.eye(nx), np.eye(nu) + 0.1),
+        fflin.lqr(lin.discretize(0.1)),
+    ]
+    fragile = [
+        fflin.acceleration_lqr(lin, 1.0, 1.0, 1.0),
+        fflin.lqr(lin.discretize(0.5), np.eye(nx), 1e-9 * np.eye(nu)),
+    ]
+    assert not any("margins" in vars(gain) for gain in sturdy)
+    assert all("margins" in vars(gain) for gain in fragile)
+    assert all(gain.margins.disk < 0.3 for gain in fragile)
+    assert all(gain.margins.disk >= 0.3 for gain in sturdy)
 
 
 def test_the_largest_gain_of_many_poles_is_found_from_few_of_them():

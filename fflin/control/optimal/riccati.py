@@ -260,8 +260,9 @@ def structured(equation: Riccati, apart: float = 0.0) -> Solution | None:
             return None
         modes, cost = loop
         P = modes.lyapunov_modal(cost)
-        known_modes = None if equation.discrete else modes
-        refined = _refined(equation, P, known_modes)
+        if equation.discrete:
+            modes = modes.sampled()
+        refined = _refined(equation, P, modes)
         solution = _finished(equation, *refined, "structured")
     if apart or (solution is not None and solution.sound):
         return solution
@@ -376,9 +377,11 @@ def _norm(matrix: Array) -> float:
 class ModalMatrix:
     """Modes V (n, n) of a real matrix F; conjugate modes are adjacent columns."""
 
-    def __init__(self, V: Values, poles: Values, discrete: bool) -> None:
+    def __init__(
+        self, V: Values, poles: Values, discrete: bool, inverse: Values | None = None
+    ) -> None:
         self.V = V
-        self.inverse = np.linalg.inv(V)
+        self.inverse = np.linalg.inv(V) if inverse is None else inverse
         self.values = poles
         across = poles.conj()[:, None]
         sums = across + poles
@@ -391,6 +394,14 @@ class ModalMatrix:
         """Compute the modes of a matrix."""
         poles, V = np.linalg.eig(F)
         return cls(V, poles, discrete)
+
+    def sampled(self) -> ModalMatrix:
+        """Return the modes of the sampled loop, if these are the modes after `_bilinear`.
+
+        By (10.6), both loops have the same modes. A pole s becomes (1 + s) / (1 - s).
+        """
+        poles = (1.0 + self.values) / (1.0 - self.values)
+        return ModalMatrix(self.V, poles, discrete=True, inverse=self.inverse)
 
     def lyapunov(self, r: Array) -> Array:
         """Return D with F' D + D F = -r (discrete: F' D F - D = -r); r (n, n) must be symmetric."""
