@@ -30,25 +30,26 @@ JETS = [
 ]
 
 
-def coarse(values):
-    """Round to 2^-20 of the largest entry: what differs by rounding alone becomes the same.
+def coarse(values, bits=20):
+    """Round to 2^-bits of the largest entry: what differs by rounding alone becomes the same.
 
     Gains are of LAPACK, whose last digits depend on the processor; motions under them should not.
     """
     values = np.asarray(values)
-    unit = 2.0 ** (np.ceil(np.log2(np.abs(values).max())) - 20.0)
+    unit = 2.0 ** (np.ceil(np.log2(np.abs(values).max())) - bits)
     return np.round(values / unit) * unit
 
 
 def coarse_cost(P):
     """Round each entry (i, j) of costs (m, nx, nx) relative to the largest P_ii and P_jj.
 
-    Gains between knots are computed from P, whose entries differ in unit by many orders.
+    Gains between knots are computed from P, whose entries differ in unit by many orders, and whose
+    small eigenvalues must survive: so the rounding is finer than that of gains.
     """
     largest = np.sqrt(P.diagonal(axis1=1, axis2=2).max(axis=0))
     units = 2.0 ** np.ceil(np.log2(np.where(largest > 0.0, largest, 1.0)))
     units = np.outer(units, units)
-    return coarse(P / units) * units
+    return coarse(P / units, bits=26) * units
 
 
 def coarsened(made, *names):
