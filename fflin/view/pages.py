@@ -26,7 +26,7 @@ from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.robot import Robot
 from fflin.simulation.motion import Motion
 from fflin.simulation.plots import JOINTS, WHEELS, charts, resting_from
-from fflin.simulation.report import STATES, Curve
+from fflin.simulation.report import STATES, THERE, Curve
 from fflin.simulation.run import Plant
 from fflin.view.page import Drawing, Page, body_poses, packed, subtitle
 from fflin.view.shapes import carriers_of
@@ -150,11 +150,12 @@ def frame_points(page: Page, film: Playback, *, follow: bool = False) -> Array:
 
     If `follow` is true, the displacement of the base from the first frame is subtracted.
     """
-    strongest = np.linalg.norm(film.force, axis=1).max() or 1.0
+    strongest = _strongest(film.force)
+    reach = ARROW * page.size / strongest if strongest > THERE else 0.0
     points = []
     for index in np.unique(np.linspace(0, len(film.poses) - 1, 24).astype(int)):
         base = film.poses[index, 0, :3]
-        tip = base + ARROW * page.size * film.force[index] / strongest
+        tip = base + reach * film.force[index]
         shift = base - film.poses[0, 0, :3] if follow else np.zeros(3)
         points.append(np.vstack((page.drawing.points(film.poses[index]), tip)) - shift)
     return np.concatenate(points)
@@ -163,6 +164,7 @@ def frame_points(page: Page, film: Playback, *, follow: bool = False) -> Array:
 def marks(page: Page, film: Playback, goals: Array) -> dict[str, object]:
     """Return the data of the trails, force arrows and thruster plumes of a page.
 
+    Forces and torques that never exceed THERE are rounding errors, and have no arrow.
     `goals` (k, njoints - 1, 7) are the poses of the target. If k > 1, the target moves, and the
     trails of the target are included.
     """
@@ -181,16 +183,29 @@ def marks(page: Page, film: Playback, goals: Array) -> dict[str, object]:
         ],
         "followed": [{"points": packed(points)} for points in followed.values()],
         "arrows": [
-            {"kind": kind, "longest": ARROW * page.size, "values": packed(values)}
-            for kind, values in (("force", film.force), ("torque", film.torque))
-            if np.any(values)
+            {
+                "kind": kind,
+                "unit": unit,
+                "longest": ARROW * page.size,
+                "values": packed(values),
+            }
+            for kind, unit, values in (
+                ("force", "N", film.force),
+                ("torque", "N m", film.torque),
+            )
+            if _strongest(values) > THERE
         ],
         "plumes": [
             {**nozzle, "values": packed(film.thrust[:, k])}
             for k, nozzle in enumerate(page.nozzles)
-            if film.thrust.any()
+            if np.abs(film.thrust).max(initial=0.0) > THERE
         ],
     }
+
+
+def _strongest(vectors: Array) -> float:
+    """Return the largest length of vectors (N, 3)."""
+    return float(np.linalg.norm(vectors, axis=1).max())
 
 
 def moved(poses: Array, point: Array) -> Array:
@@ -361,7 +376,7 @@ def panel(
     plots = [
         _plot(title, [Curve("", "", "", unit, values, _NONE)])
         for title, unit, values in readouts[:plotted]
-        if values.any()
+        if values.max() > THERE
     ]
     readouts.append((f"{motion.kept} drift", "", motion.momentum_drift[shown]))
     if len(motion.com_drift):  # empty in orbit, and if a file lacks it
@@ -375,7 +390,7 @@ def panel(
             lines.append(
                 curve._replace(values=curve.values[shown], reference=reference)
             )
-        least = max(_NOTHING, _UNSEEN * max(map(_size, lines)))
+        least = max(THERE, _UNSEEN * max(map(_size, lines)))
         seen = [curve for curve in lines if _size(curve) >= least]
         # States of the base are not plotted here, because the errors of attitude and position are
         # plotted above. Rates are plotted only if one of them comes near a limit.

@@ -30,7 +30,7 @@ function legendOf(info) {
     ...info.trails.filter(({ points }) => extent(points) > 0.02 * info.size).map(({ name }) => entry(`path of the ${name}`, MARKS[name], "trails", name)),
     ...Object.entries({ wheel: WHEEL, nozzle: NOZZLE }).filter(([kind]) => info[`${kind}s`].length).map(([kind, colour]) => (
       { label: kind === "wheel" ? "wheels" : "thrusters", colour, paths: info[`${kind}s`].map(({ path }, k) => [...path, `${kind} ${k}`]) })),
-    ...info.arrows.map(({ kind }) => entry(`${kind} on the base`, MARKS[kind], "wrench", kind)),
+    ...info.arrows.map(({ kind, unit, values }) => entry(`${kind} on the base (longest: ${figure(largest(values, 3), 2)} ${unit})`, MARKS[kind], "wrench", kind)),
   ];
   const rest = info.rest === null ? "" : `, at rest from ${Number(info.rest.toPrecision(4))} s`;
   const dashed = info.followed.length > 0;
