@@ -37,6 +37,8 @@ DWELL = 0.05
 # An error below _SEEN times its largest value is not judged.
 _TAIL, _GROWS, _SEEN = 0.1, 1.05, 1e-3
 
+TRUSTED = 0.1  # largest accepted relative error of a linear prediction
+
 # Smallest limit violation that is reported, relative to the limit. Smaller violations may be
 # integration errors.
 _SHARE = 1e-3

@@ -72,7 +72,7 @@ _ELSEWHERE: dict[str, object] = {
 
 _SCRIPTS = (
     *("sky", "orbit", "look", "camera", "stage", "marks", "equipment", "pick", "keys"),
-    *("chart", "plots", "large", "player", "live", "modes", "main"),
+    *("chart", "plots", "large", "compare", "player", "live", "modes", "main"),
 )
 
 

@@ -6,7 +6,7 @@ The page of natural modes animates one mode of a robot at a time.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -26,7 +26,7 @@ from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.robot import Robot
 from fflin.simulation.motion import Motion
 from fflin.simulation.plots import JOINTS, WHEELS, charts, resting_from
-from fflin.simulation.report import STATES, THERE, Curve
+from fflin.simulation.report import STATES, THERE, TRUSTED, Curve
 from fflin.simulation.run import Plant
 from fflin.view.page import Drawing, Page, body_poses, packed, subtitle
 from fflin.view.shapes import carriers_of
@@ -54,6 +54,10 @@ _NOTHING = 1e-14
 # A curve is not drawn if its largest magnitude is less than this fraction of the largest magnitude
 # of all curves in its plot.
 _UNSEEN = 1e-6
+
+# The time slider is coloured by the deviation of the linear prediction: small up to _SMALL, visible
+# up to TRUSTED, and beyond the validity of the linear model above.
+_SMALL = 0.01
 
 _NONE = np.zeros(0)
 
@@ -90,11 +94,13 @@ def motion_page(
         ghost.place(goals[0])
         if len(goals) > 1:
             moving.append((ghost, goals))
+    predicted, off = None, _NONE
     if motion.linear is not None:
         predicted = state.points(motion.linear[shown])[1]
-        moving.append(
-            (Drawing(page, robot, "linear", "linear"), body_poses(robot, predicted))
-        )
+        predicted_poses = body_poses(robot, predicted)
+        moving.append((Drawing(page, robot, "linear", "linear"), predicted_poses))
+        compared = goals if len(goals) else film.poses[:1]
+        off = deviation(page.drawing.corners, film.poses, predicted_poses, compared)
     held = []
     for caught, poses in payloads(motion, frame, shown):
         name = caught.prefix
@@ -131,18 +137,60 @@ def motion_page(
         "motion",
         points,
         subtitle=about[0],
-        **panel(robot, motion, shown, goal),
+        **panel(robot, motion, shown, goal, predicted),
         **marks(page, film, marked_goals),
         t=packed(t),
         speed=speed,
         follow=follow,
         target=len(goals) > 0,
-        linear=motion.linear is not None,
+        linear=predicted is not None,
+        deviation={"values": packed(off), "levels": [_SMALL, TRUSTED]},
+        boxes=_boxes(page.drawing),
         phases=[
             *zip(motion.phases, motion.starts.tolist(), names, about, strict=False)
         ],
         held=[drawing.prefix for drawing, _ in held],
     )
+
+
+def deviation(
+    corners: Mapping[int, Array], flown: Array, predicted: Array, compared: Array
+) -> Array:
+    """Return the relative error (N,) of predicted poses (N, njoints - 1, 7) of the bodies.
+
+    The error is the largest distance between a corner of a body's bounding box and its predicted
+    position. It is divided by the largest distance of any corner, at any time, from its position
+    at the poses `compared` (1 or N, njoints - 1, 7). `corners` contains the corners (8, 3) of each
+    joint's body.
+    """
+
+    def farthest(one: Array, other: Array) -> Array:
+        sizes = np.zeros(len(flown))
+        for joint, points in corners.items():
+            for point in points:
+                ends = [moved(poses[:, joint - ROOT], point) for poses in (one, other)]
+                distance = np.linalg.norm(ends[0] - ends[1], axis=1)
+                sizes = np.maximum(sizes, distance)
+        return sizes
+
+    largest = float(farthest(flown, compared).max())
+    errors = farthest(flown, predicted)
+    if largest < THERE:
+        return np.zeros(len(errors))
+    relative: Array = errors / largest
+    return relative
+
+
+def _boxes(drawing: Drawing) -> list[list[float]]:
+    """Return the least and largest coordinates of each body's bounding box, in joint order.
+
+    A body without a drawing has an empty list.
+    """
+    boxes: list[list[float]] = [[] for _ in drawing.paths]
+    for joint, corners in drawing.corners.items():
+        ends = np.concatenate((corners.min(axis=0), corners.max(axis=0)))
+        boxes[joint - ROOT] = ends.round(6).tolist()
+    return boxes
 
 
 def frame_points(page: Page, film: Playback, *, follow: bool = False) -> Array:
@@ -356,9 +404,15 @@ def errors(
 
 
 def panel(
-    robot: Robot, motion: Motion, shown: Array, target: Array
+    robot: Robot,
+    motion: Motion,
+    shown: Array,
+    target: Array,
+    predicted: Array | None = None,
 ) -> dict[str, object]:
     """Return the readouts and plots of a motion at the samples `shown`.
+
+    `predicted` (N, nq) are the configurations that the linear model predicts at these samples.
 
     Errors are relative to the configurations `target` (k, nq). If k = 0, the page shows changes
     from the first configuration instead of errors.
@@ -369,26 +423,31 @@ def panel(
     # The errors of the joints are plotted only for a moving target.
     plotted = 4 if len(target) > 1 else 2
     rest = resting_from(motion) if len(target) > 1 else None
-    readouts = [
-        (label_form.format(quantity), unit, values)
-        for quantity, (unit, values) in error_of.items()
-    ]
-    plots = [
-        _plot(title, [Curve("", "", "", unit, values, _NONE)])
-        for title, unit, values in readouts[:plotted]
-        if values.max() > THERE
-    ]
+    predicted_errors = dict[str, tuple[str, Array]]()
+    if predicted is not None:
+        predicted_errors = errors(robot, predicted, compared, motion.wheels)
+    readouts, plots = list[tuple[str, str, Array]](), list[dict[str, object]]()
+    for quantity, (unit, values) in error_of.items():
+        label = label_form.format(quantity)
+        readouts.append((label, unit, values))
+        if len(readouts) <= plotted and values.max() > THERE:
+            _, linear = predicted_errors.get(quantity, (unit, None))
+            plots.append(_plot(label, [Curve("", "", "", unit, values, _NONE, linear)]))
     readouts.append((f"{motion.kept} drift", "", motion.momentum_drift[shown]))
     if len(motion.com_drift):  # empty in orbit, and if a file lacks it
         readouts.append(("centre of mass drift", "m", motion.com_drift[shown]))
     for title, whole in charts(motion).items():
         lines = []
         for curve in whole:
-            reference = None
+            reference = linear = None
             if len(target) > 1 and curve.reference is not None:
                 reference = curve.reference[shown]
+            if predicted is not None and curve.linear is not None:
+                linear = curve.linear[shown]
             lines.append(
-                curve._replace(values=curve.values[shown], reference=reference)
+                curve._replace(
+                    values=curve.values[shown], reference=reference, linear=linear
+                )
             )
         least = max(THERE, _UNSEEN * max(map(_size, lines)))
         seen = [curve for curve in lines if _size(curve) >= least]
@@ -432,6 +491,7 @@ def _plot(title: str, lines: list[Curve]) -> dict[str, object]:
                 "label": curve.short,
                 "values": packed(curve.values),
                 "reference": "" if curve.reference is None else packed(curve.reference),
+                "linear": "" if curve.linear is None else packed(curve.linear),
                 "limits": curve.near,
             }
             for curve in lines

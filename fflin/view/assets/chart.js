@@ -3,6 +3,8 @@
 // Figures of the axis are right of the lines; a large chart has the times below [CSS pixels].
 const GUTTER = 44, WIDE_GUTTER = 52, FOOT = 24;
 
+const DASHES = [3, 3]; // of a linear prediction [CSS pixels]
+
 function figure(value, digits) {
   if (value === 0) return "0";
   const size = Math.abs(value);
@@ -29,7 +31,7 @@ function makeChart(canvas, t, curves, marks, large = false) {
 
   const scale = () => {
     low = high = 0;
-    for (const { values, reference, limits } of lines) for (const each of [values, reference, limits]) for (const value of each) {
+    for (const { values, reference, linear, limits } of lines) for (const each of [values, reference, linear, limits]) for (const value of each) {
       if (value < low) low = value;
       if (value > high) high = value;
     }
@@ -80,6 +82,10 @@ function makeChart(canvas, t, curves, marks, large = false) {
     }
     for (const { reference, colour } of lines) curve(reference, colour, 4, 0.4);
     for (const { values, colour } of lines) curve(values, colour, large ? 1.8 : 1.4, 1);
+    // What the linear model predicts.
+    context.setLineDash(DASHES.map((each) => each * ratio));
+    for (const { linear, colour } of lines) curve(linear, colour, large ? 1.4 : 1.1, 0.95);
+    context.setLineDash([]);
     Object.assign(context, {
       globalAlpha: 1, fillStyle: style.getPropertyValue("--faint"), font: `${(large ? 12 : 11) * ratio}px system-ui, sans-serif`,
       textBaseline: "middle", textAlign: large ? "left" : "right",

@@ -47,6 +47,7 @@ function makeLarge(info, seek, marks) {
     });
     curves.replaceChildren(...rows.map(({ row }) => row));
     if (plot.lines.some((line) => line.reference.length)) curves.append(element("small", {}, "in brackets and pale: the reference"));
+    if (plot.lines.some((line) => line.linear.length)) curves.append(element("small", { className: "dashed" }, "dashed: the linear model"));
     all.hidden = plot.lines.length < 3;
     box.hidden = false;
     place();
@@ -58,6 +59,7 @@ function makeLarge(info, seek, marks) {
       const unit = plot.unit ? ` [${plot.unit}]` : "";
       columns.push([nameOf(line) + unit, line.values]);
       if (line.reference.length) columns.push([`${nameOf(line)} reference${unit}`, line.reference]);
+      if (line.linear.length) columns.push([`${nameOf(line)} linear${unit}`, line.linear]);
     }
     const quoted = columns.map(([name]) => (/[",]/.test(name) ? `"${name.replaceAll('"', '""')}"` : name));
     const line = (_, i) => columns.map(([, values]) => Number(values[i].toPrecision(7))).join(",");

@@ -13,7 +13,7 @@ function problem(message) {
   box.hidden = !message;
 }
 
-const GHOST = "#8fb4ff", HELD = "#b5926f";
+const GHOST = "#8fb4ff", HELD = "#b5926f", LINEAR = "#ff7fc8";
 
 // The largest side of the box about points x, y, z, ...
 function extent(points) {
@@ -36,7 +36,7 @@ function legendOf(info) {
   const dashed = info.followed.length > 0;
   if (info.target) entries.push({ ...entry(dashed ? `reference${rest}` : "target", GHOST, "target"), dashed });
   entries.push(...info.held.map((name) => entry(name, HELD, "held", name)));
-  if (info.linear) entries.push(entry("linear model", "#ff7fc8", "linear"));
+  if (info.linear) entries.push({ ...entry("linear model", LINEAR, "linear"), dashed: true });
   // In the panel thrusters are named in their plot; a strip of pictures has none.
   return [...entries, ...info.plumes.map(({ name, colour }) => ({ label: name, colour, strip: true }))];
 }
@@ -97,7 +97,7 @@ function main() {
   info.t = floats(info.t);
   for (const each of [...info.trails, ...info.followed]) each.points = floats(each.points);
   for (const each of [...info.arrows, ...info.plumes, ...info.readouts]) each.values = floats(each.values);
-  for (const plot of info.plots) for (const line of plot.lines) for (const key of ["values", "reference"]) line[key] = floats(line[key]);
+  for (const plot of info.plots) for (const line of plot.lines) for (const key of ["values", "reference", "linear"]) line[key] = floats(line[key]);
   paint(info.plots);
   const thrusters = info.plots.filter((plot) => plot.title === "thrusters").flatMap((plot) => plot.lines);
   const most = Math.max(...info.plumes.map(({ values }) => largest(values, 1)));
@@ -109,6 +109,8 @@ function main() {
   const showPhase = makePhases(panel, info.phases, (time) => goTo(time));
   const stamp = document.getElementById("stamp"), bar = document.getElementById("bar");
   const showEquipment = makeEquipment(viewer, info), showLink = makePicking(viewer, info);
+  const deviation = floats(info.deviation.values);
+  if (info.linear) makeComparison(viewer, info);
   let charts = [];
   const player = makePlayer(viewer, info, (i, time) => {
     turn(time);
@@ -121,6 +123,7 @@ function main() {
     camera.step();
   });
   const goTo = (time) => { player.pause(); player.seek(time); };
+  if (deviation.length) makeStrip(player.slider, info.t, deviation, info.deviation.levels);
   makePassed(panel, info.passed, goTo);
   const marks = [...info.phases.slice(1).map(([, start]) => start), info.rest].filter((time) => time !== null);
   const large = makeLarge(info, goTo, marks);

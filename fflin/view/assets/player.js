@@ -22,7 +22,7 @@ function makePlayer(viewer, info, onTime) {
   const choices = [...new Set([0.1, 0.25, 0.5, 1, 2, 5, 10, 20, 50, info.speed])].sort((a, b) => a - b);
   for (const speed of choices) speeds.append(new Option(`${speed}×`, speed));
   speeds.value = info.speed;
-  bar.append(button, slider, clock, speeds);
+  bar.append(button, element("div", { className: "track" }, slider), clock, speeds);
 
   const state = { time: first, playing: false, speed: info.speed };
   const digits = last - first > 200 ? 0 : last - first > 20 ? 1 : 2;
@@ -79,5 +79,5 @@ function makePlayer(viewer, info, onTime) {
     ["End", "End", "to the end", () => seek(last)],
   ];
   mark();
-  return { seek, play, pause, setSpeed, state, first, last, keys };
+  return { seek, play, pause, setSpeed, state, first, last, keys, slider };
 }

@@ -69,6 +69,8 @@ function makeSpan(parent, t) {
 function paint(plots) {
   const first = plots.find((plot) => plot.lines.some((line) => line.reference.length));
   if (first) first.pale = true; // has the key of the references
+  const predicted = plots.find((plot) => plot.lines.some((line) => line.linear.length));
+  if (predicted) predicted.dashed = true; // has the key of the linear model
   const change = (line) => line.values.reduce((a, b) => Math.max(a, b), -Infinity) - line.values.reduce((a, b) => Math.min(a, b), Infinity);
   for (const family of new Set(plots.map((plot) => plot.family))) {
     const kin = plots.filter((plot) => plot.family === family), most = new Map();
@@ -134,10 +136,16 @@ function makePlot(parent, t, plot, seek, marks, enlarge) {
   const keys = makeKeysOf(plot.keys, plot.lines);
   // x, y, z have room beside the title.
   if (keys && keys.textContent.length < 6) name.append(keys);
-  const pale = plot.pale ? makeKeysOf([["reference", UNNAMED]], []) : null;
-  if (pale) pale.classList.add("pale");
-  if (pale && !(keys && keys.parentNode)) name.append(pale);
-  const box = element("div", { className: "plot", title: "click to enlarge" }, name, ...[keys, pale].filter((each) => each && !each.parentNode), canvas);
+  const styles = [];
+  if (plot.pale) styles.push(["pale", "reference"]);
+  if (plot.dashed) styles.push(["dashed", "linear model"]);
+  const more = styles.map(([style, text]) => {
+    const key = makeKeysOf([[text, UNNAMED]], []);
+    key.classList.add(style);
+    return key;
+  });
+  if (more.length === 1 && !(keys && keys.parentNode)) name.append(more[0]);
+  const box = element("div", { className: "plot", title: "click to enlarge" }, name, ...[keys, ...more].filter((each) => each && !each.parentNode), canvas);
   parent.append(box);
 
   const chart = makeChart(canvas, t, () => plot.lines, marks);
