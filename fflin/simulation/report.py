@@ -624,6 +624,30 @@ def verdict(motion: Motion, kinds: list[ErrorSize]) -> str:
     return f"{text}; saturated inputs: {', '.join(listed) or 'none'}"
 
 
+def headline(motion: Motion) -> str:
+    """Return a line for the page of a motion: what moves the robot, and how the motion ends."""
+    parts = [motion._about] if motion._about else []
+    kinds = [kind for kind in error_sizes(motion) if kind.title in _PLACES]
+    judged = [kind for kind in kinds if kind.steered and kind.largest > THERE]
+    if judged and not motion.tracked:
+        first = judged[0]
+        final = f"{first.final:.2g}" if first.final > THERE else "0"
+        start = f"{first.initial:.3g}" if first.initial > THERE else "0"
+        parts.append(f"{first.title} {start} {first.unit} to {final} {first.unit}")
+    if motion.stopped:
+        parts.append(f"stopped: {motion.stopped}")
+    elif motion.tracked and judged:
+        parts.append(f"errors at the end: {_and([kind.last for kind in judged])}")
+    elif late := [kind.title for kind in judged if kind.settled is None]:
+        parts.append(f"{_and(late)} not settled")
+    elif judged:
+        when = max(kind.settled or 0.0 for kind in judged)
+        parts.append(f"settled after {when:.3g} s")
+    elif kinds and any(kind.steered for kind in kinds):
+        parts.append("at the target throughout")
+    return ", ".join(parts).replace("\u00a0", " ")
+
+
 def _fast_wheels(motion: Motion) -> str:
     """Return a line about the wheels that exceed their largest speeds, or an empty text."""
     speeds = {f"qdot_m.{name}" for name in motion.wheels}

@@ -489,6 +489,8 @@ class Page:
             "links": self.links,
             "title": robot.name,
             "subtitle": subtitle(robot),
+            "verdict": "",
+            "notes": list(self.notes),
             "scene": self.scene,
             "size": self.size,
             "centre": self.centre.tolist(),
@@ -507,6 +509,9 @@ class Page:
         )
         fields = {
             "title": escape(robot.name),
+            "subtitle": escape(str(info["subtitle"])),
+            "verdict": escape(str(info["verdict"])),
+            "notes": escape("; ".join(self.notes)),
             "scene": self.scene,
             "mode": mode,
             "connect": connect,

@@ -26,7 +26,7 @@ from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.robot import Robot
 from fflin.simulation.motion import Motion
 from fflin.simulation.plots import JOINTS, WHEELS, charts, resting_from
-from fflin.simulation.report import STATES, THERE, TRUSTED, Curve
+from fflin.simulation.report import STATES, THERE, TRUSTED, Curve, headline
 from fflin.simulation.run import Plant
 from fflin.view.page import Drawing, Page, body_poses, packed, subtitle
 from fflin.view.shapes import carriers_of
@@ -58,6 +58,19 @@ _UNSEEN = 1e-6
 # The time slider is coloured by the deviation of the linear prediction: small up to _SMALL, visible
 # up to TRUSTED, and beyond the validity of the linear model above.
 _SMALL = 0.01
+
+# {unit of a curve: unit and factor on the page}. Lengths of _LONG [m] or more stay in m.
+_UNITS = {
+    "rad": ("deg", math.degrees(1.0)),
+    "rad/s": ("deg/s", math.degrees(1.0)),
+    "m": ("mm", 1e3),
+    "m/s": ("mm/s", 1e3),
+}
+_LONG = 10.0
+
+# Momentum and centre of mass are conserved if their errors do not exceed this: relative to the
+# largest momentum, and in m, or relative to the distance from the reference if it exceeds 1 m.
+_CONSERVED = 1e-9
 
 _NONE = np.zeros(0)
 
@@ -137,7 +150,8 @@ def motion_page(
         "motion",
         points,
         subtitle=about[0],
-        **panel(robot, motion, shown, goal, predicted),
+        verdict=headline(motion),
+        **panel(robot, motion, shown, goal, predicted, off),
         **marks(page, film, marked_goals),
         t=packed(t),
         speed=speed,
@@ -385,16 +399,16 @@ def errors(
     turning = [joint.idx_v for joint in joints if not joint.prismatic]
     sliding = [joint.idx_v for joint in joints if joint.prismatic]
     error_of = {
-        "attitude": ("°", np.degrees(np.linalg.norm(apart[:, 3:6], axis=1))),
+        "attitude": ("deg", np.degrees(np.linalg.norm(apart[:, 3:6], axis=1))),
         "position": ("m", np.linalg.norm((q - goals)[:, :3], axis=1)),
     }
     if turning:
         error_of["largest joint"] = (
-            "°",
+            "deg",
             np.degrees(np.abs(apart[:, turning]).max(axis=1)),
         )
     if sliding:
-        error_of["largest prismatic joint"] = (
+        error_of["largest prismatic"] = (
             "m",
             np.abs(apart[:, sliding]).max(axis=1),
         )
@@ -409,10 +423,12 @@ def panel(
     shown: Array,
     target: Array,
     predicted: Array | None = None,
+    off: Array = _NONE,
 ) -> dict[str, object]:
     """Return the readouts and plots of a motion at the samples `shown`.
 
-    `predicted` (N, nq) are the configurations that the linear model predicts at these samples.
+    `predicted` (N, nq) are the configurations that the linear model predicts at these samples, and
+    `off` (N,) is their deviation.
 
     Errors are relative to the configurations `target` (k, nq). If k = 0, the page shows changes
     from the first configuration instead of errors.
@@ -429,13 +445,13 @@ def panel(
     readouts, plots = list[tuple[str, str, Array]](), list[dict[str, object]]()
     for quantity, (unit, values) in error_of.items():
         label = label_form.format(quantity)
-        readouts.append((label, unit, values))
+        _, linear = predicted_errors.get(quantity, (unit, None))
+        (curve,) = in_page_units([Curve("", "", "", unit, values, _NONE, linear)])
+        readouts.append((label, curve.unit, curve.values))
         if len(readouts) <= plotted and values.max() > THERE:
-            _, linear = predicted_errors.get(quantity, (unit, None))
-            plots.append(_plot(label, [Curve("", "", "", unit, values, _NONE, linear)]))
-    readouts.append((f"{motion.kept} drift", "", motion.momentum_drift[shown]))
-    if len(motion.com_drift):  # empty in orbit, and if a file lacks it
-        readouts.append(("centre of mass drift", "m", motion.com_drift[shown]))
+            plots.append(_plot(label, [curve]))
+    if len(off):
+        readouts.append(("linear model off by", "%", 100.0 * off))
     for title, whole in charts(motion).items():
         lines = []
         for curve in whole:
@@ -458,16 +474,59 @@ def panel(
             any(curve.near or not title.endswith("rates") for curve in seen)
             and not of_base
         ):
-            plots.append(_plot(title, seen))
+            plots.append(_plot(title, in_page_units(seen)))
     return {
         "readouts": [
             {"label": label, "unit": unit, "values": packed(values)}
             for label, unit, values in readouts
         ],
         "plots": plots,
+        "conserved": conserved(motion),
         "rest": rest,
         "passed": [[str(violation), violation.time] for violation in motion.passed],
     }
+
+
+def in_page_units(lines: list[Curve]) -> list[Curve]:
+    """Convert curves of one unit: angles to deg, lengths to mm, and rates to deg/s and mm/s.
+
+    Speeds of wheels are not converted, and neither are lengths if one of them reaches _LONG.
+    """
+    unit, factor = _UNITS.get(lines[0].unit, (lines[0].unit, 1.0))
+    long = unit in ("mm", "mm/s") and max(map(_size, lines)) >= _LONG
+    if long or lines[0].group == "speed":
+        return lines
+
+    def scaled(values: Array | None) -> Array | None:
+        return None if values is None else factor * values
+
+    return [
+        curve._replace(
+            unit=unit,
+            values=factor * curve.values,
+            limits=factor * curve.limits,
+            linear=scaled(curve.linear),
+            reference=scaled(curve.reference),
+        )
+        for curve in lines
+    ]
+
+
+def conserved(motion: Motion) -> dict[str, object]:
+    """Return the mark on the page that says whether momentum and centre of mass are conserved."""
+    drift = float(motion.momentum_drift.max())
+    distance = max(1.0, float(np.linalg.norm(motion.q[:, :3], axis=1).max()))
+    shift = float(motion.com_drift.max(initial=0.0))  # empty in orbit
+    holds = drift <= _CONSERVED and shift <= _CONSERVED * distance
+    details = f"largest relative drift of the {motion.kept}: {drift:.1e}"
+    if len(motion.com_drift):
+        details += f"; largest drift of the centre of mass: {shift:.1e} m"
+    text = f"{motion.kept} conserved"
+    if drift > _CONSERVED:
+        text = f"{motion.kept} drifts by {drift:.1e}"
+    elif not holds:
+        text = f"centre of mass drifts by {shift:.1e} m"
+    return {"holds": holds, "text": text, "details": details}
 
 
 def _size(curve: Curve) -> float:

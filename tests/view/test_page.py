@@ -158,9 +158,13 @@ def test_the_panel_says_what_the_motion_says(settled, watched):
         assert float(values[0].split()[0]) == pytest.approx(angle, rel=6e-3)
         distance = np.linalg.norm(base.translation)
         assert float(values[1].split()[0]) == pytest.approx(
-            distance, rel=6e-3, abs=1e-9
+            1e3 * distance, rel=6e-3, abs=1e-6
         )
-        assert values[3] == "1.0e-13"  # the motion's own
+        units = [value.split()[1] for value in values]
+        assert units == ["deg", "mm", "deg"]
+    mark = watched.page.locator(".conserved")
+    assert mark.text_content() == "✓ momentum conserved"
+    assert "1.0e-13" in mark.get_attribute("title")
     plots = watched.page.locator(".plot .name").all_text_contents()
     assert plots[0].startswith("attitude error") and any(
         "joint torques" in p for p in plots

@@ -106,6 +106,7 @@ function main() {
   const panel = document.getElementById("panel");
   const showMarks = makeMarks(viewer, info);
   const showFigures = makeReadouts(panel, info.readouts);
+  makeConserved(panel, info.conserved);
   const showPhase = makePhases(panel, info.phases, (time) => goTo(time));
   const stamp = document.getElementById("stamp"), bar = document.getElementById("bar");
   const showEquipment = makeEquipment(viewer, info), showLink = makePicking(viewer, info);

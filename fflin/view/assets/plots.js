@@ -19,6 +19,11 @@ function makeReadouts(parent, readouts) {
   return (i) => shows.forEach((show) => show(i));
 }
 
+// One mark for the quantities that the simulation must conserve.
+function makeConserved(parent, { holds, text, details }) {
+  parent.append(element("div", { className: holds ? "conserved" : "conserved lost", title: details }, `${holds ? "✓" : "✗"} ${text}`));
+}
+
 // What went beyond its limit: the worst of it, which leads to its time; all of it on hovering.
 function makePassed(parent, passed, seek) {
   if (!passed.length) return;
