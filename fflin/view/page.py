@@ -72,16 +72,27 @@ _ELSEWHERE: dict[str, object] = {
 
 _SCRIPTS = (
     *("sky", "orbit", "look", "camera", "stage", "marks", "equipment", "pick", "keys"),
-    *("chart", "plots", "large", "compare", "player", "live", "modes", "main"),
+    *(
+        "chart",
+        "raster",
+        "plots",
+        "large",
+        "compare",
+        "player",
+        "live",
+        "modes",
+        "main",
+    ),
 )
 
 
 def packed(array: Array) -> str:
     """Encode an array in single precision; the JavaScript function `floats` decodes it."""
-    return _base64(np.ascontiguousarray(array, dtype="<f4").tobytes())
+    return encoded(np.ascontiguousarray(array, dtype="<f4").tobytes())
 
 
-def _base64(content: bytes) -> str:
+def encoded(content: bytes) -> str:
+    """Encode bytes; the JavaScript function `decode` decodes them."""
     return base64.b64encode(content).decode("ascii")
 
 
@@ -479,7 +490,7 @@ class Page:
         commands = list[str]()
         if mode != "live":
             connect = "'none'"
-            commands = [_base64(command) for command in self.window.commands()]
+            commands = [encoded(command) for command in self.window.commands()]
         digits = max(4, 4 - math.floor(math.log10(self.size)))
         info = {
             **orbit,

@@ -22,13 +22,14 @@ from fflin.dynamics.impact import Capture, Impact, inertia_at
 from fflin.dynamics.integrators import CommutatorFree4
 from fflin.dynamics.state import Actuation, StateMap
 from fflin.linear.model import LinearModel
+from fflin.robot.inputs import Thruster
 from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.robot import Robot
 from fflin.simulation.motion import Motion
 from fflin.simulation.plots import JOINTS, WHEELS, charts, resting_from
 from fflin.simulation.report import STATES, THERE, TRUSTED, Curve, headline
 from fflin.simulation.run import Plant
-from fflin.view.page import Drawing, Page, body_poses, packed, subtitle
+from fflin.view.page import Drawing, Page, body_poses, encoded, packed, subtitle
 from fflin.view.shapes import carriers_of
 
 # A mode is animated with _PHASES poses per period. A period takes _PERIOD [s] on the screen. The
@@ -72,6 +73,9 @@ _LONG = 10.0
 # largest momentum, and in m, or relative to the distance from the reference if it exceeds 1 m.
 _CONSERVED = 1e-9
 
+# number of cells along the time in which the pulses of a thruster are drawn
+_CELLS = 600
+
 _NONE = np.zeros(0)
 
 
@@ -107,7 +111,7 @@ def motion_page(
         ghost.place(goals[0])
         if len(goals) > 1:
             moving.append((ghost, goals))
-    predicted, off = None, _NONE
+    predicted, off = None, np.zeros(0)
     if motion.linear is not None:
         predicted = state.points(motion.linear[shown])[1]
         predicted_poses = body_poses(robot, predicted)
@@ -452,6 +456,11 @@ def panel(
             plots.append(_plot(label, [curve]))
     if len(off):
         readouts.append(("linear model off by", "%", 100.0 * off))
+    pulsed = {
+        names[0]
+        for item, names in robot.named_inputs
+        if isinstance(item, Thruster) and item.on_off
+    }
     for title, whole in charts(motion).items():
         lines = []
         for curve in whole:
@@ -474,7 +483,12 @@ def panel(
             any(curve.near or not title.endswith("rates") for curve in seen)
             and not of_base
         ):
-            plots.append(_plot(title, in_page_units(seen)))
+            strips = [curve for curve in seen if curve.name in pulsed]
+            steady = [curve for curve in seen if curve.name not in pulsed]
+            if strips:
+                plots.append(_raster(motion, strips))
+            if steady:
+                plots.append(_plot(title, in_page_units(steady)))
     return {
         "readouts": [
             {"label": label, "unit": unit, "values": packed(values)}
@@ -556,6 +570,27 @@ def _plot(title: str, lines: list[Curve]) -> dict[str, object]:
             for curve in lines
         ],
     }
+
+
+def _raster(motion: Motion, thrusters: list[Curve]) -> dict[str, object]:
+    """Return the plot of thrusters that are off or on: a strip for each, and its duty.
+
+    `pulses` is the fraction of time that a thruster is on, in each of _CELLS equal parts of the
+    motion. It comes from all rows of the motion, because frames would miss short pulses.
+    """
+    plot = _plot("on-off thrusters", thrusters)
+    lines = plot["lines"]
+    assert isinstance(lines, list)
+    edges = np.linspace(motion.t[0], motion.t[-1], _CELLS + 1)
+    for line, curve in zip(lines, thrusters, strict=True):
+        on = motion.u[:-1, motion.input_names.index(curve.name)] > 0.0
+        spent = np.concatenate(([0.0], np.cumsum(on * np.diff(motion.t))))
+        cells = np.diff(np.interp(edges, motion.t, spent)) / np.diff(edges)
+        # rounded up, so that the shortest pulse is drawn
+        levels = np.ceil(255.0 * np.clip(cells - 1e-9, 0.0, 1.0)).astype(np.uint8)
+        line["pulses"] = encoded(levels.tobytes())
+        line["duty"] = float(spent[-1] / (motion.t[-1] - motion.t[0]))
+    return {**plot, "unit": "", "raster": True}
 
 
 def mode_page(

@@ -128,5 +128,5 @@ function makeChart(canvas, t, curves, marks, large = false) {
   };
   const redraw = () => { drawn = null; };
   window.addEventListener("resize", redraw);
-  return { show, under, redraw };
+  return { show, under, redraw, reading: (line, i) => figure(line.values[i], large ? 4 : 3) };
 }

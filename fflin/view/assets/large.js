@@ -11,7 +11,8 @@ function makeLarge(info, seek, marks) {
 
   let plot = null, hidden = new Set(), rows = [], now = [0, info.t[0]], pointed = null;
   const shown = () => plot.lines.filter((line) => !hidden.has(line));
-  const chart = makeChart(canvas, info.t, shown, marks, true);
+  const kinds = [makeChart, makeRaster].map((make) => make(canvas, info.t, shown, marks, true));
+  let chart = kinds[0];
   const nameOf = (line) => line.label || plot.title;
   const show = (i = now[0], time = now[1]) => {
     now = [i, time];
@@ -21,7 +22,7 @@ function makeLarge(info, seek, marks) {
     clock.textContent = `t = ${figure(when, 4)} s`;
     rows.forEach(({ row, line, value }) => {
       const reference = line.reference.length ? ` (${figure(line.reference[at], 3)})` : "";
-      value.textContent = figure(line.values[at], 4) + reference;
+      value.textContent = chart.reading(line, at, when) + reference;
       row.classList.toggle("near", Boolean(pointed) && pointed.line === line);
     });
   };
@@ -37,6 +38,7 @@ function makeLarge(info, seek, marks) {
   };
   const open = (given) => {
     plot = given;
+    chart = kinds[plot.raster ? 1 : 0];
     hidden = new Set();
     heading.textContent = plot.unit ? `${plot.title} [${plot.unit}]` : plot.title;
     rows = plot.lines.map((line) => {

@@ -99,7 +99,8 @@ function main() {
   for (const each of [...info.arrows, ...info.plumes, ...info.readouts]) each.values = floats(each.values);
   for (const plot of info.plots) for (const line of plot.lines) for (const key of ["values", "reference", "linear"]) line[key] = floats(line[key]);
   paint(info.plots);
-  const thrusters = info.plots.filter((plot) => plot.title === "thrusters").flatMap((plot) => plot.lines);
+  for (const plot of info.plots) if (plot.raster) for (const line of plot.lines) line.pulses = decode(line.pulses);
+  const thrusters = info.plots.filter((plot) => plot.family === "thrust").flatMap((plot) => plot.lines);
   const most = Math.max(...info.plumes.map(({ values }) => largest(values, 1)));
   info.plumes = info.plumes.filter((each) => thrusters.some(({ label }) => label === each.name)); // those that fire
   for (const each of info.plumes) Object.assign(each, { most, colour: thrusters.find(({ label }) => label === each.name).colour });
@@ -132,7 +133,7 @@ function main() {
   if (info.plots.length) makeSpan(panel, info.t);
   fitPlots(panel);
   const again = () => window.dispatchEvent(new Event("resize"));
-  window.addEventListener("resize", () => { if (fitPlots(panel)) again(); });
+  window.addEventListener("resize", () => fitPlots(panel));
   makeLegend(viewer, legendOf(info));
 
   const toggle = (text, title, pressed, act) => {

@@ -3,7 +3,7 @@
 const COLOURS = ["#ff7a70", "#7ad97f", "#6aa5ff", "#f6c35b", "#c58bff", "#5fd6d0", "#ff9ed0", "#b6c46a", "#9aa7ff", "#d79a6a", "#4fb08c", "#e05fa8"];
 const NAMED = 8, UNNAMED = "#8a93a5"; // of more lines than colours those that change most are named
 
-const TALL = 62, LOW = 30; // heights of a plot where there is room, and at least
+const TALL = 62, LOW = 48; // heights of a plot where there is room, and at least
 
 function makeReadouts(parent, readouts) {
   if (!readouts.length) return () => {};
@@ -112,33 +112,23 @@ function makeKeysOf(named, lines) {
   return keys;
 }
 
-// Give the plots of a panel the height that is there for them, in a wide window in two columns
-// where one is too short. Returns whether the panel has another width by that.
+// Give the plots of a panel the height that is there for them. Where they do not fit, the panel
+// scrolls.
 function fitPlots(panel) {
-  const count = panel.querySelectorAll(".plot").length, width = panel.clientWidth;
-  if (window.innerWidth <= NARROW) {
-    panel.classList.remove("wide");
-    panel.style.setProperty("--tall", `${TALL}px`);
-    return panel.clientWidth !== width;
+  const count = panel.querySelectorAll(".plot").length;
+  const over = () => panel.scrollHeight - panel.clientHeight;
+  for (let tall = TALL; ; tall = Math.max(LOW, tall - Math.max(2, Math.floor(over() / count)))) {
+    panel.style.setProperty("--tall", `${tall}px`);
+    if (over() <= 0 || tall === LOW || !count || window.innerWidth <= NARROW) return;
   }
-  const over = () => Math.max(panel.scrollHeight - panel.clientHeight, panel.scrollWidth - panel.clientWidth);
-  const fit = (wide) => {
-    panel.classList.toggle("wide", wide);
-    for (let tall = TALL; ; tall = Math.max(LOW, tall - Math.max(2, Math.floor(over() / count)))) {
-      panel.style.setProperty("--tall", `${tall}px`);
-      if (over() <= 0 || tall === LOW || !count) return over() <= 0 ? tall : 0;
-    }
-  };
-  // A large window has room for a second column before the plots become much lower.
-  if (fit(false) < (window.innerWidth >= 1400 ? 0.75 * TALL : LOW) && window.innerWidth >= 1100) fit(true);
-  return panel.clientWidth !== width;
 }
 
 // A chart of the panel. Dragging on it leads through time; a click leads there and enlarges it.
 function makePlot(parent, t, plot, seek, marks, enlarge) {
   const at = element("span", { className: "at" }), canvas = element("canvas");
   const name = element("div", { className: "name" }, plot.unit ? `${plot.title} [${plot.unit}]` : plot.title, at);
-  const keys = makeKeysOf(plot.keys, plot.lines);
+  const keys = plot.raster ? null : makeKeysOf(plot.keys, plot.lines);
+  if (plot.raster) canvas.style.height = `${ROW * plot.lines.length}px`;
   // x, y, z have room beside the title.
   if (keys && keys.textContent.length < 6) name.append(keys);
   const styles = [];
@@ -153,7 +143,7 @@ function makePlot(parent, t, plot, seek, marks, enlarge) {
   const box = element("div", { className: "plot", title: "click to enlarge" }, name, ...[keys, ...more].filter((each) => each && !each.parentNode), canvas);
   parent.append(box);
 
-  const chart = makeChart(canvas, t, () => plot.lines, marks);
+  const chart = (plot.raster ? makeRaster : makeChart)(canvas, t, () => plot.lines, marks);
   let down = 0;
   canvas.addEventListener("pointerdown", (event) => {
     canvas.setPointerCapture(event.pointerId);
@@ -163,7 +153,7 @@ function makePlot(parent, t, plot, seek, marks, enlarge) {
   // The line nearest to the pointer, by its name, and its value there.
   canvas.addEventListener("pointermove", (event) => {
     const { time, i, line } = chart.under(event);
-    at.textContent = `${line.label} ${figure(line.values[i], 3)}`.trim();
+    at.textContent = `${line.label} ${chart.reading(line, i, time)}`.trim();
     at.style.color = line.colour;
     if (event.buttons) seek(time);
   });
