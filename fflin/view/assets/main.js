@@ -146,7 +146,18 @@ function main() {
   };
   const views = makeViews(bar, camera);
   const follow = toggle("follow", "follow the base with the camera", camera.following(), camera.follow);
-  const fold = toggle("panel", "show or fold the panel", true, (on) => { document.body.classList.toggle("folded", !on); again(); });
+  // In a small window a panel that is folded has two readouts.
+  const fold = toggle("panel", "show or fold the panel", !isSmall(), (on) => {
+    document.body.classList.toggle("folded", !on && !isSmall());
+    document.body.classList.toggle("opened", on);
+    again();
+  });
+  document.body.classList.toggle("opened", !isSmall());
+  const folds = bar.lastChild;
+  folds.classList.add("fold");
+  window.matchMedia(`(max-height: ${SMALL - 1}px)`).addEventListener("change", ({ matches }) => {
+    if ((folds.getAttribute("aria-pressed") === "true") === matches) fold();
+  });
   makeHelpButton(bar, makeKeys([...player.keys, ...views, ["f", "F", "follow the base", follow], ["p", "P", "show or fold the panel", fold]]));
   player.seek(player.first);
   camera.reframe();

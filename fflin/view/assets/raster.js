@@ -1,7 +1,7 @@
 // Thrusters that are off or on: one strip each along the time, with its name and its duty.
 
-const ROW = 19, STRIP = 6, LETTERS = 10.5; // height of a thruster, its strip and its name [CSS pixels]
-const FAINT = 0.3; // opacity of the shortest pulse
+const ROW = 22, STRIP = 6, LETTERS = 10.5; // height of a thruster, its strip and its name [CSS pixels]
+const FAINT = 0.45; // opacity of the shortest pulse
 
 // As `makeChart`. The pulses of a line are the fractions of time that it is on, of 255.
 function makeRaster(canvas, t, curves, marks, large = false) {
