@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterator, Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
 from fflin.analysis.modes import Mode, Modes, energies_of
 from fflin.base.errors import InputError
+from fflin.base.figures import COLORS, CurveStyle
 from fflin.base.rotation import rotation_matrices
 from fflin.base.tables import counted
 from fflin.base.validation import Array
@@ -26,7 +27,13 @@ from fflin.robot.inputs import Thruster
 from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.robot import Robot
 from fflin.simulation.motion import Motion
-from fflin.simulation.plots import JOINTS, WHEELS, charts, resting_from
+from fflin.simulation.plots import (
+    JOINTS,
+    charts,
+    family_of,
+    resting_from,
+    styles_of,
+)
 from fflin.simulation.report import STATES, THERE, TRUSTED, Curve, headline
 from fflin.simulation.run import Plant
 from fflin.view.page import Drawing, Page, body_poses, encoded, packed, subtitle
@@ -111,7 +118,8 @@ def motion_page(
         ghost.place(goals[0])
         if len(goals) > 1:
             moving.append((ghost, goals))
-    predicted, off = None, np.zeros(0)
+    predicted: Array | None = None
+    off: Array = _NONE
     if motion.linear is not None:
         predicted = state.points(motion.linear[shown])[1]
         predicted_poses = body_poses(robot, predicted)
@@ -446,7 +454,7 @@ def panel(
     predicted_errors = dict[str, tuple[str, Array]]()
     if predicted is not None:
         predicted_errors = errors(robot, predicted, compared, motion.wheels)
-    readouts, plots = list[tuple[str, str, Array]](), list[dict[str, object]]()
+    readouts, plots = list[tuple[str, str, Array]](), list[dict[str, Any]]()
     for quantity, (unit, values) in error_of.items():
         label = label_form.format(quantity)
         _, linear = predicted_errors.get(quantity, (unit, None))
@@ -489,6 +497,7 @@ def panel(
                 plots.append(_raster(motion, strips))
             if steady:
                 plots.append(_plot(title, in_page_units(steady)))
+    _color(plots, styles_of(motion))
     return {
         "readouts": [
             {"label": label, "unit": unit, "values": packed(values)}
@@ -551,14 +560,14 @@ def _size(curve: Curve) -> float:
     return float(np.abs(rows).max())
 
 
-def _plot(title: str, lines: list[Curve]) -> dict[str, object]:
+def _plot(title: str, lines: list[Curve]) -> dict[str, Any]:
     """Return the data of a plot: its curves, and the limits that each curve comes near."""
     group = lines[0].group
     return {
         "title": title,
         "unit": lines[0].unit,
-        # In all plots of a family, curves with the same label have the same colour.
-        "family": next((kin[0] for kin in (JOINTS, WHEELS) if group in kin), group),
+        # In all plots of a family, curves with the same label have the same style.
+        "family": family_of(group),
         "lines": [
             {
                 "label": curve.short,
@@ -572,17 +581,34 @@ def _plot(title: str, lines: list[Curve]) -> dict[str, object]:
     }
 
 
-def _raster(motion: Motion, thrusters: list[Curve]) -> dict[str, object]:
+def _color(
+    plots: list[dict[str, Any]], styles: Mapping[str, Mapping[str, CurveStyle]]
+) -> None:
+    """Give all curves their styles, and the first plot of a family the names of its colours."""
+    for plot in plots:
+        family = styles.get(plot["family"], {})
+        kin = [other for other in plots if other["family"] == plot["family"]]
+        for line in plot["lines"]:
+            style = family.get(line["label"], CurveStyle(COLORS[0]))
+            line.update(colour=style.color, dashed=style.dashed)
+        if family and plot is kin[0]:
+            seen = {line["label"] for other in kin for line in other["lines"]}
+            plot["keys"] = [
+                [name, style.color, style.dashed]
+                for name, style in family.items()
+                if style.is_named and name in seen
+            ]
+
+
+def _raster(motion: Motion, thrusters: list[Curve]) -> dict[str, Any]:
     """Return the plot of thrusters that are off or on: a strip for each, and its duty.
 
     `pulses` is the fraction of time that a thruster is on, in each of _CELLS equal parts of the
     motion. It comes from all rows of the motion, because frames would miss short pulses.
     """
     plot = _plot("on-off thrusters", thrusters)
-    lines = plot["lines"]
-    assert isinstance(lines, list)
     edges = np.linspace(motion.t[0], motion.t[-1], _CELLS + 1)
-    for line, curve in zip(lines, thrusters, strict=True):
+    for line, curve in zip(plot["lines"], thrusters, strict=True):
         on = motion.u[:-1, motion.input_names.index(curve.name)] > 0.0
         spent = np.concatenate(([0.0], np.cumsum(on * np.diff(motion.t))))
         cells = np.diff(np.interp(edges, motion.t, spent)) / np.diff(edges)

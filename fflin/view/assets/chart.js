@@ -4,6 +4,7 @@
 const GUTTER = 44, WIDE_GUTTER = 52, FOOT = 24;
 
 const DASHES = [3, 3]; // of a linear prediction [CSS pixels]
+const DASH_DOT = [8, 2, 2, 2]; // of the colours from the sixth on
 
 function figure(value, digits) {
   if (value === 0) return "0";
@@ -25,7 +26,7 @@ function roundLevels(low, high, most) {
 function makeChart(canvas, t, curves, marks, large = false) {
   const first = t[0], duration = t[t.length - 1] - first || 1;
   const gutter = large ? WIDE_GUTTER : GUTTER, foot = large ? FOOT : 0;
-  let drawn = null, lines = [], width = 0, height = 0, ratio = 1, low = 0, high = 1;
+  let drawn = null, raised = null, last = [0, first], lines = [], width = 0, height = 0, ratio = 1, low = 0, high = 1;
   const x = (time) => ((time - first) / duration) * (width - (gutter + 2) * ratio) + ratio;
   const y = (value) => (1 - (value - low) / (high - low)) * (height - (2 + foot) * ratio) + ratio;
 
@@ -81,7 +82,14 @@ function makeChart(canvas, t, curves, marks, large = false) {
       context.fill();
     }
     for (const { reference, colour } of lines) curve(reference, colour, 4, 0.4);
-    for (const { values, colour } of lines) curve(values, colour, large ? 1.8 : 1.4, 1);
+    const own = (line) => {
+      context.setLineDash(line.dashed ? DASH_DOT.map((each) => each * ratio) : []);
+      const colour = line === raised && line.colour === UNNAMED ? style.getPropertyValue("--ink") : line.colour;
+      curve(line.values, colour, (large ? 1.8 : 1.4) * (line === raised ? 1.6 : 1), 1);
+    };
+    // Grey curves lie below the others, and the one that is pointed at above all.
+    const rank = (line) => (line === raised ? 2 : line.colour === UNNAMED ? 0 : 1);
+    [...lines].sort((a, b) => rank(a) - rank(b)).forEach(own);
     // What the linear model predicts.
     context.setLineDash(DASHES.map((each) => each * ratio));
     for (const { linear, colour } of lines) curve(linear, colour, large ? 1.4 : 1.1, 0.95);
@@ -101,6 +109,7 @@ function makeChart(canvas, t, curves, marks, large = false) {
     for (const time of times) context.fillText(`${time} s`, Math.min(right, Math.max(3 * half, x(time))), height - 0.4 * foot * ratio);
   };
   const show = (i, time) => {
+    last = [i, time];
     if (!drawn || canvas.width !== width) draw();
     if (!drawn) return;
     const context = canvas.getContext("2d");
@@ -127,6 +136,12 @@ function makeChart(canvas, t, curves, marks, large = false) {
     return { time, i, line: lines.length ? lines.reduce((a, b) => (away(b) < away(a) ? b : a)) : null };
   };
   const redraw = () => { drawn = null; };
+  const raise = (line) => {
+    if (line === raised) return;
+    raised = line;
+    redraw();
+    show(...last);
+  };
   window.addEventListener("resize", redraw);
-  return { show, under, redraw, reading: (line, i) => figure(line.values[i], large ? 4 : 3) };
+  return { show, under, redraw, raise, reading: (line, i) => figure(line.values[i], large ? 4 : 3) };
 }

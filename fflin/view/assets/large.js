@@ -76,12 +76,13 @@ function makeLarge(info, seek, marks) {
   });
   const point = (event) => {
     pointed = chart.under(event);
+    chart.raise(pointed.line);
     if (event.buttons) seek(pointed.time);
     show();
   };
   canvas.addEventListener("pointerdown", (event) => { canvas.setPointerCapture(event.pointerId); point(event); });
   canvas.addEventListener("pointermove", point);
-  canvas.addEventListener("pointerleave", () => { pointed = null; show(); });
+  canvas.addEventListener("pointerleave", () => { pointed = null; chart.raise(null); show(); });
   window.addEventListener("resize", () => { place(); requestAnimationFrame(() => show()); });
   return { open, show };
 }

@@ -98,7 +98,7 @@ function main() {
   for (const each of [...info.trails, ...info.followed]) each.points = floats(each.points);
   for (const each of [...info.arrows, ...info.plumes, ...info.readouts]) each.values = floats(each.values);
   for (const plot of info.plots) for (const line of plot.lines) for (const key of ["values", "reference", "linear"]) line[key] = floats(line[key]);
-  paint(info.plots);
+  markFirst(info.plots);
   for (const plot of info.plots) if (plot.raster) for (const line of plot.lines) line.pulses = decode(line.pulses);
   const thrusters = info.plots.filter((plot) => plot.family === "thrust").flatMap((plot) => plot.lines);
   const most = Math.max(...info.plumes.map(({ values }) => largest(values, 1)));

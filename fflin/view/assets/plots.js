@@ -1,7 +1,6 @@
 // The panel of a motion: figures, what was passed, phases, and small charts.
 
-const COLOURS = ["#ff7a70", "#7ad97f", "#6aa5ff", "#f6c35b", "#c58bff", "#5fd6d0", "#ff9ed0", "#b6c46a", "#9aa7ff", "#d79a6a", "#4fb08c", "#e05fa8"];
-const NAMED = 8, UNNAMED = "#8a93a5"; // of more lines than colours those that change most are named
+const UNNAMED = "#8a93a5"; // of more curves than colours those that change most are named
 
 const TALL = 62, LOW = 48; // heights of a plot where there is room, and at least
 
@@ -70,29 +69,12 @@ function makeSpan(parent, t) {
   parent.append(row);
 }
 
-// Give the lines their colours: a name has one in all plots of a family, the first of which has keys.
-function paint(plots) {
-  const first = plots.find((plot) => plot.lines.some((line) => line.reference.length));
-  if (first) first.pale = true; // has the key of the references
-  const predicted = plots.find((plot) => plot.lines.some((line) => line.linear.length));
-  if (predicted) predicted.dashed = true; // has the key of the linear model
-  const change = (line) => line.values.reduce((a, b) => Math.max(a, b), -Infinity) - line.values.reduce((a, b) => Math.min(a, b), Infinity);
-  for (const family of new Set(plots.map((plot) => plot.family))) {
-    const kin = plots.filter((plot) => plot.family === family), most = new Map();
-    for (const { lines } of kin) {
-      const changes = lines.map(change), largest = Math.max(...changes) || 1;
-      lines.forEach(({ label }, k) => most.set(label, Math.max(changes[k] / largest, most.get(label) || 0)));
-    }
-    let names = [...most.keys()];
-    if (names.length > COLOURS.length) {
-      const named = new Set([...names].sort((a, b) => most.get(b) - most.get(a)).slice(0, NAMED));
-      names = names.filter((name) => named.has(name));
-    }
-    const axes = names.every((name) => "xyz".includes(name));
-    const colours = new Map(names.map((name, k) => [name, COLOURS[axes ? "xyz".indexOf(name) : k]]));
-    for (const { lines } of kin) for (const line of lines) line.colour = colours.get(line.label) || UNNAMED;
-    if (names.some((name) => name)) kin[0].keys = [...colours];
-  }
+// Mark the first plot with a reference and the first with a prediction, which have their keys.
+function markFirst(plots) {
+  const first = (kind) => plots.find((plot) => plot.lines.some((line) => line[kind].length));
+  const [reference, predicted] = [first("reference"), first("linear")];
+  if (reference) reference.pale = true;
+  if (predicted) predicted.dashed = true;
 }
 
 // Which colour is whose, for this plot and those below it with the same names.
@@ -101,8 +83,9 @@ function makeKeysOf(named, lines) {
   const keys = document.createElement("div");
   keys.className = "keys";
   const grey = new Set(lines.map((line) => line.label));
-  for (const [label, colour] of named) {
+  for (const [label, colour, dashed] of named) {
     const key = document.createElement("span");
+    key.classList.toggle("dashdot", Boolean(dashed));
     key.textContent = label;
     key.style.setProperty("--swatch", colour);
     keys.append(key);
@@ -154,10 +137,11 @@ function makePlot(parent, t, plot, seek, marks, enlarge) {
   canvas.addEventListener("pointermove", (event) => {
     const { time, i, line } = chart.under(event);
     at.textContent = `${line.label} ${chart.reading(line, i, time)}`.trim();
-    at.style.color = line.colour;
+    at.style.color = line.colour === UNNAMED ? "var(--ink)" : line.colour;
+    chart.raise(line);
     if (event.buttons) seek(time);
   });
-  canvas.addEventListener("pointerleave", () => { at.textContent = ""; });
+  canvas.addEventListener("pointerleave", () => { at.textContent = ""; chart.raise(null); });
   box.addEventListener("click", (event) => { if (event.target !== canvas || Math.abs(event.clientX - down) < STILL) enlarge(plot); });
   return chart.show;
 }

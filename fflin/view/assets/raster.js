@@ -62,7 +62,7 @@ function makeRaster(canvas, t, curves, marks, large = false) {
     const k = Math.min(pulses.length - 1, Math.floor(((time - first) / duration) * pulses.length));
     return `${pulses[k] ? "on" : "off"}, duty ${percentOf(duty)}`;
   };
-  return { show, under, redraw, reading };
+  return { show, under, redraw, reading, raise: () => {} };
 }
 
 const percentOf = (share) => `${Number((100 * share).toPrecision(2))} %`;
