@@ -101,20 +101,12 @@ def motion_page(
     t = motion.t[shown]
     state = StateMap(robot, reference=motion.reference, frame=frame)
     film = play_back(state, motion.q[shown], motion.u[shown])
-    if target is None:
-        # At the end, `states` has one row for a fixed target, one row per frame for a moving
-        # target, and no row without a target.
-        states = motion.target.reshape(-1, state.nx)
-        if len(states) > 1:
-            states = states[shown]
-        goal = state.points(states)[1]
-    else:
-        goal = target[None]
+    goal = _goals(state, motion, shown) if target is None else target[None]
     goals = body_poses(robot, goal)
 
     moving = [(page.drawing, film.poses)]
     if len(goals):
-        ghost = Drawing(page, robot, "target", "ghost")
+        ghost = Drawing(page, robot, "target", "ghost", coarse=True)
         ghost.place(goals[0])
         if len(goals) > 1:
             moving.append((ghost, goals))
@@ -123,7 +115,8 @@ def motion_page(
     if motion.linear is not None:
         predicted = state.points(motion.linear[shown])[1]
         predicted_poses = body_poses(robot, predicted)
-        moving.append((Drawing(page, robot, "linear", "linear"), predicted_poses))
+        contour = Drawing(page, robot, "linear", "linear", coarse=True)
+        moving.append((contour, predicted_poses))
         compared = goals if len(goals) else film.poses[:1]
         off = deviation(page.drawing.corners, film.poses, predicted_poses, compared)
     held = []
@@ -177,6 +170,18 @@ def motion_page(
         ],
         held=[drawing.prefix for drawing, _ in held],
     )
+
+
+def _goals(state: StateMap, motion: Motion, shown: Array) -> Array:
+    """Return the target configurations (k, nq) of a motion at the samples `shown`.
+
+    There is one row for a fixed target, one row per sample for a moving target, and no row without
+    a target.
+    """
+    states = motion.target.reshape(-1, state.nx)
+    if len(states) > 1:
+        states = states[shown]
+    return state.points(states)[1]
 
 
 def deviation(

@@ -67,11 +67,12 @@ def test_charts_of_errors_and_joints_have_the_prediction(robots):
         for line in plot["lines"]
     }
     of_errors = errors(robot, predicted, target, motion.wheels)
-    for name in ("attitude", "position"):
-        values = of_errors[name][1]
+    for name, factor in (("attitude", 1.0), ("position", 1e3)):
+        values = factor * of_errors[name][1]
         np.testing.assert_allclose(linear[f"{name} error", ""], values, rtol=1e-6)
     for joint in robot.joint_names:
         values = motion.linear[rows, motion.state_names.index(f"q_m.{joint}")]
+        values = np.degrees(values)
         np.testing.assert_allclose(linear["joints", joint], values, rtol=1e-6)
     for (title, _), values in linear.items():
         is_input = "torque" in title or "force" in title

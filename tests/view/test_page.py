@@ -406,7 +406,8 @@ def test_a_lab_with_meshes_plumes_and_a_prediction(robots, watch, tmp_path):
         }
         return count;
     })()""")
-    assert drawn["robot"] == drawn["target"] == drawn["linear"] > 100_000
+    assert drawn["robot"] > 100_000
+    assert drawn["target"] == drawn["linear"] < 0.4 * drawn["robot"]
     node = (
         "viewer.scene_tree.find(['meshcat', 'robot', 'root_joint', 'plume 0'])"
         ".object.children[0]"

@@ -5,31 +5,30 @@ const APART = 3; // CSS pixels from which on the contour is shown
 // Colours of a deviation that is small, visible, and beyond the validity of the linear model.
 const DEVIATIONS = [["small", "#3f8fd0"], ["visible", "#e6b422"], ["beyond validity", "#e0452c"]];
 
-// Show the contour of the linear model only while it is seen apart from the robot.
-function makeComparison(viewer, info) {
-  const pixel = shared.get("contour").uniforms.pixel.value;
+// Show target and linear model only while they are seen apart from the robot.
+function makeComparison(viewer, info, ghosts) {
+  const pixel = shared.has("contour") ? shared.get("contour").uniforms.pixel.value : new THREE.Vector2();
   const node = (path) => viewer.scene_tree.find(path).object;
-  const pairs = info.bodies.map((path, k) => {
+  const bodies = info.bodies.map((path, k) => {
     const [x, y, z, X, Y, Z] = info.boxes[k];
     const corners = info.boxes[k].length ? [x, X].flatMap((a) => [y, Y].flatMap((b) => [z, Z].map((c) => new THREE.Vector3(a, b, c)))) : [];
-    return { robot: node(path), linear: node([path[0], "linear", ...path.slice(2)]), corners };
+    return { robot: node(path), corners, ghosts: ghosts.map((ghost) => node([path[0], ghost, ...path.slice(2)])) };
   });
   const one = new THREE.Vector3(), other = new THREE.Vector3();
-  const apart = () => {
-    let most = 0;
-    for (const { robot, linear, corners } of pairs) for (const corner of corners) {
-      one.copy(corner).applyMatrix4(robot.matrixWorld).project(viewer.camera);
-      other.copy(corner).applyMatrix4(linear.matrixWorld).project(viewer.camera);
-      most = Math.max(most, Math.hypot((one.x - other.x) * window.innerWidth, (one.y - other.y) * window.innerHeight) / 2);
-    }
-    return most;
-  };
+  const seen = (point, corner, object) => point.copy(corner).applyMatrix4(object.matrixWorld).project(viewer.camera);
+  const apart = (k) => bodies.some(({ robot, corners, ghosts: nodes }) => corners.some((corner) => {
+    seen(one, corner, robot);
+    seen(other, corner, nodes[k]);
+    return Math.hypot((one.x - other.x) * window.innerWidth, (one.y - other.y) * window.innerHeight) / 2 > APART;
+  }));
   const render = viewer.render.bind(viewer);
   viewer.render = () => {
     viewer.controls.update();
     viewer.scene.updateMatrixWorld();
-    const shown = apart() > APART;
-    for (const { linear } of pairs) linear.visible = shown;
+    ghosts.forEach((_, k) => {
+      const shown = apart(k);
+      for (const body of bodies) body.ghosts[k].visible = shown;
+    });
     pixel.set(2 / window.innerWidth, 2 / window.innerHeight);
     render();
   };

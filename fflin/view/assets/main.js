@@ -112,9 +112,10 @@ function main() {
   const stamp = document.getElementById("stamp"), bar = document.getElementById("bar");
   const showEquipment = makeEquipment(viewer, info), showLink = makePicking(viewer, info);
   const deviation = floats(info.deviation.values);
-  if (info.linear) makeComparison(viewer, info);
+  makeComparison(viewer, info, [...(info.target ? ["target"] : []), ...(info.linear ? ["linear"] : [])]);
   let charts = [];
-  const player = makePlayer(viewer, info, (i, time) => {
+  const quality = makeQuality(viewer);
+  const player = makePlayer(viewer, info, quality, (i, time) => {
     turn(time);
     showMarks(i);
     showEquipment();
@@ -167,6 +168,6 @@ function main() {
     document.body.classList.toggle("keyed", Boolean(keyed));
     again();
   };
-  window.fflin = { ...player, plain, plots: info.plots, ready: true };
+  window.fflin = { ...player, plain, quality, plots: info.plots, ready: true };
   if (!/[#&]pause\b/.test(location.hash)) player.play();
 }

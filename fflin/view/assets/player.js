@@ -1,7 +1,7 @@
 // The clock of a motion: slider, play, speed. It drives meshcat's own animator, whose seek, play
 // and pause stay the way to it from outside.
 
-function makePlayer(viewer, info, onTime) {
+function makePlayer(viewer, info, quality, onTime) {
   const { t } = info;
   const first = t[0], last = t[t.length - 1];
   const animator = viewer.animator;
@@ -52,7 +52,11 @@ function makePlayer(viewer, info, onTime) {
     then = performance.now();
     mark();
   };
-  const pause = () => { state.playing = false; mark(); };
+  const pause = () => {
+    if (state.playing) quality.rest();
+    state.playing = false;
+    mark();
+  };
   const setSpeed = (speed) => { state.speed = Number(speed); speeds.value = speed; };
 
   animator.seek = (time) => seek(first + time);
@@ -62,6 +66,7 @@ function makePlayer(viewer, info, onTime) {
   animator.update = () => {
     if (!state.playing) return;
     const now = performance.now();
+    quality.measure(now - then);
     const time = state.time + ((now - then) / 1000) * state.speed;
     then = now;
     seek(time);
