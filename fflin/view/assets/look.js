@@ -7,7 +7,7 @@ const FINISHES = [
   [/black|carbon|rubber/i, { metalness: 0.3, roughness: 0.5 }],
   [/joint|dark|grey|gray/i, { metalness: 0.55, roughness: 0.42 }],
   [/white|tube|light/i, { metalness: 0.05, roughness: 0.42 }],
-  [/held inertia/, { metalness: 0.0, roughness: 0.8, opacity: 0.82, lift: 0.6 }],
+  [/held inertia/, { metalness: 0.0, roughness: 0.8, opacity: 0.42, lift: 0.6 }],
   [/inertia/, { metalness: 0.0, roughness: 0.7, opacity: 0.55 }],
   [/./, { metalness: 0.1, roughness: 0.5 }],
   [/^$/, { metalness: 0.15, roughness: 0.5 }],
@@ -223,7 +223,7 @@ function dress(object) {
   const body = about.look === "held" && about.finish === "inertia";
   if (body) {
     Object.assign(about, { finish: "held inertia", color: [...new THREE.Color(HELD).toArray(), 1] });
-    const lines = new THREE.LineBasicMaterial({ color: new THREE.Color("#4a3322").convertSRGBToLinear() });
+    const lines = new THREE.LineBasicMaterial({ color: new THREE.Color(HELD).convertSRGBToLinear() });
     object.add(new THREE.LineSegments(new THREE.EdgesGeometry(object.geometry), lines));
   }
   object.castShadow = object.receiveShadow = real;

@@ -90,7 +90,7 @@ function main() {
   if (info.mode === "modes") {
     makeLegend(viewer, legendOf(info));
     window.fflin = makeModes(stage, info);
-    if (!/[#&]pause\b/.test(location.hash)) window.fflin.play();
+    if (playsAtOnce()) window.fflin.play();
     return;
   }
 
@@ -146,6 +146,8 @@ function main() {
     return () => button.click();
   };
   const views = makeViews(bar, camera);
+  const loop = toggle("↻", "play again and again", false, (on) => { player.state.loop = on; });
+  bar.lastChild.setAttribute("aria-label", "loop");
   const follow = toggle("follow", "follow the base with the camera", camera.following(), camera.follow);
   // In a small window a panel that is folded has two readouts.
   const fold = toggle("panel", "show or fold the panel", !isSmall(), (on) => {
@@ -159,8 +161,8 @@ function main() {
   window.matchMedia(`(max-height: ${SMALL - 1}px)`).addEventListener("change", ({ matches }) => {
     if ((folds.getAttribute("aria-pressed") === "true") === matches) fold();
   });
-  makeHelpButton(bar, makeKeys([...player.keys, ...views, ["f", "F", "follow the base", follow], ["p", "P", "show or fold the panel", fold]]));
-  player.seek(player.first);
+  makeHelpButton(bar, makeKeys([...player.keys, ...views, ["l", "L", "play again and again", loop], ["f", "F", "follow the base", follow], ["p", "P", "show or fold the panel", fold]]));
+  player.seek(askedTime() ?? player.first);
   camera.reframe();
   window.addEventListener("resize", () => requestAnimationFrame(() => player.seek(player.state.time)));
   const plain = (on, keyed) => {
@@ -169,5 +171,6 @@ function main() {
     again();
   };
   window.fflin = { ...player, plain, quality, plots: info.plots, ready: true };
-  if (!/[#&]pause\b/.test(location.hash)) player.play();
+  window.addEventListener("hashchange", () => { if (askedTime() !== null) goTo(askedTime()); });
+  if (playsAtOnce()) player.play();
 }

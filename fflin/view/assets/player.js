@@ -1,6 +1,24 @@
 // The clock of a motion: slider, play, speed. It drives meshcat's own animator, whose seek, play
 // and pause stay the way to it from outside.
 
+// The time [s] that the address of the page asks for, or null.
+function askedTime() {
+  const found = /[#&]t=([-+.\deE]+)/.exec(location.hash);
+  return found && Number.isFinite(Number(found[1])) ? Number(found[1]) : null;
+}
+
+// Keep the time at which a motion was stopped in the address, so that a link leads there.
+function keepTime(time) {
+  try {
+    history.replaceState(null, "", `#t=${Number(time.toFixed(3))}`);
+  } catch (error) {
+    console.debug("the address is not writable:", error); // in an embedded page
+  }
+}
+
+// Whether a page plays by itself.
+const playsAtOnce = () => !/[#&]pause\b/.test(location.hash) && askedTime() === null && !window.matchMedia("(prefers-reduced-motion: reduce)").matches;
+
 function makePlayer(viewer, info, quality, onTime) {
   const { t } = info;
   const first = t[0], last = t[t.length - 1];
@@ -24,7 +42,7 @@ function makePlayer(viewer, info, quality, onTime) {
   speeds.value = info.speed;
   bar.append(button, element("div", { className: "track" }, slider), clock, speeds);
 
-  const state = { time: first, playing: false, speed: info.speed };
+  const state = { time: first, playing: false, speed: info.speed, loop: false };
   const digits = last - first > 200 ? 0 : last - first > 20 ? 1 : 2;
   // The width does not change while the motion plays.
   clock.style.minWidth = `${2 * last.toFixed(digits).length + 5}ch`;
@@ -53,7 +71,10 @@ function makePlayer(viewer, info, quality, onTime) {
     mark();
   };
   const pause = () => {
-    if (state.playing) quality.rest();
+    if (state.playing) {
+      quality.rest();
+      keepTime(state.time);
+    }
     state.playing = false;
     mark();
   };
@@ -70,7 +91,9 @@ function makePlayer(viewer, info, quality, onTime) {
     const time = state.time + ((now - then) / 1000) * state.speed;
     then = now;
     seek(time);
-    if (state.time >= last) pause();
+    if (state.time < last) return;
+    if (state.loop) seek(first);
+    else pause();
   };
   slider.addEventListener("input", () => { pause(); seek(slider.value); });
   button.addEventListener("click", () => (state.playing ? pause() : play()));
