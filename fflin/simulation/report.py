@@ -39,6 +39,9 @@ _TAIL, _GROWS, _SEEN = 0.1, 1.05, 1e-3
 
 TRUSTED = 0.1  # largest accepted relative error of a linear prediction
 
+# The heading of a page shows an error as 0 below this fraction of its largest value.
+_GONE = 1e-4
+
 # Smallest limit violation that is reported, relative to the limit. Smaller violations may be
 # integration errors.
 _SHARE = 1e-3
@@ -631,9 +634,11 @@ def headline(motion: Motion) -> str:
     judged = [kind for kind in kinds if kind.steered and kind.largest > THERE]
     if judged and not motion.tracked:
         first = judged[0]
-        final = f"{first.final:.2g}" if first.final > THERE else "0"
-        start = f"{first.initial:.3g}" if first.initial > THERE else "0"
-        parts.append(f"{first.title} {start} {first.unit} to {final} {first.unit}")
+        ends = [
+            f"{size:.3g}" if size > max(_GONE * first.largest, THERE) else "0"
+            for size in (first.initial, first.final)
+        ]
+        parts.append(f"{first.title} {ends[0]} {first.unit} to {ends[1]} {first.unit}")
     if motion.stopped:
         parts.append(f"stopped: {motion.stopped}")
     elif motion.tracked and judged:

@@ -106,7 +106,7 @@ def test_predictions_are_dashed_in_the_colour_of_their_curve(watch, tmp_path):
     assert flown > 0.97
     assert 0.3 < predicted < 0.85
     (key,) = watched.page.locator(".plot .dashed span").all_text_contents()
-    assert key == "linear model"
+    assert key == "linear"
 
 
 @pytest.fixture

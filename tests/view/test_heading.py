@@ -24,7 +24,8 @@ def test_the_heading_states_controller_attitude_and_settling(flown):
     controller, attitude, settled = headline(motion).split(", ")
     assert controller == "state feedback"
     error = motion.attitude_error
-    assert attitude == f"attitude {error[0]:.3g} deg to {error[-1]:.2g} deg"
+    final = f"{error[-1]:.3g}" if error[-1] > 1e-4 * error.max() else "0"
+    assert attitude == f"attitude {error[0]:.3g} deg to {final} deg"
     time = float(settled.removeprefix("settled after ").removesuffix(" s"))
     assert time > 0.0
     assert error[motion.t > time].max() <= 0.02 * error.max() + 1e-9

@@ -140,6 +140,7 @@ function contoured(object) {
   const depth = once("depth alone", () => new THREE.MeshBasicMaterial({ colorWrite: false, transparent: true }));
   const line = once("contour", () => new THREE.ShaderMaterial({
     transparent: true, depthWrite: false, side: THREE.BackSide,
+    polygonOffset: true, polygonOffsetFactor: 2, polygonOffsetUnits: 4,
     uniforms: { colour: { value: new THREE.Color(LINEAR) }, pixel: { value: new THREE.Vector2(1, 1) } },
     vertexShader: `
       uniform vec2 pixel; // of the screen, in normalised coordinates

@@ -116,7 +116,7 @@ function makePlot(parent, t, plot, seek, marks, enlarge) {
   if (keys && keys.textContent.length < 6) name.append(keys);
   const styles = [];
   if (plot.pale) styles.push(["pale", "reference"]);
-  if (plot.dashed) styles.push(["dashed", "linear model"]);
+  if (plot.dashed) styles.push(["dashed", "linear"]);
   const more = styles.map(([style, text]) => {
     const key = makeKeysOf([[text, UNNAMED]], []);
     key.classList.add(style);
