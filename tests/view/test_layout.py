@@ -126,7 +126,7 @@ def test_its_scrollbar_is_as_dark_as_the_page(watched):
         == "thin"
     )
     if watched.name == "canadarm2":  # where all of it has room there is none
-        watched.resize(800, 600)
+        watched.resize(800, 900)
         panel = "document.getElementById('panel')"
         assert watched.do(f"{panel}.scrollHeight <= {panel}.clientHeight")
 
