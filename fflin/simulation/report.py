@@ -627,6 +627,16 @@ def verdict(motion: Motion, kinds: list[ErrorSize]) -> str:
     return f"{text}; saturated inputs: {', '.join(listed) or 'none'}"
 
 
+# {unit of an error: unit and factor in the heading of a page}
+_PAGE_UNITS = {"rad": ("deg", float(np.degrees(1.0))), "m": ("mm", 1e3)}
+
+
+def _in_deg_mm(kind: ErrorSize) -> str:
+    """Return the title and the final value of an error as text, in deg or mm."""
+    unit, factor = _PAGE_UNITS.get(kind.unit, (kind.unit, 1.0))
+    return f"{kind.title} {factor * kind.final:.2g} {unit}"
+
+
 def headline(motion: Motion) -> str:
     """Return a line for the page of a motion: what moves the robot, and how the motion ends."""
     parts = [motion._about] if motion._about else []
@@ -634,15 +644,20 @@ def headline(motion: Motion) -> str:
     judged = [kind for kind in kinds if kind.steered and kind.largest > THERE]
     if judged and not motion.tracked:
         first = judged[0]
+        unit, factor = _PAGE_UNITS.get(first.unit, (first.unit, 1.0))
         ends = [
-            f"{size:.3g}" if size > max(_GONE * first.largest, THERE) else "0"
+            f"{factor * size:.3g} {unit}"
+            if size > max(_GONE * first.largest, THERE)
+            else f"0 {unit}"
             for size in (first.initial, first.final)
         ]
-        parts.append(f"{first.title} {ends[0]} {first.unit} to {ends[1]} {first.unit}")
+        parts.append(f"{first.title} {ends[0]} to {ends[1]}")
     if motion.stopped:
         parts.append(f"stopped: {motion.stopped}")
     elif motion.tracked and judged:
-        parts.append(f"errors at the end: {_and([kind.last for kind in judged])}")
+        parts.append(
+            f"errors at the end: {_and([_in_deg_mm(kind) for kind in judged])}"
+        )
     elif late := [kind.title for kind in judged if kind.settled is None]:
         parts.append(f"{_and(late)} not settled")
     elif judged:

@@ -3,11 +3,12 @@
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import fflin
 from fflin.simulation.report import headline
-from tests.support.motions import displaced, regulated, settling
+from tests.support.motions import displaced, led, regulated, settling
 
 
 @pytest.fixture(scope="module")
@@ -38,6 +39,18 @@ def test_the_heading_says_so_if_a_motion_does_not_settle(robots):
     assert headline(replace(motion, stopped="event")).endswith("stopped: event")
     resting = fflin.simulate(robot, None, duration=1.0)
     assert headline(resting) == "no control"
+
+
+def test_errors_along_a_trajectory_are_in_deg_and_mm(robots):
+    motion = led(settling(robots["planar_detumble"], 4.0), rows=900)
+    motion = replace(motion, target=motion.target + 1e-3)
+    _, _, text = headline(motion).partition("errors at the end: ")
+    position, joints = (
+        float(np.abs(motion.error[-1, part]).max())
+        for part in (slice(3, 6), slice(6, 9))
+    )
+    assert f"position {1e3 * position:.2g} mm" in text
+    assert f"joints {np.degrees(joints):.2g} deg" in text
 
 
 def test_a_run_of_a_campaign_is_named(flown):

@@ -36,7 +36,7 @@ function makeChart(canvas, t, curves, marks, large = false) {
       if (value < low) low = value;
       if (value > high) high = value;
     }
-    const ends = [high, low];
+    const ends = [high, low].map((end) => (Math.abs(end) > 1e-6 * (high - low) ? end : 0)); // the rest is rounding
     if (!(high - low > 0)) { low -= 1; high += 1; }
     const spare = 0.06 * (high - low);
     if (low < 0) low -= spare;
