@@ -464,7 +464,7 @@ class Campaign(FrozenArrays):
             )
         worst = ""
         if at == self.worst(1)[0]:
-            worst = f", {self.about}"
+            worst = f", worst {self.about.removeprefix('worst ')}"
         about = f"run {at} of {len(self)}{worst}, seed {self.seed}, {motion._about}"
         return replace(motion, _about=about)
 

@@ -59,9 +59,15 @@ def test_a_run_of_a_campaign_is_named(flown):
     campaign = fflin.monte_carlo(robot, policy, {"q_b": 0.1}, **options)
     worst = campaign.worst(1)[0]
     other = (worst + 1) % 6
+    assert campaign.about.startswith("worst ")
+    bounded = fflin.monte_carlo(
+        robot, policy, {"q_b": 0.1}, goals=["attitude < 5"], **options
+    )
+    assert bounded.about == "attitude"
+    first = bounded.worst(1)[0]
+    assert ", worst attitude, seed 3" in headline(bounded.replay(first))
     start = f"run {worst} of 6, {campaign.about}, seed 3, state feedback"
     assert headline(campaign.replay(worst)).startswith(start)
-    assert campaign.about.startswith("worst ")
     start = f"run {other} of 6, seed 3, state feedback"
     assert headline(campaign.replay(other)).startswith(start)
 
