@@ -2,10 +2,10 @@
 
 import io
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from fflin.base.errors import InputError, MissingPackageError, optional_package
 from fflin.base.validation import Array
@@ -21,17 +21,55 @@ else:
 
 FORMATS = (".png", ".pdf", ".svg")
 
+# Colours of curves in figures and on pages. They differ in CIEDE2000 by at least 15, also for
+# people with protanopia or deuteranopia, and can be read on white and on a dark ground.
 COLORS = (
-    "#0072b2",
-    "#d55e00",
-    "#009e73",
-    "#cc79a7",
-    "#e69f00",
-    "#56b4e9",
-    "#000000",
-    "#8a6d3b",
+    "#d40007",
+    "#34c7b1",
+    "#2e63fc",
+    "#c11684",
+    "#70b8fd",
+    "#f5931a",
+    "#fb447e",
+    "#317b58",
 )
+# The colours after the first _SOLID are drawn with dashes and dots.
+_SOLID = 5
+# Colour of curves that have none of COLORS, because others change more.
+GREY = "#8a93a5"
 _STYLE = Path(__file__).parent / "assets" / "figures.mplstyle"
+
+
+class CurveStyle(NamedTuple):
+    """Colour and line style of a curve in figures and on pages."""
+
+    color: str
+    dashed: bool = False
+
+    @property
+    def line(self) -> str:
+        """Line style of matplotlib."""
+        return "-." if self.dashed else "-"
+
+    @property
+    def is_named(self) -> bool:
+        """Whether the curve has one of COLORS, and therefore a name in the legend."""
+        return self.color != GREY
+
+
+def curve_styles(changes: Mapping[str, float]) -> dict[str, CurveStyle]:
+    """Return the style of each curve, given how much it changes.
+
+    If there are more curves than COLORS, those that change most are coloured, and the others are
+    grey. The order of the colours is the order of the curves.
+    """
+    names = list(changes)
+    largest = sorted(names, key=lambda name: -changes[name])[: len(COLORS)]
+    named = [name for name in names if name in largest]
+    styles = dict.fromkeys(names, CurveStyle(GREY))
+    for index, name in enumerate(named):
+        styles[name] = CurveStyle(COLORS[index], dashed=index >= _SOLID)
+    return styles
 
 
 def cycle(count: int) -> list[str]:

@@ -7,7 +7,7 @@ import math
 import re
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -460,7 +460,11 @@ class Campaign(FrozenArrays):
                 FflinWarning,
                 stacklevel=2,
             )
-        return motion
+        worst = ""
+        if at == self.worst(1)[0]:
+            worst = f", worst {self.about.removeprefix('worst ')}"
+        about = f"run {at} of {len(self)}{worst}, seed {self.seed}, {motion._about}"
+        return replace(motion, _about=about)
 
     def save(self, path: str | Path) -> None:
         """Save the campaign to a .npz, .h5, .csv or .mat file, atomically.

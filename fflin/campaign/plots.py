@@ -13,7 +13,8 @@ from fflin.campaign.campaign import Campaign
 from fflin.campaign.funnel import Funnel
 from fflin.campaign.report import ended_of, goal_met
 from fflin.campaign.runs import KINDS
-from fflin.campaign.validity import TRUSTED, Validity, shown
+from fflin.campaign.validity import Validity, shown
+from fflin.simulation.report import TRUSTED
 
 # Bands, widest first: (fraction of runs above the band, name, opacity). The same fraction of runs
 # is below the band.

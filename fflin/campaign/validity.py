@@ -25,6 +25,7 @@ from fflin.campaign.runs import expect
 from fflin.campaign.settling import OUTCOMES, PATIENCE, Loop, settle
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
+from fflin.simulation.report import TRUSTED
 
 # The prediction error is measured at these fractions of the largest displacement, in _DIRECTIONS
 # directions.
@@ -32,7 +33,6 @@ _LEVELS = 2.0 ** np.arange(-6.0, 1.0)
 _DIRECTIONS = 4
 
 _ROUNDING = 1e-7  # smaller prediction errors are integration errors
-TRUSTED = 0.1  # largest accepted relative prediction error
 
 # Largest accepted value of a displacement argument.
 _FARTHEST = 1e6

@@ -166,6 +166,8 @@ class Motion(StatesAndInputs, Design):
     com_drift: Vector = field(default_factory=lambda: np.zeros(0))
     # simulated robot; not saved in files
     _robot: Any = field(default=None, kw_only=True)
+    # controller, and run of a campaign, as text; not saved
+    _about: str = field(default="", kw_only=True)
     # checksum of the nominal robot; not saved
     _nominal: str = field(default="", kw_only=True)
     wheels: tuple[str, ...] = field(default_factory=tuple)

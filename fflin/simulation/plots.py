@@ -9,7 +9,15 @@ from typing import Any
 import numpy as np
 
 from fflin.base.errors import InputError
-from fflin.base.figures import COLORS, Artist, Axes, Figure, cycle, drawing
+from fflin.base.figures import (
+    COLORS,
+    Artist,
+    Axes,
+    CurveStyle,
+    Figure,
+    curve_styles,
+    drawing,
+)
 from fflin.base.names import chosen, input_keys
 from fflin.base.validation import Array
 from fflin.simulation.motion import Motion, require_motion
@@ -117,12 +125,9 @@ def plot_motion(
     heights += [3.0] * math.ceil(others / _ACROSS)
     spots = [(k // _ACROSS * len(per_row), k % _ACROSS) for k in range(len(states))]
     spots += [(above + k // _ACROSS, k % _ACROSS) for k in range(others)]
-    # A joint has the same colour in all charts.
-    every = [curve for chart in drawn.values() for curve in chart]
-    joints = dict.fromkeys(curve.short for curve in every if curve.group in JOINTS)
+    styles = styles_of(motion)
     legends: dict[str, dict[str, Artist]] = {}
     with drawing(path, 11.0, 0.3 + sum(heights), axes=axes) as figure:
-        colors = dict(zip(joints, cycle(len(joints)), strict=True))
         grid = figure.add_gridspec(
             len(heights), _ACROSS, height_ratios=heights, hspace=0.06
         )
@@ -130,8 +135,8 @@ def plot_motion(
             panel = figure.add_subplot(grid[row, column])
             group = chart[0].group
             panel.set_title(f"{title} {group}" if title in states else title)
-            chart_colors = colors if group in JOINTS else {}
-            _draw(panel, motion.t, chart, chart_colors)
+            chart_styles = styles[family_of(group)]
+            _draw(panel, motion.t, chart, chart_styles)
             if motion.tracked and [title] == states[:1]:
                 panel.plot(
                     [], [], color="#888888", lw=3.6, alpha=0.3, label="reference"
@@ -149,7 +154,7 @@ def plot_motion(
             if errors and title in states:
                 strip = figure.add_subplot(grid[row + 1, column], sharex=panel)
                 below = [errors[curve.key] for curve in chart]
-                _draw_errors(strip, motion.t, below, chart_colors, error_label)
+                _draw_errors(strip, motion.t, below, chart_styles, error_label)
                 panel.tick_params(labelbottom=False)
                 panel.set_xlabel("")
         _name_below(figure, legends)
@@ -172,6 +177,29 @@ def _heading(motion: Motion) -> str:
     phases = zip(motion.phases[1:], motion.starts[1:].tolist(), strict=True)
     parts += [f"{name} at {start:g} s" for name, start in phases]
     return f"{'; '.join(parts)}\n{motion.stopped}".strip()
+
+
+def family_of(group: str) -> str:
+    """Return the first of all groups in whose charts a name has the same colour."""
+    return next((family[0] for family in (JOINTS, WHEELS) if group in family), group)
+
+
+def styles_of(motion: Motion) -> dict[str, dict[str, CurveStyle]]:
+    """Return {family of groups: {short name: style}} for all curves of a motion.
+
+    The styles do not depend on the curves that are shown, so a joint has the same colour in all
+    figures and pages of a motion. The change of a curve counts relative to the largest change in
+    its chart.
+    """
+    changes: dict[str, dict[str, float]] = {}
+    for chart in charts(motion).values():
+        family = changes.setdefault(family_of(chart[0].group), {})
+        spans = [float(np.ptp(curve.values)) for curve in chart]
+        largest = max(spans) or 1.0
+        for curve, span in zip(chart, spans, strict=True):
+            share = span / largest
+            family[curve.short] = max(share, family.get(curve.short, 0.0))
+    return {group: curve_styles(family) for group, family in changes.items()}
 
 
 def charts(motion: Motion, show: Sequence[str] | None = None) -> dict[str, list[Curve]]:
@@ -226,7 +254,7 @@ def _draw(
     axes: Axes,
     t: Array,
     chart: Sequence[Curve],
-    colors: Mapping[str, str],
+    styles: Mapping[str, CurveStyle],
     width: float | None = None,
 ) -> None:
     """Draw curves and their limits, with references in pale colours and predictions dashed."""
@@ -241,12 +269,26 @@ def _draw(
                 c._replace(**{field: row}) for c, row in zip(chart, rows, strict=True)
             ]
     steps = "default" if group in ("", *STATES, "speed", "momentum") else "steps-post"
-    for default_color, curve in zip(cycle(len(chart)), chart, strict=True):
-        color = colors.get(curve.short, default_color)
+    # Grey curves are drawn below the others. One name at the end of the legend counts them.
+    order = sorted(chart, key=lambda curve: not styles[curve.short].is_named)
+    grey = sum(not styles[curve.short].is_named for curve in chart)
+    for k, curve in enumerate(order):
+        style = styles[curve.short]
+        color = style.color
+        label = curve.short
+        if not style.is_named:
+            label = f"{grey} more" if k == len(order) - 1 else f"_{curve.short}"
         if curve.reference is not None:
             axes.plot(t, curve.reference, color=color, lw=3.6, alpha=0.3)
         axes.plot(
-            t, curve.values, color=color, label=curve.short, drawstyle=steps, lw=width
+            t,
+            curve.values,
+            color=color,
+            label=label,
+            drawstyle=steps,
+            lw=width,
+            ls=style.line,
+            zorder=2.0 if style.is_named else 1.5,
         )
         if curve.linear is not None:
             axes.plot(t, curve.linear, color=color, ls="--", lw=1.0)
@@ -259,10 +301,14 @@ def _draw(
 
 
 def _draw_errors(
-    axes: Axes, t: Array, errors: Sequence[Curve], colors: Mapping[str, str], label: str
+    axes: Axes,
+    t: Array,
+    errors: Sequence[Curve],
+    styles: Mapping[str, CurveStyle],
+    label: str,
 ) -> None:
     """Draw the errors of a chart of states, which is above these axes."""
-    _draw(axes, t, errors, colors, width=1.0)
+    _draw(axes, t, errors, styles, width=1.0)
     axes.set_ylabel(f"{label}\n{axes.get_ylabel()}".strip())
     axes.ticklabel_format(axis="y", scilimits=(-2, 3))
 

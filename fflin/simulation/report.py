@@ -38,6 +38,11 @@ DWELL = 0.05
 # An error below _SEEN times its largest value is not judged.
 _TAIL, _GROWS, _SEEN = 0.1, 1.05, 1e-3
 
+TRUSTED = 0.1  # largest accepted relative error of a linear prediction
+
+# The heading of a page shows an error as 0 below this fraction of its largest value.
+_GONE = 1e-4
+
 # Smallest limit violation that is reported, relative to the limit. Smaller violations may be
 # integration errors.
 _SHARE = 1e-3
@@ -625,6 +630,47 @@ def verdict(motion: Motion, kinds: list[ErrorSize]) -> str:
     if len(full) > _NAMED:
         listed.append(f"{len(full) - _NAMED} more")
     return f"{text}; saturated inputs: {', '.join(listed) or 'none'}"
+
+
+# {unit of an error: unit and factor in the heading of a page}
+_PAGE_UNITS = {"rad": ("deg", float(np.degrees(1.0))), "m": ("mm", 1e3)}
+
+
+def _in_deg_mm(kind: ErrorSize) -> str:
+    """Return the title and the final value of an error as text, in deg or mm."""
+    unit, factor = _PAGE_UNITS.get(kind.unit, (kind.unit, 1.0))
+    return f"{kind.title} {factor * kind.final:.2g} {unit}"
+
+
+def headline(motion: Motion) -> str:
+    """Return a line for the page of a motion: what moves the robot, and how the motion ends."""
+    parts = [motion._about] if motion._about else []
+    kinds = [kind for kind in error_sizes(motion) if kind.title in _PLACES]
+    judged = [kind for kind in kinds if kind.steered and kind.largest > THERE]
+    if judged and not motion.tracked:
+        first = judged[0]
+        unit, factor = _PAGE_UNITS.get(first.unit, (first.unit, 1.0))
+        ends = [
+            f"{factor * size:.3g} {unit}"
+            if size > max(_GONE * first.largest, THERE)
+            else f"0 {unit}"
+            for size in (first.initial, first.final)
+        ]
+        parts.append(f"{first.title} {ends[0]} to {ends[1]}")
+    if motion.stopped:
+        parts.append(f"stopped: {motion.stopped}")
+    elif motion.tracked and judged:
+        parts.append(
+            f"errors at the end: {_and([_in_deg_mm(kind) for kind in judged])}"
+        )
+    elif late := [kind.title for kind in judged if kind.settled is None]:
+        parts.append(f"{_and(late)} not settled")
+    elif judged:
+        when = max(kind.settled or 0.0 for kind in judged)
+        parts.append(f"settled after {when:.3g} s")
+    elif kinds and any(kind.steered for kind in kinds):
+        parts.append("at the target throughout")
+    return ", ".join(parts).replace("\u00a0", " ")
 
 
 def _fast_wheels(motion: Motion) -> str:

@@ -281,6 +281,29 @@ def simulate(
         ) from None
 
 
+# {class of a policy: what it is called on the page of a motion}
+_CONTROLLERS = {
+    "StateFeedback": "state feedback",
+    "OutputFeedback": "output feedback",
+    "LinearController": "linear controller",
+    "TrajectoryFeedback": "trajectory tracking",
+    "TrajectoryOutputFeedback": "trajectory tracking, output feedback",
+    "Mpc": "MPC",
+    "TrajectoryMpc": "trajectory tracking, MPC",
+}
+
+
+def controller_of(policy: object) -> str:
+    """Return the name of a controller, or "no control" without a policy."""
+    if policy is None:
+        return "no control"
+    kind = type(policy).__name__
+    if kind in _CONTROLLERS:
+        return _CONTROLLERS[kind]
+    inner = getattr(policy, "policy", None)
+    return "controller" if inner is None else controller_of(inner)
+
+
 def motion_of(plan: Plan, run: Recording, foresees: Predictor | None = None) -> Motion:
     """Build the motion from the recorded rows of a run; `foresees` computes the prediction."""
     plant, state, robot = plan.plant, plan.plant.state, plan.plant.robot
@@ -340,6 +363,7 @@ def motion_of(plan: Plan, run: Recording, foresees: Predictor | None = None) -> 
         robot=robot.name,
         urdf_sha256=robot.urdf_sha256,
         _robot=robot,
+        _about=controller_of(plan.policy),
         wheels=tuple(plan.flown),
         wheel_inertias=np.array(list(plan.flown.values())),
         modes=tuple(map(attrgetter("name"), robot.modes)),

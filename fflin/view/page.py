@@ -81,8 +81,11 @@ _SCRIPTS = (
     "pick",
     "keys",
     "chart",
+    "raster",
     "plots",
     "large",
+    "compare",
+    "quality",
     "player",
     "live",
     "modes",
@@ -92,10 +95,11 @@ _SCRIPTS = (
 
 def packed(array: Array) -> str:
     """Encode an array in single precision; the JavaScript function `floats` decodes it."""
-    return _base64(np.ascontiguousarray(array, dtype="<f4").tobytes())
+    return encoded(np.ascontiguousarray(array, dtype="<f4").tobytes())
 
 
-def _base64(content: bytes) -> str:
+def encoded(content: bytes) -> str:
+    """Encode bytes; the JavaScript function `decode` decodes them."""
     return base64.b64encode(content).decode("ascii")
 
 
@@ -103,13 +107,17 @@ def _asset(name: str) -> str:
     return files("fflin.view").joinpath("assets", name).read_text(encoding="utf-8")
 
 
+def _bare(script: str) -> str:
+    """Remove indentation and comments from a script."""
+    return re.sub(r"(?m)^ *(//.*\n)?", "", script)
+
+
 @cache
 def _fixed() -> dict[str, str]:
     """Return the parts that all pages share: the style and the scripts."""
     bundle = files("meshcat").joinpath("viewer", "dist", "main.min.js")
     meshcat = bundle.read_text(encoding="utf-8")
-    body = "\n".join(_asset(f"{name}.js") for name in _SCRIPTS)
-    body = re.sub(r"(?m)^ *(//.*\n)?", "", body)  # indentation and comments
+    body = _bare("\n".join(_asset(f"{name}.js") for name in _SCRIPTS))
     head = '"use strict";\nconst THREE = MeshCat.THREE;'
     return {
         "style": _asset("style.css"),
@@ -117,6 +125,7 @@ def _fixed() -> dict[str, str]:
         # Put the scripts into a function, so that their names do not collide with names in
         # meshcat's bundle.
         "scripts": f"(() => {{\n{head}\n{body}\nmain();\n}})();",
+        "start": _bare(_asset("start.js")),
     }
 
 
@@ -143,12 +152,21 @@ def body_poses(robot: Robot, q: Array) -> Array:
 class Drawing:
     """Drawing of a robot at a node of a page's scene, with a child node for each body.
 
+    If `coarse` is true, meshes are drawn with few triangles.
+
     The constructor adds notes about missing drawings to `page.notes`. If `look` is "real" or
     "held", the constructor also adds the links of the robot to `page.links`.
     """
 
     def __init__(
-        self, page: Page, robot: Robot, node: str, look: str = "real", prefix: str = ""
+        self,
+        page: Page,
+        robot: Robot,
+        node: str,
+        look: str = "real",
+        prefix: str = "",
+        *,
+        coarse: bool = False,
     ) -> None:
         self.prefix = prefix
         self._visualizer = page.meshcat[node]
@@ -161,7 +179,8 @@ class Drawing:
         corners: dict[int, list[Array]] = {}
         for index, shape in enumerate(drawn_shapes):
             body = self._visualizer[self.paths[shape.joint - ROOT]]
-            for part, (geometry, matrix, color, box) in enumerate(_pieces(shape)):
+            pieces = _pieces(shape, coarse)
+            for part, (geometry, matrix, color, box) in enumerate(pieces):
                 about: dict[str, object] = {
                     "finish": shape.finish,
                     "color": color,
@@ -174,6 +193,11 @@ class Drawing:
                 shown = _ELSEWHERE if identity in page.sent else geometry
                 if geometry["type"] == "BufferGeometry":
                     about["mesh"] = identity
+                    if look == "real":
+                        # drawn instead while frames are slow, if the page contains it
+                        assert shape.mesh is not None
+                        few = load_mesh(shape.mesh, coarse=True)[part]
+                        about["coarse"] = _triangles(few)["uuid"]
                     page.sent.add(identity)
                 placed = shape.placement.homogeneous @ matrix
                 # `content` describes a three.js mesh. The material is a placeholder, which the page
@@ -259,7 +283,9 @@ def typed(array: Array | Indices, kind: str = "<f4") -> object:
     )
 
 
-def _pieces(shape: Shape) -> list[tuple[dict[str, object], Array, Color, Array]]:
+def _pieces(
+    shape: Shape, coarse: bool
+) -> list[tuple[dict[str, object], Array, Color, Array]]:
     """Return the geometry, matrix, colour and bounding box of each three.js mesh of a shape.
 
     A bounding box is given by two opposite corners (2, 3), before the transform by the matrix
@@ -276,7 +302,7 @@ def _pieces(shape: Shape) -> list[tuple[dict[str, object], Array, Color, Array]]
                 shape.color or mesh.color or PLAIN,
                 _bounds(mesh.vertices),
             )
-            for mesh in load_mesh(shape.mesh)
+            for mesh in load_mesh(shape.mesh, coarse=coarse)
         ]
     color = shape.color or PLAIN
     pieces = list[tuple[dict[str, object], Array, Color, Array]]()
@@ -493,7 +519,7 @@ class Page:
         commands = list[str]()
         if mode != "live":
             connect = "'none'"
-            commands = [_base64(command) for command in self.window.commands()]
+            commands = [encoded(command) for command in self.window.commands()]
         digits = max(4, 4 - math.floor(math.log10(self.size)))
         info = {
             **orbit,
@@ -503,6 +529,8 @@ class Page:
             "links": self.links,
             "title": robot.name,
             "subtitle": subtitle(robot),
+            "verdict": "",
+            "notes": list(self.notes),
             "scene": self.scene,
             "size": self.size,
             "centre": self.centre.tolist(),
@@ -521,6 +549,9 @@ class Page:
         )
         fields = {
             "title": escape(robot.name),
+            "subtitle": escape(str(info["subtitle"])),
+            "verdict": escape(str(info["verdict"])),
+            "notes": escape("; ".join(self.notes)),
             "scene": self.scene,
             "mode": mode,
             "connect": connect,

@@ -6,14 +6,15 @@ The page of natural modes animates one mode of a robot at a time.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator
-from typing import NamedTuple
+from collections.abc import Collection, Iterator, Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
 from fflin.analysis.modes import Mode, Modes, energies_of
 from fflin.base.errors import InputError
+from fflin.base.figures import COLORS, CurveStyle
 from fflin.base.rotation import rotation_matrices
 from fflin.base.tables import counted
 from fflin.base.validation import Array
@@ -22,13 +23,20 @@ from fflin.dynamics.impact import Capture, Impact, inertia_at
 from fflin.dynamics.integrators import DEFAULT_INTEGRATOR
 from fflin.dynamics.state import Actuation, StateMap
 from fflin.linear.model import LinearModel
+from fflin.robot.inputs import Thruster
 from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.robot import Robot
 from fflin.simulation.motion import Motion
 from fflin.simulation.plant import Plant
-from fflin.simulation.plots import JOINTS, WHEELS, charts, resting_from
-from fflin.simulation.report import STATES, Curve
-from fflin.view.page import Drawing, Page, body_poses, packed, subtitle
+from fflin.simulation.plots import (
+    JOINTS,
+    charts,
+    family_of,
+    resting_from,
+    styles_of,
+)
+from fflin.simulation.report import STATES, THERE, TRUSTED, Curve, headline
+from fflin.view.page import Drawing, Page, body_poses, encoded, packed, subtitle
 from fflin.view.shapes import carriers_of
 
 # A mode is animated with _PHASES poses per period. A period takes _PERIOD [s] on the screen. The
@@ -55,6 +63,26 @@ _NOTHING = 1e-14
 # of all curves in its plot.
 _UNSEEN = 1e-6
 
+# The time slider is coloured by the deviation of the linear prediction: small up to _SMALL, visible
+# up to TRUSTED, and beyond the validity of the linear model above.
+_SMALL = 0.01
+
+# {unit of a curve: unit and factor on the page}. Lengths of _LONG [m] or more stay in m.
+_UNITS = {
+    "rad": ("deg", math.degrees(1.0)),
+    "rad/s": ("deg/s", math.degrees(1.0)),
+    "m": ("mm", 1e3),
+    "m/s": ("mm/s", 1e3),
+}
+_LONG = 10.0
+
+# Momentum and centre of mass are conserved if their errors do not exceed this: relative to the
+# largest momentum, and in m, or relative to the distance from the reference if it exceeds 1 m.
+_CONSERVED = 1e-9
+
+# number of cells along the time in which the pulses of a thruster are drawn
+_CELLS = 600
+
 _NONE = np.zeros(0)
 
 
@@ -73,28 +101,24 @@ def motion_page(
     t = motion.t[shown]
     state = StateMap(robot, reference=motion.reference, frame=frame)
     film = play_back(state, motion.q[shown], motion.u[shown])
-    if target is None:
-        # At the end, `states` has one row for a fixed target, one row per frame for a moving
-        # target, and no row without a target.
-        states = motion.target.reshape(-1, state.nx)
-        if len(states) > 1:
-            states = states[shown]
-        goal = state.points(states)[1]
-    else:
-        goal = target[None]
+    goal = _goals(state, motion, shown) if target is None else target[None]
     goals = body_poses(robot, goal)
 
     moving = [(page.drawing, film.poses)]
     if len(goals):
-        ghost = Drawing(page, robot, "target", "ghost")
+        ghost = Drawing(page, robot, "target", "ghost", coarse=True)
         ghost.place(goals[0])
         if len(goals) > 1:
             moving.append((ghost, goals))
+    predicted: Array | None = None
+    off: Array = _NONE
     if motion.linear is not None:
         predicted = state.points(motion.linear[shown])[1]
-        moving.append(
-            (Drawing(page, robot, "linear", "linear"), body_poses(robot, predicted))
-        )
+        predicted_poses = body_poses(robot, predicted)
+        contour = Drawing(page, robot, "linear", "linear", coarse=True)
+        moving.append((contour, predicted_poses))
+        compared = goals if len(goals) else film.poses[:1]
+        off = deviation(page.drawing.corners, film.poses, predicted_poses, compared)
     held = []
     for caught, poses in payloads(motion, frame, shown):
         name = caught.prefix
@@ -131,13 +155,16 @@ def motion_page(
         "motion",
         points,
         subtitle=about[0],
-        **panel(robot, motion, shown, goal),
+        verdict=headline(motion),
+        **panel(robot, motion, shown, goal, predicted, off),
         **marks(page, film, marked_goals),
         t=packed(t),
         speed=speed,
         follow=follow,
         target=len(goals) > 0,
-        linear=motion.linear is not None,
+        linear=predicted is not None,
+        deviation={"values": packed(off), "levels": [_SMALL, TRUSTED]},
+        boxes=_boxes(page.drawing),
         phases=[
             *zip(motion.phases, motion.starts.tolist(), names, about, strict=False)
         ],
@@ -145,16 +172,69 @@ def motion_page(
     )
 
 
+def _goals(state: StateMap, motion: Motion, shown: Array) -> Array:
+    """Return the target configurations (k, nq) of a motion at the samples `shown`.
+
+    There is one row for a fixed target, one row per sample for a moving target, and no row without
+    a target.
+    """
+    states = motion.target.reshape(-1, state.nx)
+    if len(states) > 1:
+        states = states[shown]
+    return state.points(states)[1]
+
+
+def deviation(
+    corners: Mapping[int, Array], flown: Array, predicted: Array, compared: Array
+) -> Array:
+    """Return the relative error (N,) of predicted poses (N, njoints - 1, 7) of the bodies.
+
+    The error is the largest distance between a corner of a body's bounding box and its predicted
+    position. It is divided by the largest distance of any corner, at any time, from its position
+    at the poses `compared` (1 or N, njoints - 1, 7). `corners` contains the corners (8, 3) of each
+    joint's body.
+    """
+
+    def farthest(one: Array, other: Array) -> Array:
+        sizes = np.zeros(len(flown))
+        for joint, points in corners.items():
+            for point in points:
+                ends = [moved(poses[:, joint - ROOT], point) for poses in (one, other)]
+                distance = np.linalg.norm(ends[0] - ends[1], axis=1)
+                sizes = np.maximum(sizes, distance)
+        return sizes
+
+    largest = float(farthest(flown, compared).max())
+    errors = farthest(flown, predicted)
+    if largest < THERE:
+        return np.zeros(len(errors))
+    relative: Array = errors / largest
+    return relative
+
+
+def _boxes(drawing: Drawing) -> list[list[float]]:
+    """Return the least and largest coordinates of each body's bounding box, in joint order.
+
+    A body without a drawing has an empty list.
+    """
+    boxes: list[list[float]] = [[] for _ in drawing.paths]
+    for joint, corners in drawing.corners.items():
+        ends = np.concatenate((corners.min(axis=0), corners.max(axis=0)))
+        boxes[joint - ROOT] = ends.round(6).tolist()
+    return boxes
+
+
 def frame_points(page: Page, film: Playback, *, follow: bool = False) -> Array:
     """Return points (M, 3) that the camera must show: corners of bodies, tips of force arrows.
 
     If `follow` is true, the displacement of the base from the first frame is subtracted.
     """
-    strongest = np.linalg.norm(film.force, axis=1).max() or 1.0
+    strongest = _strongest(film.force)
+    reach = ARROW * page.size / strongest if strongest > THERE else 0.0
     points = []
     for index in np.unique(np.linspace(0, len(film.poses) - 1, 24).astype(int)):
         base = film.poses[index, 0, :3]
-        tip = base + ARROW * page.size * film.force[index] / strongest
+        tip = base + reach * film.force[index]
         shift = base - film.poses[0, 0, :3] if follow else np.zeros(3)
         points.append(np.vstack((page.drawing.points(film.poses[index]), tip)) - shift)
     return np.concatenate(points)
@@ -163,6 +243,7 @@ def frame_points(page: Page, film: Playback, *, follow: bool = False) -> Array:
 def marks(page: Page, film: Playback, goals: Array) -> dict[str, object]:
     """Return the data of the trails, force arrows and thruster plumes of a page.
 
+    Forces and torques that never exceed THERE are rounding errors, and have no arrow.
     `goals` (k, njoints - 1, 7) are the poses of the target. If k > 1, the target moves, and the
     trails of the target are included.
     """
@@ -181,16 +262,29 @@ def marks(page: Page, film: Playback, goals: Array) -> dict[str, object]:
         ],
         "followed": [{"points": packed(points)} for points in followed.values()],
         "arrows": [
-            {"kind": kind, "longest": ARROW * page.size, "values": packed(values)}
-            for kind, values in (("force", film.force), ("torque", film.torque))
-            if np.any(values)
+            {
+                "kind": kind,
+                "unit": unit,
+                "longest": ARROW * page.size,
+                "values": packed(values),
+            }
+            for kind, unit, values in (
+                ("force", "N", film.force),
+                ("torque", "N m", film.torque),
+            )
+            if _strongest(values) > THERE
         ],
         "plumes": [
             {**nozzle, "values": packed(film.thrust[:, k])}
             for k, nozzle in enumerate(page.nozzles)
-            if film.thrust.any()
+            if np.abs(film.thrust).max(initial=0.0) > THERE
         ],
     }
+
+
+def _strongest(vectors: Array) -> float:
+    """Return the largest length of vectors (N, 3)."""
+    return float(np.linalg.norm(vectors, axis=1).max())
 
 
 def moved(poses: Array, point: Array) -> Array:
@@ -322,16 +416,16 @@ def errors(
     turning = [joint.idx_v for joint in joints if not joint.prismatic]
     sliding = [joint.idx_v for joint in joints if joint.prismatic]
     error_of = {
-        "attitude": ("°", np.degrees(np.linalg.norm(apart[:, 3:6], axis=1))),
+        "attitude": ("deg", np.degrees(np.linalg.norm(apart[:, 3:6], axis=1))),
         "position": ("m", np.linalg.norm((q - goals)[:, :3], axis=1)),
     }
     if turning:
         error_of["largest joint"] = (
-            "°",
+            "deg",
             np.degrees(np.abs(apart[:, turning]).max(axis=1)),
         )
     if sliding:
-        error_of["largest prismatic joint"] = (
+        error_of["largest prismatic"] = (
             "m",
             np.abs(apart[:, sliding]).max(axis=1),
         )
@@ -341,9 +435,17 @@ def errors(
 
 
 def panel(
-    robot: Robot, motion: Motion, shown: Array, target: Array
+    robot: Robot,
+    motion: Motion,
+    shown: Array,
+    target: Array,
+    predicted: Array | None = None,
+    off: Array = _NONE,
 ) -> dict[str, object]:
     """Return the readouts and plots of a motion at the samples `shown`.
+
+    `predicted` (N, nq) are the configurations that the linear model predicts at these samples, and
+    `off` (N,) is their deviation.
 
     Errors are relative to the configurations `target` (k, nq). If k = 0, the page shows changes
     from the first configuration instead of errors.
@@ -354,28 +456,38 @@ def panel(
     # The errors of the joints are plotted only for a moving target.
     plotted = 4 if len(target) > 1 else 2
     rest = resting_from(motion) if len(target) > 1 else None
-    readouts = [
-        (label_form.format(quantity), unit, values)
-        for quantity, (unit, values) in error_of.items()
-    ]
-    plots = [
-        _plot(title, [Curve("", "", "", unit, values, _NONE)])
-        for title, unit, values in readouts[:plotted]
-        if values.any()
-    ]
-    readouts.append((f"{motion.kept} drift", "", motion.momentum_drift[shown]))
-    if len(motion.com_drift):  # empty in orbit, and if a file lacks it
-        readouts.append(("centre of mass drift", "m", motion.com_drift[shown]))
+    predicted_errors = dict[str, tuple[str, Array]]()
+    if predicted is not None:
+        predicted_errors = errors(robot, predicted, compared, motion.wheels)
+    readouts, plots = list[tuple[str, str, Array]](), list[dict[str, Any]]()
+    for quantity, (unit, values) in error_of.items():
+        label = label_form.format(quantity)
+        _, linear = predicted_errors.get(quantity, (unit, None))
+        (curve,) = in_page_units([Curve("", "", "", unit, values, _NONE, linear)])
+        readouts.append((label, curve.unit, curve.values))
+        if len(readouts) <= plotted and values.max() > THERE:
+            plots.append(_plot(label, [curve]))
+    if len(off):
+        readouts.append(("linear model off by", "%", 100.0 * off))
+    pulsed = {
+        names[0]
+        for item, names in robot.named_inputs
+        if isinstance(item, Thruster) and item.on_off
+    }
     for title, whole in charts(motion).items():
         lines = []
         for curve in whole:
-            reference = None
+            reference = linear = None
             if len(target) > 1 and curve.reference is not None:
                 reference = curve.reference[shown]
+            if predicted is not None and curve.linear is not None:
+                linear = curve.linear[shown]
             lines.append(
-                curve._replace(values=curve.values[shown], reference=reference)
+                curve._replace(
+                    values=curve.values[shown], reference=reference, linear=linear
+                )
             )
-        least = max(_NOTHING, _UNSEEN * max(map(_size, lines)))
+        least = max(THERE, _UNSEEN * max(map(_size, lines)))
         seen = [curve for curve in lines if _size(curve) >= least]
         # States of the base are not plotted here, because the errors of attitude and position are
         # plotted above. Rates are plotted only if one of them comes near a limit.
@@ -384,16 +496,65 @@ def panel(
             any(curve.near or not title.endswith("rates") for curve in seen)
             and not of_base
         ):
-            plots.append(_plot(title, seen))
+            strips = [curve for curve in seen if curve.name in pulsed]
+            steady = [curve for curve in seen if curve.name not in pulsed]
+            if strips:
+                plots.append(_raster(motion, strips))
+            if steady:
+                plots.append(_plot(title, in_page_units(steady)))
+    _color(plots, styles_of(motion))
     return {
         "readouts": [
             {"label": label, "unit": unit, "values": packed(values)}
             for label, unit, values in readouts
         ],
         "plots": plots,
+        "conserved": conserved(motion),
         "rest": rest,
         "passed": [[str(violation), violation.time] for violation in motion.passed],
     }
+
+
+def in_page_units(lines: list[Curve]) -> list[Curve]:
+    """Convert curves of one unit: angles to deg, lengths to mm, and rates to deg/s and mm/s.
+
+    Speeds of wheels are not converted, and neither are lengths if one of them reaches _LONG.
+    """
+    unit, factor = _UNITS.get(lines[0].unit, (lines[0].unit, 1.0))
+    long = unit in ("mm", "mm/s") and max(map(_size, lines)) >= _LONG
+    if long or lines[0].group == "speed":
+        return lines
+
+    def scaled(values: Array | None) -> Array | None:
+        return None if values is None else factor * values
+
+    return [
+        curve._replace(
+            unit=unit,
+            values=factor * curve.values,
+            limits=factor * curve.limits,
+            linear=scaled(curve.linear),
+            reference=scaled(curve.reference),
+        )
+        for curve in lines
+    ]
+
+
+def conserved(motion: Motion) -> dict[str, object]:
+    """Return the mark on the page that says whether momentum and centre of mass are conserved."""
+    drift = float(motion.momentum_drift.max())
+    distance = max(1.0, float(np.linalg.norm(motion.q[:, :3], axis=1).max()))
+    shift = float(motion.com_drift.max(initial=0.0))  # empty in orbit
+    holds = drift <= _CONSERVED and shift <= _CONSERVED * distance
+    details = f"largest relative drift of the {motion.kept}: {drift:.1e}"
+    if len(motion.com_drift):
+        details += f"; largest drift of the centre of mass: {shift:.1e} m"
+    text = f"{motion.kept} conserved"
+    if drift > _CONSERVED:
+        text = f"{motion.kept} drifts by {drift:.1e}"
+    elif not holds:
+        text = f"centre of mass drifts by {shift:.1e} m"
+    return {"holds": holds, "text": text, "details": details}
 
 
 def _size(curve: Curve) -> float:
@@ -404,24 +565,63 @@ def _size(curve: Curve) -> float:
     return float(np.abs(rows).max())
 
 
-def _plot(title: str, lines: list[Curve]) -> dict[str, object]:
+def _plot(title: str, lines: list[Curve]) -> dict[str, Any]:
     """Return the data of a plot: its curves, and the limits that each curve comes near."""
     group = lines[0].group
     return {
         "title": title,
         "unit": lines[0].unit,
-        # In all plots of a family, curves with the same label have the same colour.
-        "family": next((kin[0] for kin in (JOINTS, WHEELS) if group in kin), group),
+        # In all plots of a family, curves with the same label have the same style.
+        "family": family_of(group),
         "lines": [
             {
                 "label": curve.short,
                 "values": packed(curve.values),
                 "reference": "" if curve.reference is None else packed(curve.reference),
+                "linear": "" if curve.linear is None else packed(curve.linear),
                 "limits": curve.near,
             }
             for curve in lines
         ],
     }
+
+
+def _color(
+    plots: list[dict[str, Any]], styles: Mapping[str, Mapping[str, CurveStyle]]
+) -> None:
+    """Give all curves their styles, and the first plot of a family the names of its colours."""
+    for plot in plots:
+        family = styles.get(plot["family"], {})
+        kin = [other for other in plots if other["family"] == plot["family"]]
+        for line in plot["lines"]:
+            style = family.get(line["label"], CurveStyle(COLORS[0]))
+            line.update(colour=style.color, dashed=style.dashed)
+        if family and plot is kin[0]:
+            seen = {line["label"] for other in kin for line in other["lines"]}
+            plot["keys"] = [
+                [name, style.color, style.dashed]
+                for name, style in family.items()
+                if style.is_named and name in seen
+            ]
+
+
+def _raster(motion: Motion, thrusters: list[Curve]) -> dict[str, Any]:
+    """Return the plot of thrusters that are off or on: a strip for each, and its duty.
+
+    `pulses` is the fraction of time that a thruster is on, in each of _CELLS equal parts of the
+    motion. It comes from all rows of the motion, because frames would miss short pulses.
+    """
+    plot = _plot("on-off thrusters", thrusters)
+    edges = np.linspace(motion.t[0], motion.t[-1], _CELLS + 1)
+    for line, curve in zip(plot["lines"], thrusters, strict=True):
+        on = motion.u[:-1, motion.input_names.index(curve.name)] > 0.0
+        spent = np.concatenate(([0.0], np.cumsum(on * np.diff(motion.t))))
+        cells = np.diff(np.interp(edges, motion.t, spent)) / np.diff(edges)
+        # rounded up, so that the shortest pulse is drawn
+        levels = np.ceil(255.0 * np.clip(cells - 1e-9, 0.0, 1.0)).astype(np.uint8)
+        line["pulses"] = encoded(levels.tobytes())
+        line["duty"] = float(spent[-1] / (motion.t[-1] - motion.t[0]))
+    return {**plot, "unit": "", "raster": True}
 
 
 def mode_page(

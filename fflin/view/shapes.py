@@ -344,6 +344,10 @@ _RESOLUTION = 1.0 / 400.0
 # are larger than 2 % of the largest extent of the file's meshes.
 _LARGEST = 20_000
 
+# The same for a coarse mesh, whose cells are at most _COARSEST of the extent. Translucent robots
+# are drawn so, because without a graphics card the triangles decide the frames per second.
+_LARGEST_COARSE, _COARSEST = 1_500, 0.06
+
 
 @dataclass(frozen=True)
 class Mesh:
@@ -354,8 +358,10 @@ class Mesh:
     color: Color | None  # None without a colour in the file
 
 
-def load_mesh(path: Path) -> tuple[Mesh, ...]:
+def load_mesh(path: Path, *, coarse: bool = False) -> tuple[Mesh, ...]:
     """Read a mesh file; raise ValueError if it cannot be drawn.
+
+    A coarse mesh has few triangles.
 
     The vertices are in the file's unit of length. For a COLLADA file, they are in m.
     """
@@ -363,7 +369,30 @@ def load_mesh(path: Path) -> tuple[Mesh, ...]:
         status = os.stat(path)
     except OSError as error:
         raise ValueError(f"{path}: cannot be read: {reason(error)}") from None
-    return _loaded(path, status.st_mtime_ns, status.st_size)
+    key = path, status.st_mtime_ns, status.st_size
+    return _coarse(*key) if coarse else _loaded(*key)
+
+
+@lru_cache(maxsize=256)
+def _coarse(path: Path, modified: int, size: int) -> tuple[Mesh, ...]:
+    """Return the meshes of a file with at most about _LARGEST_COARSE triangles."""
+    meshes = _loaded(path, modified, size)
+    extent = max(float(np.ptp(mesh.vertices, axis=0).max()) for mesh in meshes)
+    resolution = _RESOLUTION
+    coarse = meshes
+    while sum(len(mesh.faces) for mesh in coarse) > _LARGEST_COARSE:
+        resolution *= 1.5
+        if resolution > _COARSEST:
+            break
+        coarse = tuple(
+            Mesh(*_weld(mesh.vertices, mesh.faces, extent * resolution), mesh.color)
+            for mesh in meshes
+        )
+    # A part whose triangles all collapse remains as it is.
+    return tuple(
+        few if len(few.faces) else mesh
+        for mesh, few in zip(meshes, coarse, strict=True)
+    )
 
 
 @lru_cache(maxsize=256)

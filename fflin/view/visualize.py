@@ -63,12 +63,19 @@ def visualize(
 
     - the robot in its colours, with axes at base and tool;
     - the paths of the tool and of the centre of mass;
-    - arrows for force and torque on the base;
+    - arrows for force and torque on the base, with their scale in the legend;
     - thrusters, with plumes whose lengths are proportional to u(t), and wheels at their frames;
-    - a translucent robot at the target, and another translucent robot at the linear prediction;
-    - a time slider, camera views, and a panel with charts of errors and inputs over time.
+    - a translucent robot at the target, and the contour of the robot at the linear prediction.
+      Both are shown only if they are more than 3 pixels away from the robot;
+    - a time slider, camera views, and a panel with charts of errors and inputs over time. Angles
+      are in deg and lengths in mm. On-off thrusters are drawn as strips with their duty.
 
-    A click on a chart enlarges it, and a click on a link shows the link's mass and pose.
+    Dashed curves show the linear prediction. A strip below the time slider is coloured by its
+    deviation from the robot, relative to the largest displacement: small up to 1 %, visible up to
+    10 %, and beyond the validity of the linear model above.
+
+    A click on a chart enlarges it, and a click on a link shows the link's mass and pose. The
+    address ``motion.html#t=12.5`` leads to a time [s].
 
     If the robot follows a trajectory, a translucent robot moves with the reference, dashed lines
     show the reference paths of base and tool, and pale curves show the reference joint positions. A

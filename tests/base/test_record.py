@@ -57,7 +57,9 @@ def content(thing):
     held = {}
     for field in fields(thing):
         value = getattr(thing, field.name)
-        if field.name in ("verified", "_robot", "_asked", "_lin") or callable(value):
+        if field.name in ("verified", "_robot", "_about", "_asked", "_lin"):
+            continue
+        if callable(value):
             continue
         held[field.name] = (
             (value.shape, np.ascontiguousarray(value).tobytes())

@@ -158,9 +158,13 @@ def test_the_panel_agrees_with_the_motion(settled, watched):
         assert float(values[0].split()[0]) == pytest.approx(angle, rel=6e-3)
         distance = np.linalg.norm(base.translation)
         assert float(values[1].split()[0]) == pytest.approx(
-            distance, rel=6e-3, abs=1e-9
+            1e3 * distance, rel=6e-3, abs=1e-6
         )
-        assert values[3] == "1.0e-13"  # the motion's own
+        units = [value.split()[1] for value in values]
+        assert units == ["deg", "mm", "deg"]
+    mark = watched.page.locator(".conserved")
+    assert mark.text_content() == "✓ momentum conserved"
+    assert "1.0e-13" in mark.get_attribute("title")
     plots = watched.page.locator(".plot .name").all_text_contents()
     assert plots[0].startswith("attitude error") and any(
         "joint torques" in p for p in plots
@@ -402,7 +406,8 @@ def test_a_lab_with_meshes_plumes_and_a_prediction(robots, watch, tmp_path):
         }
         return count;
     })()""")
-    assert drawn["robot"] == drawn["target"] == drawn["linear"] > 100_000
+    assert drawn["robot"] > 100_000
+    assert drawn["target"] == drawn["linear"] < 0.4 * drawn["robot"]
     node = (
         "viewer.scene_tree.find(['meshcat', 'robot', 'root_joint', 'plume 0'])"
         ".object.children[0]"

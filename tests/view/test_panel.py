@@ -65,7 +65,7 @@ def test_errors_match_the_pose(robots):
     np.testing.assert_allclose(
         result["largest joint"][1], np.degrees([0, 1.1]), atol=1e-7
     )
-    assert "largest prismatic joint" not in result
+    assert "largest prismatic" not in result
 
 
 def test_errors_from_a_moving_target_are_relative_to_the_same_instant(robots):
@@ -100,13 +100,13 @@ def test_metres_are_not_taken_for_degrees_nor_wheels_for_joints():
     robot.joint("wheel_1").place(q, 2.0)
     result = errors(robot, np.array([q]), target[None], robot.wheels)
     assert result["largest joint"][1] == pytest.approx(np.degrees(0.1))
-    assert result["largest prismatic joint"][1] == pytest.approx(0.03)
+    assert result["largest prismatic"][1] == pytest.approx(0.03)
     motion = settling(robot, 1.0)
     shown = panel(robot, motion, every(motion), target[None])
     labels = {item["label"]: item["unit"] for item in shown["readouts"]}
     assert (
-        labels["largest joint error"] == "°"
-        and labels["largest prismatic joint error"] == "m"
+        labels["largest joint error"] == "deg"
+        and labels["largest prismatic error"] == "mm"
     )
     assert subtitle(robot) == f"{robot.n - 1} joints, 1 wheel, 17.45 kg"
 
@@ -133,8 +133,8 @@ def test_plots_have_the_units_of_the_model():
     expected = {
         ("base torque", "N m"),
         ("base force", "N"),
-        ("joints", "rad"),
-        ("prismatic joints", "m"),
+        ("joints", "deg"),
+        ("prismatic joints", "mm"),
     }
     expected |= {("joint torques", "N m"), ("joint forces", "N")}
     expected |= {("thrusters", "N"), ("wheel torque", "N m")}
@@ -148,7 +148,8 @@ def test_plots_have_the_units_of_the_model():
         )
         x = motion.x[every(motion), motion.state_names.index(f"q_m.{joint.name}")]
         u = motion.u[every(motion), motion.input_names.index(f"tau_m.{joint.name}")]
-        np.testing.assert_allclose(drawn[source][joint.name], x, rtol=1e-6)
+        factor = 1e3 if joint.prismatic else np.degrees(1.0)
+        np.testing.assert_allclose(drawn[source][joint.name], factor * x, rtol=1e-6)
         np.testing.assert_allclose(drawn[by_key][joint.name], u, rtol=1e-6)
 
 
@@ -210,7 +211,8 @@ def test_rates_of_joints_are_shown_where_they_come_near_a_limit(robots):
             robot, limited(motion, {name: (-limit, limit)}), every(motion), motion.q[:1]
         )
         rates = limits_drawn(plots).get("joint rates")
-        assert rates == ({robot.joint_names[0]: [-1.0]} if shown else None)
+        expected = {robot.joint_names[0]: [pytest.approx(-np.degrees(1.0))]}
+        assert rates == (expected if shown else None)
 
 
 def test_thrusters_that_never_fire_are_not_drawn():
@@ -274,6 +276,7 @@ def test_references_include_joints_and_wheels():
     }
     for joint in robot.joint_names[:3]:
         expected = motion.target[rows, motion.state_names.index(f"q_m.{joint}")]
+        expected = np.degrees(expected)
         np.testing.assert_allclose(followed["joints"][joint], expected, rtol=1e-6)
     speed = motion.target[rows, motion.state_names.index("qdot_m.w")]
     np.testing.assert_allclose(followed["wheel speed"]["w"], speed, rtol=1e-6)
@@ -288,3 +291,43 @@ def test_references_include_joints_and_wheels():
     assert not any(
         line["reference"] for plot in shown["plots"] for line in plot["lines"]
     )
+
+
+@pytest.mark.parametrize(
+    ("momentum", "center", "text"),
+    [
+        (9e-10, 9e-10, "momentum conserved"),
+        (2e-9, 0.0, "momentum drifts by 2.0e-09"),
+        (0.0, 2e-9, "centre of mass drifts by 2.0e-09 m"),
+    ],
+)
+def test_one_mark_tells_whether_momentum_is_conserved(robots, momentum, center, text):
+    robot = robots["planar_detumble"]
+    motion = settling(robot, 1.0)
+    rows = np.zeros(len(motion.t))
+    rows[77] = 1.0
+    motion = replace(motion, momentum_drift=momentum * rows, com_drift=center * rows)
+    shown = panel(robot, motion, every(motion), motion.q[:1])
+    assert not any("drift" in each["label"] for each in shown["readouts"])
+    mark = shown["conserved"]
+    assert (mark["holds"], mark["text"]) == (text == "momentum conserved", text)
+    for drift in (f"{momentum:.1e}", f"{center:.1e} m"):
+        assert drift in mark["details"]
+    # From far away, a single unit of rounding is more.
+    q = motion.q.copy()
+    q[5, 0] = 1e4
+    shown = panel(robot, replace(motion, q=q), every(motion), motion.q[:1])
+    assert shown["conserved"]["holds"] is (momentum < 1e-9)
+
+
+def test_lengths_are_in_mm_until_they_are_long(robots):
+    robot = robots["planar_detumble"]
+    motion = settling(robot, 1.0)
+    for shift, unit, factor in ((3.0, "mm", 1e3), (30.0, "m", 1.0)):
+        q = motion.q.copy()
+        q[:, :3] = np.outer(motion.t, [0.0, shift, 0.0])
+        shown = panel(robot, replace(motion, q=q), every(motion), q[:1])
+        (readout,) = (x for x in shown["readouts"] if x["label"] == "position error")
+        assert readout["unit"] == unit
+        last = floats(readout["values"])[-1]
+        assert last == pytest.approx(factor * shift)

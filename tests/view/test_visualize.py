@@ -137,7 +137,7 @@ def test_names_of_robots_and_links_do_no_harm(robots, motion, tmp_path):
     with pytest.warns(fflin.FflinWarning):
         fflin.visualize(robot, settling(robot, 1.0), html=tmp_path / "m.html")
     text = (tmp_path / "m.html").read_text()
-    assert "<script>alert" not in text and text.count("</script>") == 3
+    assert "<script>alert" not in text and text.count("</script>") == 4
 
 
 def test_view_on_the_command_line(capsys, monkeypatch):

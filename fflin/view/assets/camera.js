@@ -4,6 +4,9 @@
 const FIELD_OF_VIEW = 34;
 
 const NARROW = 700; // narrower windows have the panel under the scene [CSS pixels]
+const SMALL = 520; // lower windows have a panel of two readouts and no legend [CSS pixels]
+
+const isSmall = () => window.innerHeight < SMALL;
 
 // Directions towards the camera, y up.
 const VIEWS = { front: [1, 0, 0], side: [0, 0, 1], top: [0.001, 1, 0] };
@@ -25,6 +28,11 @@ function makeCamera(viewer, info, aim) {
     if (document.body.classList.contains("plain")) return { right: 0, top: 30, bottom: legend.height + 16 };
     const w = window.innerWidth, h = window.innerHeight;
     const bottom = bar.height ? h - bar.top : 70;
+    if (isSmall() && document.body.matches(".motion:not(.opened)")) {
+      const head = box("heading").bottom + 4;
+      if (w <= NARROW) return { right: 0, top: head, bottom: (panel.height ? h - panel.top : bottom) + 4 };
+      return { right: 0, top: Math.max(head, panel.bottom + 4), bottom };
+    }
     if (w <= NARROW) return { right: 0, top: 64, bottom: (panel.height ? h - panel.top : bottom) + legend.height + 8 };
     return { right: panel.width ? w - panel.left : 0, top: 40, bottom };
   };

@@ -3,6 +3,9 @@
 // Figures of the axis are right of the lines; a large chart has the times below [CSS pixels].
 const GUTTER = 44, WIDE_GUTTER = 52, FOOT = 24;
 
+const DASHES = [3, 3]; // of a linear prediction [CSS pixels]
+const DASH_DOT = [8, 2, 2, 2]; // of the colours from the sixth on
+
 function figure(value, digits) {
   if (value === 0) return "0";
   const size = Math.abs(value);
@@ -23,17 +26,17 @@ function roundLevels(low, high, most) {
 function makeChart(canvas, t, curves, marks, large = false) {
   const first = t[0], duration = t[t.length - 1] - first || 1;
   const gutter = large ? WIDE_GUTTER : GUTTER, foot = large ? FOOT : 0;
-  let drawn = null, lines = [], width = 0, height = 0, ratio = 1, low = 0, high = 1;
+  let drawn = null, raised = null, last = [0, first], lines = [], width = 0, height = 0, ratio = 1, low = 0, high = 1;
   const x = (time) => ((time - first) / duration) * (width - (gutter + 2) * ratio) + ratio;
   const y = (value) => (1 - (value - low) / (high - low)) * (height - (2 + foot) * ratio) + ratio;
 
   const scale = () => {
     low = high = 0;
-    for (const { values, reference, limits } of lines) for (const each of [values, reference, limits]) for (const value of each) {
+    for (const { values, reference, linear, limits } of lines) for (const each of [values, reference, linear, limits]) for (const value of each) {
       if (value < low) low = value;
       if (value > high) high = value;
     }
-    const ends = [high, low];
+    const ends = [high, low].map((end) => (Math.abs(end) > 1e-6 * (high - low) ? end : 0)); // the rest is rounding
     if (!(high - low > 0)) { low -= 1; high += 1; }
     const spare = 0.06 * (high - low);
     if (low < 0) low -= spare;
@@ -79,7 +82,18 @@ function makeChart(canvas, t, curves, marks, large = false) {
       context.fill();
     }
     for (const { reference, colour } of lines) curve(reference, colour, 4, 0.4);
-    for (const { values, colour } of lines) curve(values, colour, large ? 1.8 : 1.4, 1);
+    const own = (line) => {
+      context.setLineDash(line.dashed ? DASH_DOT.map((each) => each * ratio) : []);
+      const colour = line === raised && line.colour === UNNAMED ? style.getPropertyValue("--ink") : line.colour;
+      curve(line.values, colour, (large ? 1.8 : 1.4) * (line === raised ? 1.6 : 1), 1);
+    };
+    // Grey curves lie below the others, and the one that is pointed at above all.
+    const rank = (line) => (line === raised ? 2 : line.colour === UNNAMED ? 0 : 1);
+    [...lines].sort((a, b) => rank(a) - rank(b)).forEach(own);
+    // What the linear model predicts.
+    context.setLineDash(DASHES.map((each) => each * ratio));
+    for (const { linear, colour } of lines) curve(linear, colour, large ? 1.4 : 1.1, 0.95);
+    context.setLineDash([]);
     Object.assign(context, {
       globalAlpha: 1, fillStyle: style.getPropertyValue("--faint"), font: `${(large ? 12 : 11) * ratio}px system-ui, sans-serif`,
       textBaseline: "middle", textAlign: large ? "left" : "right",
@@ -95,6 +109,7 @@ function makeChart(canvas, t, curves, marks, large = false) {
     for (const time of times) context.fillText(`${time} s`, Math.min(right, Math.max(3 * half, x(time))), height - 0.4 * foot * ratio);
   };
   const show = (i, time) => {
+    last = [i, time];
     if (!drawn || canvas.width !== width) draw();
     if (!drawn) return;
     const context = canvas.getContext("2d");
@@ -121,6 +136,12 @@ function makeChart(canvas, t, curves, marks, large = false) {
     return { time, i, line: lines.length ? lines.reduce((a, b) => (away(b) < away(a) ? b : a)) : null };
   };
   const redraw = () => { drawn = null; };
+  const raise = (line) => {
+    if (line === raised) return;
+    raised = line;
+    redraw();
+    show(...last);
+  };
   window.addEventListener("resize", redraw);
-  return { show, under, redraw };
+  return { show, under, redraw, raise, reading: (line, i) => figure(line.values[i], large ? 4 : 3) };
 }

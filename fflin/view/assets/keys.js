@@ -21,8 +21,13 @@ function makeKeys(keys) {
     }],
   ];
   const list = element("dl");
-  for (const [, name, what] of all) list.append(element("dt", {}, name), element("dd", {}, what));
-  list.append(element("dt", {}, "mouse"), element("dd", {}, "drag: turn; right button: shift; wheel: zoom; click a link: its mass and pose"));
+  const row = (kind, name, what) => list.append(element("dt", { className: kind }, name), element("dd", { className: kind }, what));
+  for (const [, name, what] of all) row("keyboard", name, what);
+  row("keyboard", "mouse", "drag: turn; right button: shift; wheel: zoom; click a link: its mass and pose");
+  row("touch", "one finger", "turn");
+  row("touch", "two fingers", "shift and zoom");
+  row("touch", "tap a link", "its mass and pose");
+  row("touch", "tap a chart", "enlarge it");
   help.append(list);
   help.addEventListener("click", toggle);
   document.getElementById("overlay").append(help);

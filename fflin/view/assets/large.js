@@ -11,7 +11,8 @@ function makeLarge(info, seek, marks) {
 
   let plot = null, hidden = new Set(), rows = [], now = [0, info.t[0]], pointed = null;
   const shown = () => plot.lines.filter((line) => !hidden.has(line));
-  const chart = makeChart(canvas, info.t, shown, marks, true);
+  const kinds = [makeChart, makeRaster].map((make) => make(canvas, info.t, shown, marks, true));
+  let chart = kinds[0];
   const nameOf = (line) => line.label || plot.title;
   const show = (i = now[0], time = now[1]) => {
     now = [i, time];
@@ -21,7 +22,7 @@ function makeLarge(info, seek, marks) {
     clock.textContent = `t = ${figure(when, 4)} s`;
     rows.forEach(({ row, line, value }) => {
       const reference = line.reference.length ? ` (${figure(line.reference[at], 3)})` : "";
-      value.textContent = figure(line.values[at], 4) + reference;
+      value.textContent = chart.reading(line, at, when) + reference;
       row.classList.toggle("near", Boolean(pointed) && pointed.line === line);
     });
   };
@@ -37,6 +38,7 @@ function makeLarge(info, seek, marks) {
   };
   const open = (given) => {
     plot = given;
+    chart = kinds[plot.raster ? 1 : 0];
     hidden = new Set();
     heading.textContent = plot.unit ? `${plot.title} [${plot.unit}]` : plot.title;
     rows = plot.lines.map((line) => {
@@ -47,6 +49,7 @@ function makeLarge(info, seek, marks) {
     });
     curves.replaceChildren(...rows.map(({ row }) => row));
     if (plot.lines.some((line) => line.reference.length)) curves.append(element("small", {}, "in brackets and pale: the reference"));
+    if (plot.lines.some((line) => line.linear.length)) curves.append(element("small", { className: "dashed" }, "dashed: the linear model"));
     all.hidden = plot.lines.length < 3;
     box.hidden = false;
     place();
@@ -58,6 +61,7 @@ function makeLarge(info, seek, marks) {
       const unit = plot.unit ? ` [${plot.unit}]` : "";
       columns.push([nameOf(line) + unit, line.values]);
       if (line.reference.length) columns.push([`${nameOf(line)} reference${unit}`, line.reference]);
+      if (line.linear.length) columns.push([`${nameOf(line)} linear${unit}`, line.linear]);
     }
     const quoted = columns.map(([name]) => (/[",]/.test(name) ? `"${name.replaceAll('"', '""')}"` : name));
     const line = (_, i) => columns.map(([, values]) => Number(values[i].toPrecision(7))).join(",");
@@ -72,12 +76,13 @@ function makeLarge(info, seek, marks) {
   });
   const point = (event) => {
     pointed = chart.under(event);
+    chart.raise(pointed.line);
     if (event.buttons) seek(pointed.time);
     show();
   };
   canvas.addEventListener("pointerdown", (event) => { canvas.setPointerCapture(event.pointerId); point(event); });
   canvas.addEventListener("pointermove", point);
-  canvas.addEventListener("pointerleave", () => { pointed = null; show(); });
+  canvas.addEventListener("pointerleave", () => { pointed = null; chart.raise(null); show(); });
   window.addEventListener("resize", () => { place(); requestAnimationFrame(() => show()); });
   return { open, show };
 }

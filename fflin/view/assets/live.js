@@ -49,6 +49,17 @@ function makeSlider(parent, joint, long, send) {
   };
 }
 
+// The pose as Python code: the joints, and the base if it is not at the origin.
+function codeOf(info, { joints, poses }) {
+  const short = (x) => String(Number(x.toFixed(6)));
+  const angles = info.joints.map(({ name }, k) => `${JSON.stringify(name)}: ${short(joints[k])}`).join(", ");
+  const [x, y, z, ...turn] = poses[0];
+  const home = [x, y, z, ...turn.slice(0, 3)].every((each) => Math.abs(each) < 1e-6);
+  const base = home ? "" : `, pin.XYZQUATToSE3(np.array([${poses[0].map(short).join(", ")}]))`;
+  const imports = home ? "import fflin" : "import numpy as np\nimport pinocchio as pin\n\nimport fflin";
+  return `${imports}\n\nrobot = fflin.load(${JSON.stringify(info.title)})\nq = fflin.configuration(robot, {${angles}}${base})`;
+}
+
 function makeLive({ viewer, camera, turn }, info) {
   const panel = document.getElementById("panel");
   let socket = null;
@@ -61,7 +72,16 @@ function makeLive({ viewer, camera, turn }, info) {
     button.addEventListener("click", () => send(message));
     row.append(button);
   }
-  if (info.joints.length) panel.append(row);
+  const code = element("pre", { id: "code", hidden: true }), show = element("button", { title: "the pose as Python code" }, "code");
+  const write = () => { code.textContent = codeOf(info, live.state); };
+  show.addEventListener("click", () => {
+    code.hidden = !code.hidden || !live.state;
+    if (code.hidden) return;
+    write();
+    navigator.clipboard?.writeText(code.textContent).catch(() => {}); // it can be selected by hand
+  });
+  row.append(show);
+  panel.append(row, code);
   const long = info.joints.some((joint) => joint.name.length > 11); // than there is room for beside a slider
   const sliders = info.joints.map((joint) => makeSlider(panel, joint, long, send));
   const showHeat = makeHeatMap(panel, info.names);
@@ -84,6 +104,7 @@ function makeLive({ viewer, camera, turn }, info) {
     turn(state.time ?? 0);
     camera.step();
     live.state = state;
+    if (!code.hidden) write();
     viewer.set_dirty();
   };
   const connect = () => {

@@ -7,13 +7,14 @@ const FINISHES = [
   [/black|carbon|rubber/i, { metalness: 0.3, roughness: 0.5 }],
   [/joint|dark|grey|gray/i, { metalness: 0.55, roughness: 0.42 }],
   [/white|tube|light/i, { metalness: 0.05, roughness: 0.42 }],
-  [/held inertia/, { metalness: 0.0, roughness: 0.8, opacity: 0.82, lift: 0.6 }],
+  [/held inertia/, { metalness: 0.0, roughness: 0.8, opacity: 0.42, lift: 0.6 }],
   [/inertia/, { metalness: 0.0, roughness: 0.7, opacity: 0.55 }],
   [/./, { metalness: 0.1, roughness: 0.5 }],
   [/^$/, { metalness: 0.15, roughness: 0.5 }],
 ];
 
-const GHOSTS = { ghost: [0x9fc4ff, 0.42], linear: [0xff7fc8, 0.50] };
+const GHOST_LOOK = [0x9fc4ff, 0.42]; // colour and strength
+const CONTOUR = 1.7; // width [CSS pixels]
 
 const shared = new Map(); // geometries by name, materials and textures by what they are
 
@@ -109,9 +110,9 @@ function realMaterial(about) {
 }
 
 // Brightest where the surface turns away, as glass does.
-function ghostMaterial(kind) {
-  const [colour, strength] = GHOSTS[kind];
-  return once(`ghost ${kind}`, () => new THREE.ShaderMaterial({
+function ghostMaterial() {
+  const [colour, strength] = GHOST_LOOK;
+  return once("ghost", () => new THREE.ShaderMaterial({
     transparent: true, depthWrite: false, side: THREE.FrontSide,
     polygonOffset: true, polygonOffsetFactor: 2, polygonOffsetUnits: 4,
     uniforms: { colour: { value: new THREE.Color(colour) }, strength: { value: strength } },
@@ -131,6 +132,31 @@ function ghostMaterial(kind) {
         gl_FragColor = vec4(colour, strength * (0.16 + 0.84 * rim));
       }`,
   }));
+}
+
+// A contour: of the piece itself only the depth is drawn, and of its back faces, moved outwards by
+// the width of the line, what lies beside it.
+function contoured(object) {
+  const depth = once("depth alone", () => new THREE.MeshBasicMaterial({ colorWrite: false, transparent: true }));
+  const line = once("contour", () => new THREE.ShaderMaterial({
+    transparent: true, depthWrite: false, side: THREE.BackSide,
+    polygonOffset: true, polygonOffsetFactor: 2, polygonOffsetUnits: 4,
+    uniforms: { colour: { value: new THREE.Color(LINEAR) }, pixel: { value: new THREE.Vector2(1, 1) } },
+    vertexShader: `
+      uniform vec2 pixel; // of the screen, in normalised coordinates
+      void main() {
+        vec4 p = projectionMatrix * modelViewMatrix * vec4(position, 1.0);
+        vec2 n = (projectionMatrix * vec4(normalMatrix * normal, 0.0)).xy / pixel;
+        p.xy += ${CONTOUR.toFixed(1)} * normalize(n + 1e-9) * pixel * p.w;
+        gl_Position = p;
+      }`,
+    fragmentShader: "uniform vec3 colour; void main() { gl_FragColor = vec4(colour, 0.95); }",
+  }));
+  const beside = new THREE.Mesh(object.geometry, line);
+  object.material = depth;
+  object.renderOrder = 3;
+  beside.renderOrder = 4;
+  object.add(beside);
 }
 
 // Texture coordinates of a box in metres, so that a pattern has one size on all boxes.
@@ -198,10 +224,11 @@ function dress(object) {
   const body = about.look === "held" && about.finish === "inertia";
   if (body) {
     Object.assign(about, { finish: "held inertia", color: [...new THREE.Color(HELD).toArray(), 1] });
-    const lines = new THREE.LineBasicMaterial({ color: new THREE.Color("#4a3322").convertSRGBToLinear() });
+    const lines = new THREE.LineBasicMaterial({ color: new THREE.Color(HELD).convertSRGBToLinear() });
     object.add(new THREE.LineSegments(new THREE.EdgesGeometry(object.geometry), lines));
   }
-  object.material = real ? realMaterial(about) : ghostMaterial(about.look);
   object.castShadow = object.receiveShadow = real;
+  if (about.look === "linear") return contoured(object);
+  object.material = real ? realMaterial(about) : ghostMaterial();
   object.renderOrder = real ? 0 : 2;
 }

@@ -13,7 +13,7 @@ function problem(message) {
   box.hidden = !message;
 }
 
-const GHOST = "#8fb4ff", HELD = "#b5926f";
+const GHOST = "#8fb4ff", HELD = "#b5926f", LINEAR = "#ff7fc8";
 
 // The largest side of the box about points x, y, z, ...
 function extent(points) {
@@ -30,13 +30,13 @@ function legendOf(info) {
     ...info.trails.filter(({ points }) => extent(points) > 0.02 * info.size).map(({ name }) => entry(`path of the ${name}`, MARKS[name], "trails", name)),
     ...Object.entries({ wheel: WHEEL, nozzle: NOZZLE }).filter(([kind]) => info[`${kind}s`].length).map(([kind, colour]) => (
       { label: kind === "wheel" ? "wheels" : "thrusters", colour, paths: info[`${kind}s`].map(({ path }, k) => [...path, `${kind} ${k}`]) })),
-    ...info.arrows.map(({ kind }) => entry(`${kind} on the base`, MARKS[kind], "wrench", kind)),
+    ...info.arrows.map(({ kind, unit, values }) => entry(`${kind} on the base (longest: ${figure(largest(values, 3), 2)} ${unit})`, MARKS[kind], "wrench", kind)),
   ];
   const rest = info.rest === null ? "" : `, at rest from ${Number(info.rest.toPrecision(4))} s`;
   const dashed = info.followed.length > 0;
   if (info.target) entries.push({ ...entry(dashed ? `reference${rest}` : "target", GHOST, "target"), dashed });
   entries.push(...info.held.map((name) => entry(name, HELD, "held", name)));
-  if (info.linear) entries.push(entry("linear model", "#ff7fc8", "linear"));
+  if (info.linear) entries.push({ ...entry("linear model", LINEAR, "linear"), dashed: true });
   // In the panel thrusters are named in their plot; a strip of pictures has none.
   return [...entries, ...info.plumes.map(({ name, colour }) => ({ label: name, colour, strip: true }))];
 }
@@ -90,27 +90,32 @@ function main() {
   if (info.mode === "modes") {
     makeLegend(viewer, legendOf(info));
     window.fflin = makeModes(stage, info);
-    if (!/[#&]pause\b/.test(location.hash)) window.fflin.play();
+    if (playsAtOnce()) window.fflin.play();
     return;
   }
 
   info.t = floats(info.t);
   for (const each of [...info.trails, ...info.followed]) each.points = floats(each.points);
   for (const each of [...info.arrows, ...info.plumes, ...info.readouts]) each.values = floats(each.values);
-  for (const plot of info.plots) for (const line of plot.lines) for (const key of ["values", "reference"]) line[key] = floats(line[key]);
-  paint(info.plots);
-  const thrusters = info.plots.filter((plot) => plot.title === "thrusters").flatMap((plot) => plot.lines);
+  for (const plot of info.plots) for (const line of plot.lines) for (const key of ["values", "reference", "linear"]) line[key] = floats(line[key]);
+  markFirst(info.plots);
+  for (const plot of info.plots) if (plot.raster) for (const line of plot.lines) line.pulses = decode(line.pulses);
+  const thrusters = info.plots.filter((plot) => plot.family === "thrust").flatMap((plot) => plot.lines);
   const most = Math.max(...info.plumes.map(({ values }) => largest(values, 1)));
   info.plumes = info.plumes.filter((each) => thrusters.some(({ label }) => label === each.name)); // those that fire
   for (const each of info.plumes) Object.assign(each, { most, colour: thrusters.find(({ label }) => label === each.name).colour });
   const panel = document.getElementById("panel");
   const showMarks = makeMarks(viewer, info);
   const showFigures = makeReadouts(panel, info.readouts);
+  makeConserved(panel, info.conserved);
   const showPhase = makePhases(panel, info.phases, (time) => goTo(time));
   const stamp = document.getElementById("stamp"), bar = document.getElementById("bar");
   const showEquipment = makeEquipment(viewer, info), showLink = makePicking(viewer, info);
+  const deviation = floats(info.deviation.values);
+  makeComparison(viewer, info, [...(info.target ? ["target"] : []), ...(info.linear ? ["linear"] : [])]);
   let charts = [];
-  const player = makePlayer(viewer, info, (i, time) => {
+  const quality = makeQuality(viewer);
+  const player = makePlayer(viewer, info, quality, (i, time) => {
     turn(time);
     showMarks(i);
     showEquipment();
@@ -121,6 +126,7 @@ function main() {
     camera.step();
   });
   const goTo = (time) => { player.pause(); player.seek(time); };
+  if (deviation.length) makeStrip(player.slider, info.t, deviation, info.deviation.levels);
   makePassed(panel, info.passed, goTo);
   const marks = [...info.phases.slice(1).map(([, start]) => start), info.rest].filter((time) => time !== null);
   const large = makeLarge(info, goTo, marks);
@@ -128,7 +134,7 @@ function main() {
   if (info.plots.length) makeSpan(panel, info.t);
   fitPlots(panel);
   const again = () => window.dispatchEvent(new Event("resize"));
-  window.addEventListener("resize", () => { if (fitPlots(panel)) again(); });
+  window.addEventListener("resize", () => fitPlots(panel));
   makeLegend(viewer, legendOf(info));
 
   const toggle = (text, title, pressed, act) => {
@@ -140,10 +146,23 @@ function main() {
     return () => button.click();
   };
   const views = makeViews(bar, camera);
+  const loop = toggle("↻", "play again and again", false, (on) => { player.state.loop = on; });
+  bar.lastChild.setAttribute("aria-label", "loop");
   const follow = toggle("follow", "follow the base with the camera", camera.following(), camera.follow);
-  const fold = toggle("panel", "show or fold the panel", true, (on) => { document.body.classList.toggle("folded", !on); again(); });
-  makeHelpButton(bar, makeKeys([...player.keys, ...views, ["f", "F", "follow the base", follow], ["p", "P", "show or fold the panel", fold]]));
-  player.seek(player.first);
+  // In a small window a panel that is folded has two readouts.
+  const fold = toggle("panel", "show or fold the panel", !isSmall(), (on) => {
+    document.body.classList.toggle("folded", !on && !isSmall());
+    document.body.classList.toggle("opened", on);
+    again();
+  });
+  document.body.classList.toggle("opened", !isSmall());
+  const folds = bar.lastChild;
+  folds.classList.add("fold");
+  window.matchMedia(`(max-height: ${SMALL - 1}px)`).addEventListener("change", ({ matches }) => {
+    if ((folds.getAttribute("aria-pressed") === "true") === matches) fold();
+  });
+  makeHelpButton(bar, makeKeys([...player.keys, ...views, ["l", "L", "play again and again", loop], ["f", "F", "follow the base", follow], ["p", "P", "show or fold the panel", fold]]));
+  player.seek(askedTime() ?? player.first);
   camera.reframe();
   window.addEventListener("resize", () => requestAnimationFrame(() => player.seek(player.state.time)));
   const plain = (on, keyed) => {
@@ -151,6 +170,7 @@ function main() {
     document.body.classList.toggle("keyed", Boolean(keyed));
     again();
   };
-  window.fflin = { ...player, plain, plots: info.plots, ready: true };
-  if (!/[#&]pause\b/.test(location.hash)) player.play();
+  window.fflin = { ...player, plain, quality, plots: info.plots, ready: true };
+  window.addEventListener("hashchange", () => { if (askedTime() !== null) goTo(askedTime()); });
+  if (playsAtOnce()) player.play();
 }

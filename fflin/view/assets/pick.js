@@ -1,6 +1,6 @@
 // Links are named where the pointer is; a click shows the mass and the pose of one.
 
-const STILL = 4; // CSS pixels that a click may move
+const STILL = 4, TAP = 10; // CSS pixels that a click and a touch may move
 
 // A number with these decimals, never -0.
 const fixed = (x, decimals) => (Number(x.toFixed(decimals)) + 0).toFixed(decimals);
@@ -56,7 +56,8 @@ function makePicking(viewer, info) {
   let down = null, asked = null;
   pane.addEventListener("pointerdown", (event) => { down = [event.clientX, event.clientY]; name.hidden = true; });
   pane.addEventListener("pointerup", (event) => {
-    if (down && Math.hypot(event.clientX - down[0], event.clientY - down[1]) <= STILL) pick(under(event));
+    const most = event.pointerType === "touch" ? TAP : STILL;
+    if (down && Math.hypot(event.clientX - down[0], event.clientY - down[1]) <= most) pick(under(event));
     down = null;
   });
   // Once a frame, since a mesh has many triangles.

@@ -1,7 +1,25 @@
 // The clock of a motion: slider, play, speed. It drives meshcat's own animator, whose seek, play
 // and pause stay the way to it from outside.
 
-function makePlayer(viewer, info, onTime) {
+// The time [s] that the address of the page asks for, or null.
+function askedTime() {
+  const found = /[#&]t=([-+.\deE]+)/.exec(location.hash);
+  return found && Number.isFinite(Number(found[1])) ? Number(found[1]) : null;
+}
+
+// Keep the time at which a motion was stopped in the address, so that a link leads there.
+function keepTime(time) {
+  try {
+    history.replaceState(null, "", `#t=${Number(time.toFixed(3))}`);
+  } catch (error) {
+    console.debug("the address is not writable:", error); // in an embedded page
+  }
+}
+
+// Whether a page plays by itself.
+const playsAtOnce = () => !/[#&]pause\b/.test(location.hash) && askedTime() === null && !window.matchMedia("(prefers-reduced-motion: reduce)").matches;
+
+function makePlayer(viewer, info, quality, onTime) {
   const { t } = info;
   const first = t[0], last = t[t.length - 1];
   const animator = viewer.animator;
@@ -22,9 +40,9 @@ function makePlayer(viewer, info, onTime) {
   const choices = [...new Set([0.1, 0.25, 0.5, 1, 2, 5, 10, 20, 50, info.speed])].sort((a, b) => a - b);
   for (const speed of choices) speeds.append(new Option(`${speed}×`, speed));
   speeds.value = info.speed;
-  bar.append(button, slider, clock, speeds);
+  bar.append(button, element("div", { className: "track" }, slider), clock, speeds);
 
-  const state = { time: first, playing: false, speed: info.speed };
+  const state = { time: first, playing: false, speed: info.speed, loop: false };
   const digits = last - first > 200 ? 0 : last - first > 20 ? 1 : 2;
   // The width does not change while the motion plays.
   clock.style.minWidth = `${2 * last.toFixed(digits).length + 5}ch`;
@@ -52,7 +70,14 @@ function makePlayer(viewer, info, onTime) {
     then = performance.now();
     mark();
   };
-  const pause = () => { state.playing = false; mark(); };
+  const pause = () => {
+    if (state.playing) {
+      quality.rest();
+      keepTime(state.time);
+    }
+    state.playing = false;
+    mark();
+  };
   const setSpeed = (speed) => { state.speed = Number(speed); speeds.value = speed; };
 
   animator.seek = (time) => seek(first + time);
@@ -62,10 +87,13 @@ function makePlayer(viewer, info, onTime) {
   animator.update = () => {
     if (!state.playing) return;
     const now = performance.now();
+    quality.measure(now - then);
     const time = state.time + ((now - then) / 1000) * state.speed;
     then = now;
     seek(time);
-    if (state.time >= last) pause();
+    if (state.time < last) return;
+    if (state.loop) seek(first);
+    else pause();
   };
   slider.addEventListener("input", () => { pause(); seek(slider.value); });
   button.addEventListener("click", () => (state.playing ? pause() : play()));
@@ -79,5 +107,5 @@ function makePlayer(viewer, info, onTime) {
     ["End", "End", "to the end", () => seek(last)],
   ];
   mark();
-  return { seek, play, pause, setSpeed, state, first, last, keys };
+  return { seek, play, pause, setSpeed, state, first, last, keys, slider };
 }

@@ -1,9 +1,8 @@
 // The panel of a motion: figures, what was passed, phases, and small charts.
 
-const COLOURS = ["#ff7a70", "#7ad97f", "#6aa5ff", "#f6c35b", "#c58bff", "#5fd6d0", "#ff9ed0", "#b6c46a", "#9aa7ff", "#d79a6a", "#4fb08c", "#e05fa8"];
-const NAMED = 8, UNNAMED = "#8a93a5"; // of more lines than colours those that change most are named
+const UNNAMED = "#8a93a5"; // of more curves than colours those that change most are named
 
-const TALL = 62, LOW = 30; // heights of a plot where there is room, and at least
+const TALL = 62, LOW = 48; // heights of a plot where there is room, and at least
 
 function makeReadouts(parent, readouts) {
   if (!readouts.length) return () => {};
@@ -17,6 +16,11 @@ function makeReadouts(parent, readouts) {
   });
   parent.append(grid);
   return (i) => shows.forEach((show) => show(i));
+}
+
+// One mark for the quantities that the simulation must conserve.
+function makeConserved(parent, { holds, text, details }) {
+  parent.append(element("div", { className: holds ? "conserved" : "conserved lost", title: details }, `${holds ? "✓" : "✗"} ${text}`));
 }
 
 // What went beyond its limit: the worst of it, which leads to its time; all of it on hovering.
@@ -65,27 +69,12 @@ function makeSpan(parent, t) {
   parent.append(row);
 }
 
-// Give the lines their colours: a name has one in all plots of a family, the first of which has keys.
-function paint(plots) {
-  const first = plots.find((plot) => plot.lines.some((line) => line.reference.length));
-  if (first) first.pale = true; // has the key of the references
-  const change = (line) => line.values.reduce((a, b) => Math.max(a, b), -Infinity) - line.values.reduce((a, b) => Math.min(a, b), Infinity);
-  for (const family of new Set(plots.map((plot) => plot.family))) {
-    const kin = plots.filter((plot) => plot.family === family), most = new Map();
-    for (const { lines } of kin) {
-      const changes = lines.map(change), largest = Math.max(...changes) || 1;
-      lines.forEach(({ label }, k) => most.set(label, Math.max(changes[k] / largest, most.get(label) || 0)));
-    }
-    let names = [...most.keys()];
-    if (names.length > COLOURS.length) {
-      const named = new Set([...names].sort((a, b) => most.get(b) - most.get(a)).slice(0, NAMED));
-      names = names.filter((name) => named.has(name));
-    }
-    const axes = names.every((name) => "xyz".includes(name));
-    const colours = new Map(names.map((name, k) => [name, COLOURS[axes ? "xyz".indexOf(name) : k]]));
-    for (const { lines } of kin) for (const line of lines) line.colour = colours.get(line.label) || UNNAMED;
-    if (names.some((name) => name)) kin[0].keys = [...colours];
-  }
+// Mark the first plot with a reference and the first with a prediction, which have their keys.
+function markFirst(plots) {
+  const first = (kind) => plots.find((plot) => plot.lines.some((line) => line[kind].length));
+  const [reference, predicted] = [first("reference"), first("linear")];
+  if (reference) reference.pale = true;
+  if (predicted) predicted.dashed = true;
 }
 
 // Which colour is whose, for this plot and those below it with the same names.
@@ -94,8 +83,9 @@ function makeKeysOf(named, lines) {
   const keys = document.createElement("div");
   keys.className = "keys";
   const grey = new Set(lines.map((line) => line.label));
-  for (const [label, colour] of named) {
+  for (const [label, colour, dashed] of named) {
     const key = document.createElement("span");
+    key.classList.toggle("dashdot", Boolean(dashed));
     key.textContent = label;
     key.style.setProperty("--swatch", colour);
     keys.append(key);
@@ -105,42 +95,38 @@ function makeKeysOf(named, lines) {
   return keys;
 }
 
-// Give the plots of a panel the height that is there for them, in a wide window in two columns
-// where one is too short. Returns whether the panel has another width by that.
+// Give the plots of a panel the height that is there for them. Where they do not fit, the panel
+// scrolls.
 function fitPlots(panel) {
-  const count = panel.querySelectorAll(".plot").length, width = panel.clientWidth;
-  if (window.innerWidth <= NARROW) {
-    panel.classList.remove("wide");
-    panel.style.setProperty("--tall", `${TALL}px`);
-    return panel.clientWidth !== width;
+  const count = panel.querySelectorAll(".plot").length;
+  const over = () => panel.scrollHeight - panel.clientHeight;
+  for (let tall = TALL; ; tall = Math.max(LOW, tall - Math.max(2, Math.floor(over() / count)))) {
+    panel.style.setProperty("--tall", `${tall}px`);
+    if (over() <= 0 || tall === LOW || !count || window.innerWidth <= NARROW) return;
   }
-  const over = () => Math.max(panel.scrollHeight - panel.clientHeight, panel.scrollWidth - panel.clientWidth);
-  const fit = (wide) => {
-    panel.classList.toggle("wide", wide);
-    for (let tall = TALL; ; tall = Math.max(LOW, tall - Math.max(2, Math.floor(over() / count)))) {
-      panel.style.setProperty("--tall", `${tall}px`);
-      if (over() <= 0 || tall === LOW || !count) return over() <= 0 ? tall : 0;
-    }
-  };
-  // A large window has room for a second column before the plots become much lower.
-  if (fit(false) < (window.innerWidth >= 1400 ? 0.75 * TALL : LOW) && window.innerWidth >= 1100) fit(true);
-  return panel.clientWidth !== width;
 }
 
 // A chart of the panel. Dragging on it leads through time; a click leads there and enlarges it.
 function makePlot(parent, t, plot, seek, marks, enlarge) {
   const at = element("span", { className: "at" }), canvas = element("canvas");
   const name = element("div", { className: "name" }, plot.unit ? `${plot.title} [${plot.unit}]` : plot.title, at);
-  const keys = makeKeysOf(plot.keys, plot.lines);
+  const keys = plot.raster ? null : makeKeysOf(plot.keys, plot.lines);
+  if (plot.raster) canvas.style.height = `${ROW * plot.lines.length}px`;
   // x, y, z have room beside the title.
   if (keys && keys.textContent.length < 6) name.append(keys);
-  const pale = plot.pale ? makeKeysOf([["reference", UNNAMED]], []) : null;
-  if (pale) pale.classList.add("pale");
-  if (pale && !(keys && keys.parentNode)) name.append(pale);
-  const box = element("div", { className: "plot", title: "click to enlarge" }, name, ...[keys, pale].filter((each) => each && !each.parentNode), canvas);
+  const styles = [];
+  if (plot.pale) styles.push(["pale", "reference"]);
+  if (plot.dashed) styles.push(["dashed", "linear"]);
+  const more = styles.map(([style, text]) => {
+    const key = makeKeysOf([[text, UNNAMED]], []);
+    key.classList.add(style);
+    return key;
+  });
+  if (more.length === 1 && !(keys && keys.parentNode)) name.append(more[0]);
+  const box = element("div", { className: "plot", title: "click to enlarge" }, name, ...[keys, ...more].filter((each) => each && !each.parentNode), canvas);
   parent.append(box);
 
-  const chart = makeChart(canvas, t, () => plot.lines, marks);
+  const chart = (plot.raster ? makeRaster : makeChart)(canvas, t, () => plot.lines, marks);
   let down = 0;
   canvas.addEventListener("pointerdown", (event) => {
     canvas.setPointerCapture(event.pointerId);
@@ -150,11 +136,12 @@ function makePlot(parent, t, plot, seek, marks, enlarge) {
   // The line nearest to the pointer, by its name, and its value there.
   canvas.addEventListener("pointermove", (event) => {
     const { time, i, line } = chart.under(event);
-    at.textContent = `${line.label} ${figure(line.values[i], 3)}`.trim();
-    at.style.color = line.colour;
+    at.textContent = `${line.label} ${chart.reading(line, i, time)}`.trim();
+    at.style.color = line.colour === UNNAMED ? "var(--ink)" : line.colour;
+    chart.raise(line);
     if (event.buttons) seek(time);
   });
-  canvas.addEventListener("pointerleave", () => { at.textContent = ""; });
+  canvas.addEventListener("pointerleave", () => { at.textContent = ""; chart.raise(null); });
   box.addEventListener("click", (event) => { if (event.target !== canvas || Math.abs(event.clientX - down) < STILL) enlarge(plot); });
   return chart.show;
 }

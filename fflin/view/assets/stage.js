@@ -59,7 +59,7 @@ function makeStage(info) {
     stars.material.uniforms.turned.value = angle;
   };
   if (orbit) scene.add(below.dome);
-  if (space) scene.add(stars);
+  if (space) scene.add(stars, makeVeil());
   else viewer.scene_tree.find(["Floor"]).object.add(makeFloor(info));
 
   // What comes from Python is dressed on its way in.
@@ -68,6 +68,25 @@ function makeStage(info) {
   aim(new THREE.Vector3());
   viewer.animate();
   return { viewer, turn, camera: makeCamera(viewer, info, aim) };
+}
+
+// Looked at from above, the ground is the background of all: a veil dims it.
+const VEIL = 0.72; // its opacity where one looks straight down
+
+function makeVeil() {
+  const material = new THREE.ShaderMaterial({
+    transparent: true, depthWrite: false, uniforms: { opacity: { value: 0 } },
+    vertexShader: "void main() { gl_Position = vec4(position.xy, 1.0, 1.0); }", // behind all else
+    fragmentShader: "uniform float opacity; void main() { gl_FragColor = vec4(0.006, 0.010, 0.022, opacity); }",
+  });
+  const veil = new THREE.Mesh(new THREE.PlaneGeometry(2, 2), material), direction = new THREE.Vector3();
+  veil.frustumCulled = false;
+  veil.renderOrder = -5;
+  veil.onBeforeRender = (renderer, scene, camera) => {
+    const down = -camera.getWorldDirection(direction).y;
+    material.uniforms.opacity.value = VEIL * THREE.MathUtils.smoothstep(down, 0.6, 0.95);
+  };
+  return veil;
 }
 
 function makeFloor(info) {
