@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pinocchio as pin
 
+from fflin.base import html, svg
 from fflin.base.errors import FflinWarning, InputError, located
 from fflin.base.record import Design, record_of, write_record
 from fflin.base.rotation import rotation_matrices
@@ -188,8 +189,38 @@ class Trajectory(Design):
 
     def _report(self) -> str:
         """Return text about the trajectory: its largest residual, or why it is invalid."""
-        verdict = self._fault or f"residual {self.residual.max():.1e}"
-        return folded([repr(self), verdict, *self._note.splitlines()])
+        return folded([repr(self), self._verdict(), *self._note.splitlines()])
+
+    def _verdict(self) -> str:
+        return self._fault or f"residual {self.residual.max():.1e}"
+
+    def _html_parts(self) -> list[str]:
+        rows = svg.sampled(len(self.t))
+        robot, q = self.robot, self.q[rows]
+        apart = np.minimum(1.0, np.abs(q[:, 3:7] @ q[0, 3:7]))
+        charts = {
+            "attitude from the start": (
+                "deg",
+                {"base": 2.0 * np.degrees(np.arccos(apart))},
+            )
+        }
+        for title, prismatic in (("joints", False), ("prismatic joints", True)):
+            joints = [
+                x for x in robot.joints if x.prismatic == prismatic and not x.mode
+            ]
+            curves = {x.name: np.array([x.value(row) for row in q]) for x in joints}
+            charts[title] = ("m" if prismatic else "rad", curves)
+        pictures = [
+            svg.figure(title, svg.curves(self.t[rows], curves, unit))
+            for title, (unit, curves) in charts.items()
+            if curves
+        ]
+        notes = [html.paragraph(note) for note in self._note.splitlines()]
+        return [
+            html.verdict(self._verdict(), not self._fault),
+            *notes,
+            html.side_by_side(*pictures),
+        ]
 
     @cached_property
     def _aba(self) -> Aba:

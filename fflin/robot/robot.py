@@ -15,6 +15,7 @@ import pinocchio as pin
 from fflin.base.errors import InputError, require_known, unknown
 from fflin.base.validation import Array
 from fflin.robot import mass_properties
+from fflin.robot.card import robot_card
 from fflin.robot.equipment.appendages import Appendage
 from fflin.robot.equipment.assembly import equipped, stored_momentum, with_appendages
 from fflin.robot.fields import FIELDS, Range, checked_names, pulsed_thrusters
@@ -477,6 +478,9 @@ class Robot(Coordinates):
 
     def __repr__(self) -> str:
         return f"Robot('{self.name}', n={self.n}, mass={self.mass:.6g} kg)"
+
+    def _repr_html_(self) -> str:
+        return robot_card(self)
 
     def joint(self, name: str) -> Joint:
         """Return the independent joint with the given name.
