@@ -16,7 +16,7 @@ from fflin.robot.fields import limits_of
 from fflin.robot.inputs import Input
 from fflin.robot.joints import ROOT
 from fflin.robot.mass_properties import equivalent_box
-from fflin.robot.summary import joint_table
+from fflin.robot.summary import LIMIT_UNITS, joint_table
 
 if TYPE_CHECKING:
     from fflin.robot.robot import Robot
@@ -40,6 +40,7 @@ def robot_card(robot: Robot) -> str:
     return html.result_card(
         robot,
         html.side_by_side(thumbnail(robot), html.table(joint_table(robot), "ll")),
+        html.paragraph(LIMIT_UNITS if robot.joints else "", "note"),
         html.folded(f"inputs ({count})", table, html.paragraph(more)),
         html.folded("warnings", *map(html.paragraph, robot.notes)),
     )

@@ -22,6 +22,8 @@ from fflin.robot.joints import ROOT, Joint
 if TYPE_CHECKING:
     from fflin.robot.robot import Robot
 
+LIMIT_UNITS = "limits in rad, N m and rad/s, or in m, N and m/s for prismatic joints"
+
 _STATE = {
     "rpy": "[deg]",
     "position": "[m]",
@@ -63,7 +65,7 @@ def robot_info(robot: Robot, at_point: str = "") -> str:
     tree = joint_table(robot)
     limits = ""
     if any(cell != "." for row in tree[1:] for cell in row[3:]):
-        limits = "limits in rad, N m and rad/s, or in m, N and m/s for prismatic joints"
+        limits = LIMIT_UNITS
     frames = [
         frame.name for frame in robot.model.frames.tolist() if frame.parentJoint >= ROOT
     ]
