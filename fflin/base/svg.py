@@ -8,12 +8,12 @@ from __future__ import annotations
 import cmath
 import math
 from collections.abc import Mapping, Sequence
-from html import escape
 from typing import NamedTuple
 
 import numpy as np
 
 from fflin.base.figures import COLORS
+from fflin.base.html import escape
 from fflin.base.names import runs
 from fflin.base.tables import rounding
 from fflin.base.validation import Array, Indices, Values

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from html import escape
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
 
 from fflin.base import html, svg
+from fflin.base.html import escape
 from fflin.base.validation import Array
 from fflin.robot.fields import limits_of
 from fflin.robot.inputs import Input

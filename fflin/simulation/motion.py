@@ -6,7 +6,6 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -241,6 +240,8 @@ class Motion(StatesAndInputs, Design):
 
     def _page(self) -> str:
         """Return the page of the motion in HTML, or an empty text if its robot is not known."""
+        from tempfile import TemporaryDirectory
+
         from fflin import visualize
 
         if self._robot is None:
