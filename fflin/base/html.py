@@ -14,11 +14,11 @@ from pathlib import Path
 
 _LIGHT = (
     "{--ink:#1b1f24;--soft:#5c6670;--line:#d3d9df;--back:#ffffff;--cell:#f1f4f6;"
-    "--good:#1a7f37;--bad:#b42318;--first:#0072b2;--second:#d55e00;--body:#c9d6e2}"
+    "--good:#1a7f37;--bad:#b42318;--first:#0072b2;--second:#d55e00;--body:#c9d6e2;--bright:1}"
 )
 _DARK = (
     "{--ink:#e4e8ec;--soft:#9aa5b0;--line:#3b434c;--back:#1a1e23;--cell:#262c33;"
-    "--good:#4cc36d;--bad:#ff7b72;--first:#56b4e9;--second:#f08c4a;--body:#3d4d5c}"
+    "--good:#4cc36d;--bad:#ff7b72;--first:#56b4e9;--second:#f08c4a;--body:#3d4d5c;--bright:1.5}"
 )
 
 

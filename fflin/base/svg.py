@@ -235,8 +235,9 @@ def curves(t: Array, values: Mapping[str, Array], unit: str) -> str:
         y = height * (high - value[rows]) / (high - low)
         points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x, y, strict=True))
         parts.append(
-            f'<polyline class="curve" stroke="{_ink(color)}" points="{points}">'
-            f"<title>{escape(name)}</title></polyline>"
+            f'<g><polyline class="curve" stroke="{_ink(color)}" points="{points}"/>'
+            f'<polyline class="near" points="{points}"/>'  # easier to point at
+            f"<title>{escape(name)}</title></g>"
         )
     for value_at, y_at in ((high, 8.0), (low, height)):
         parts.append(
