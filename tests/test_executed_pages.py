@@ -1,5 +1,6 @@
 """Every build of the site has what the executed pages wrote, whether it runs them or not."""
 
+import re
 import sys
 from pathlib import Path
 
@@ -30,10 +31,11 @@ kernelspec:
 # Title
 
 ```{{code-cell}}
-import os, pages
+import os
+from fflin.view.html_page import HtmlPage
 with open("{name}", "w") as file:
-    file.write(str(os.getpid()))
-pages.embed("{name}")
+    file.write(f'<p>"{{os.getpid()}}" & more</p>')
+HtmlPage("{name}")
 ```
 """
 
@@ -51,6 +53,7 @@ def written(site):
     shown = "".join(
         path.read_text() for path in [site / "plain.html", *site.glob("inner/*.html")]
     )
+    assert "srcdoc" not in shown
     assert all(
         f'src="{address}"' in shown or f'src="../{address}"' in shown
         for address in result
@@ -67,6 +70,7 @@ def test_a_second_build_is_as_whole_as_the_first(tmp_path):
     (source / "inner/page.md").write_text(PAGE.format(name="a.html"))
     build(source, one)
     first = written(one)
+    assert all(re.fullmatch(r'<p>"\d+" & more</p>', text) for text in first.values())
     assert {*first} == {"pages/plain/a.html", "pages/inner/page/a.html"}
     build(source, two)
     assert written(two) == first  # neither page is run again

@@ -1,34 +1,49 @@
-"""Executed pages: every build contains the files that a run of a page wrote.
+"""Executed pages: pictures, warnings, and the HTML pages that cells show.
 
-Sphinx runs a page only if its source changed since the last build. The files of the run are kept
-in `docs/_build/executed`, beside the page's doctree, and every build copies them into its site.
+Sphinx runs a page only if its source changed since the last build. A cell that shows an HTML page
+of fflin contains this page in its output. In the site, each such HTML page is a file of its own,
+which the browser loads when the reader scrolls to it.
 """
 
 from __future__ import annotations
 
 import os
-import shutil
+import re
+from html import unescape
 from pathlib import Path
 from typing import Any
 
+from docutils import nodes
 from sphinx.application import Sphinx
 from sphinx.environment import BuildEnvironment
 
+# A frame that contains its page; see `fflin.base.html.frame`.
+_FRAME = re.compile(
+    r'<iframe class="fflin-page" title="([^"]*)"[^>]*? height="(\d+)"'
+    r'[^>]*? srcdoc="([^"]*)"></iframe>'
+)
 
-def kept(app: Sphinx) -> Path:
-    """Return the folder of the files that pages wrote, with one folder for each page."""
-    return Path(app.doctreedir) / "executed" / "pages"
+# Warnings appear as on the command line, without the place in a notebook that nobody sees.
+_STARTUP = """\
+import warnings
+
+warnings.showwarning = lambda message, category, *_: print(f"{category.__name__}: {message}")
+"""
 
 
 def keep_pictures(app: Sphinx) -> None:
-    """Keep the figures of the pages there too."""
-    folder = str(kept(app).parent)
+    """Keep the figures of the pages beside their doctrees."""
+    folder = str(Path(app.doctreedir) / "executed")
     app.env.mystnb_config = app.env.mystnb_config.copy(output_folder=folder)
 
 
-def forget(app: Sphinx, env: BuildEnvironment, page: str) -> None:
-    """Remove the files of a page before it is run again, or when it is removed."""
-    shutil.rmtree(kept(app) / page, ignore_errors=True)
+def prepare_kernels(app: Sphinx) -> None:
+    """Write the code that each kernel runs first."""
+    folder = Path(app.doctreedir) / "ipython"
+    startup = folder / "profile_default" / "startup"
+    startup.mkdir(parents=True, exist_ok=True)
+    (startup / "warnings.py").write_text(_STARTUP, "utf-8")
+    os.environ["IPYTHONDIR"] = str(folder)
 
 
 def spread(app: Sphinx, env: BuildEnvironment, pages: list[str]) -> None:
@@ -43,17 +58,42 @@ def spread(app: Sphinx, env: BuildEnvironment, pages: list[str]) -> None:
     pages += [] if run else others
 
 
-def announce(app: Sphinx, page: str, source: list[str]) -> None:
-    """Pass the name of the page to the kernel that runs it."""
-    os.environ["FFLIN_DOCS_PAGE"] = page
+def move_frames(app: Sphinx, doctree: nodes.document, page: str) -> None:
+    """Write the HTML pages in the outputs of a page to files, and show these files."""
+    if app.builder.format != "html":
+        return
+    folder = Path(app.outdir) / "pages" / page
+    for old in folder.glob("*.html"):
+        old.unlink()
+    up = "../" * page.count("/")
+
+    def moved(frame: re.Match[str]) -> str:
+        title, height, content = map(unescape, frame.groups())
+        name = re.sub(r"\W+", "_", title.removesuffix(".html"))
+        while (folder / f"{name}.html").exists():
+            name += "_"
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / f"{name}.html").write_text(content, "utf-8")
+        address = f"{up}pages/{page}/{name}.html"
+        return (
+            f'<iframe class="fflin-page" src="{address}" height="{height}" loading="lazy" '
+            f'title="{name}"></iframe>'
+            f'<p class="fflin-page-link"><a href="{address}">{name}.html by itself</a></p>'
+        )
+
+    for output in doctree.findall(nodes.raw):
+        text = output.astext()
+        if "srcdoc=" in text:
+            output.children = [nodes.Text(_FRAME.sub(moved, text))]
+            output.rawsource = ""
 
 
-def deliver(app: Sphinx, error: Exception | None) -> None:
-    """Copy the files of all pages into the site."""
+def remove_strays(app: Sphinx, error: Exception | None) -> None:
+    """Remove the files of pages that no longer exist."""
     folder = Path(app.outdir) / "pages"
-    shutil.rmtree(folder, ignore_errors=True)
-    if error is None and kept(app).exists():
-        shutil.copytree(kept(app), folder)
+    for file in folder.rglob("*.html"):
+        if file.parent.relative_to(folder).as_posix() not in app.env.all_docs:
+            file.unlink()
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
@@ -62,16 +102,12 @@ def setup(app: Sphinx) -> dict[str, Any]:
     app.parallel = max(app.parallel, os.cpu_count() or 1)
     # Files that Sphinx keeps for its next build are not part of the site.
     app.doctreedir = app.srcdir / "_build"
-    here = str(Path(__file__).parent)
-    # The kernels find the module `pages`, use one thread each, and print nothing about themselves.
-    path = filter(None, (here, os.environ.get("PYTHONPATH")))
-    os.environ["PYTHONPATH"] = os.pathsep.join(path)
+    # The kernels use one thread each, and print nothing about themselves.
     os.environ.setdefault("PYDEVD_DISABLE_FILE_VALIDATION", "1")
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    os.environ["FFLIN_DOCS_KEPT"] = str(kept(app))
+    app.connect("builder-inited", prepare_kernels)
     app.connect("builder-inited", keep_pictures, priority=900)  # after myst_nb has chosen
-    app.connect("env-purge-doc", forget)
     app.connect("env-before-read-docs", spread)
-    app.connect("source-read", announce)
-    app.connect("build-finished", deliver)
+    app.connect("doctree-resolved", move_frames)
+    app.connect("build-finished", remove_strays)
     return {"version": "1", "parallel_read_safe": True, "parallel_write_safe": True}

@@ -11,7 +11,6 @@ from sphinx.application import Sphinx
 
 _CELL = re.compile(r"^```\{code-cell\}\n(?::[^\n]*\n)*\n?(.*?)^```\n", re.DOTALL | re.MULTILINE)
 _LINK = re.compile(r"\[([^\]]+)\]\((?!http)[^)]+\)")
-_PAGE = re.compile(r'pages\.embed\((".*?")\)')
 
 
 def notebook(text: str) -> dict[str, Any]:
@@ -23,12 +22,8 @@ def notebook(text: str) -> dict[str, Any]:
         if not k % 2:
             source = re.sub(r"<!-- index: .*? -->\n", "", _LINK.sub(r"\1", part), flags=re.DOTALL)
             extra: dict[str, Any] = {"cell_type": "markdown"}
-        elif part == "import pages\n":
-            continue
         else:
-            source = _PAGE.sub(r'IFrame(\1, "100%", 480)', part)
-            if source != part:
-                source = f"from IPython.display import IFrame\n\n{source}"
+            source = part
             extra = {"cell_type": "code", "execution_count": None, "outputs": []}
         if source.strip():
             name = f"cell-{len(cells)}"

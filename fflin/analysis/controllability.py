@@ -35,7 +35,7 @@ _LOOPS = (
 _RANK = 1e-7
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class Controllability(ranks.RankAnalysis):
     """Controllability of a linear model; ``print`` shows a summary.
 
@@ -96,7 +96,7 @@ class Controllability(ranks.RankAnalysis):
     stabilizable: bool | None
     reach: dict[str, int]
 
-    def __str__(self) -> str:
+    def _lines(self) -> list[str]:
         lines = list[str]()
         if self.uncontrollable:
             lines.append(f"controllable: {', '.join(self.controllable)}")
@@ -108,7 +108,7 @@ class Controllability(ranks.RankAnalysis):
         conserved = self.uncontrollable[: len(self.basis) - self.bound]
         limit = f"no input can change {listed(mechanics.grouped(conserved))}"
         decays = ranks.verdict(self.stabilizable, "stabilizable")
-        return self._summary("controllable", limit, decays, lines)
+        return [self._head("controllable", limit, decays), *lines]
 
 
 def controllability(lin: LinearModel | LinearTrajectory) -> Controllability:

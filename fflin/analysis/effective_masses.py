@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fflin.analysis.mechanics import floating_inertia
+from fflin.base import html
 from fflin.base.errors import InputError
 from fflin.base.tables import counted, folded, grid
 from fflin.base.validation import Array, FrozenArrays, instance
@@ -21,8 +22,8 @@ _EQUAL = 1e-9
 _ROUNDING = 1e-14
 
 
-@dataclass(frozen=True, eq=False)
-class EffectiveMasses(FrozenArrays):
+@dataclass(frozen=True, eq=False, repr=False)
+class EffectiveMasses(html.Reported, FrozenArrays):
     """Effective masses of the vibration modes with the base clamped; ``print`` shows a table.
 
     All quantities refer to the origin of the base frame and are expressed in its axes. Entries for

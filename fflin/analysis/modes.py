@@ -11,6 +11,7 @@ import pinocchio as pin
 from fflin.analysis.mechanics import checked
 from fflin.analysis.ranks import EPS
 from fflin.analysis.reduction import ReducedModel
+from fflin.base import html, svg
 from fflin.base.errors import InputError
 from fflin.base.rotation import skew
 from fflin.base.tables import counted, folded, grid, width
@@ -32,7 +33,7 @@ _NO_STIFFNESS = 1e-13
 _ROUNDING = 1e-13
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Mode(FrozenArrays):
     r"""Natural mode: a conjugate pair of poles, or a real pole.
 
@@ -90,6 +91,10 @@ class Mode(FrozenArrays):
     energy: Mapping[str, float]
     strain: Mapping[str, float] = field(default_factory=dict)
 
+    def __repr__(self) -> str:
+        unstable = ", unstable" if self.unstable else ""
+        return f"Mode(pole={self.pole:.5g}, nx={len(self.shape)}{unstable})"
+
     @property
     def oscillates(self) -> bool:
         """Whether the mode is a conjugate pair of poles."""
@@ -115,8 +120,8 @@ class Mode(FrozenArrays):
         return 1.0 / abs(self.pole.real)
 
 
-@dataclass(frozen=True, eq=False)
-class Modes:
+@dataclass(frozen=True, eq=False, repr=False)
+class Modes(html.Reported):
     """Natural modes of a linear model; ``print`` shows a table.
 
     Attributes
@@ -208,6 +213,33 @@ class Modes:
 
     def __str__(self) -> str:
         """Show the number of rigid-body modes, and a table of the other modes."""
+        parts = [folded([line]) for line in self._lines()]
+        rows = self._rows()
+        left = max(map(len, grid(rows, "rrrll").splitlines())) - len(rows[0][-1])
+        for row, mode in zip(rows[1:], self.modes, strict=True):
+            row[-1] = _percents(mode.energy, width() - left)
+        if self.modes:
+            parts.append(grid(rows, "rrrll"))
+        for title, table, align in self._of_appendages():
+            parts.append(f"{textwrap.fill(title, width())}\n{grid(table, align)}")
+        return "\n\n".join(parts)
+
+    def _html_parts(self) -> list[str]:
+        head, *notes = self._lines()
+        parts = [html.verdict(head, False if self.unstable else None)]
+        parts += [html.paragraph(note, "note") for note in notes]
+        rows = self._rows()
+        for row, mode in zip(rows[1:], self.modes, strict=True):
+            row[-1] = _percents(mode.energy, 80)
+        if self.modes:
+            poles = svg.figure("poles", svg.pole_map(self.poles))
+            parts.append(html.side_by_side(html.table(rows, "rrrll"), poles))
+        for title, table, align in self._of_appendages():
+            parts.append(html.folded(title, html.table(table, align)))
+        return parts
+
+    def _lines(self) -> list[str]:
+        """Return the first lines of the report: the numbers of modes, and notes."""
         vibrations = len(self.vibrations)
         others = len(self.modes) - len(self.vibrations)
         head = (
@@ -224,7 +256,10 @@ class Modes:
             poles = ", ".join(f"{mode.pole:.5g}" for mode in self.unstable)
             lines.append(f"unstable poles (positive real part): {poles}")
         lines += [f"note: {note}" for note in self.notes]
-        parts = [folded([line]) for line in lines]
+        return lines
+
+    def _rows(self) -> list[list[str]]:
+        """Return the table of modes; its last column is empty."""
         rows = [["rad/s", "damping", "decay [s]", "", "kinetic energy"]]
         for mode in self.modes:
             frequency = damping = "."
@@ -234,19 +269,14 @@ class Modes:
             decay = f"{mode.time_constant:.4g}" if mode.pole.real else "."
             growth = "unstable" if mode.unstable else ""
             rows.append([frequency, damping, decay, growth, ""])
-        left = max(map(len, grid(rows, "rrrll").splitlines())) - len(rows[0][-1])
-        for row, mode in zip(rows[1:], self.modes, strict=True):
-            row[-1] = _percents(mode.energy, width() - left)
-        if self.modes:
-            parts.append(grid(rows, "rrrll"))
-        return "\n\n".join((*parts, *self._of_appendages()))
+        return rows
 
-    def _of_appendages(self) -> list[str]:
-        """Return two tables for a robot with flexible appendages or slosh, or an empty list.
+    def _of_appendages(self) -> list[tuple[str, list[list[str]], str]]:
+        """Return (title, rows, alignment) of two tables about flexible appendages and slosh.
 
-        The first table lists two frequencies of each mode: the frequency if the link that carries
-        the appendage is free, and the frequency if this link is clamped. The second table contains
-        the effective masses.
+        For a robot without them, the list is empty. The first table lists two frequencies of each
+        mode: the frequency if the link that carries the appendage is free, and the frequency if
+        this link is clamped. The second table contains the effective masses.
         """
         robot = self.lin._robot
         if robot is None or not robot.modes:
@@ -279,11 +309,10 @@ class Modes:
             "effective masses and moments of inertia about the frame of the appendage, in % of "
             "the inertia of the body that carries it, or of the inertia in its file"
         )
-        return [
-            "modes of the appendages, with the link that carries them free and "
-            f"clamped\n{grid(rows, 'rrll')}",
-            f"{textwrap.fill(title, width())}\n{grid(of_masses, 'lrrrrrrr')}",
-        ]
+        of_modes = (
+            "modes of the appendages, with the link that carries them free and clamped"
+        )
+        return [(of_modes, rows, "rrll"), (title, of_masses, "lrrrrrrr")]
 
 
 def modes(lin: LinearModel) -> Modes:

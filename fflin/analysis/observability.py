@@ -24,7 +24,7 @@ from fflin.linear.linear_trajectory import LinearTrajectory
 from fflin.linear.model import LinearModel
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class Observability(RankAnalysis):
     """Observability of a linear model; ``print`` shows a summary.
 
@@ -69,7 +69,7 @@ class Observability(RankAnalysis):
     unobservable: tuple[str, ...]
     detectable: bool | None
 
-    def __str__(self) -> str:
+    def _lines(self) -> list[str]:
         lines = list[str]()
         if self.unobservable:
             lines.append(f"unobservable: {', '.join(self.unobservable)}")
@@ -77,9 +77,8 @@ class Observability(RankAnalysis):
             : (len(self.basis) - self.bound) // 3
         ]
         limit = f"no output depends on the {listed(parts)} of the base"
-        return self._summary(
-            "observable", limit, verdict(self.detectable, "detectable"), lines
-        )
+        decays = verdict(self.detectable, "detectable")
+        return [self._head("observable", limit, decays), *lines]
 
 
 def observability(lin: LinearModel | LinearTrajectory) -> Observability:
@@ -287,7 +286,7 @@ def lasting_motions(lin: LinearModel, analysis: Observability) -> tuple[str, ...
     )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Gramians(FrozenArrays):
     """Controllability and observability Gramians of a linear model.
 
@@ -312,6 +311,9 @@ class Gramians(FrozenArrays):
     controllability: Array
     observability: Array
     duration: float
+
+    def __repr__(self) -> str:
+        return f"Gramians(nx={len(self.controllability)}, duration={self.duration:g} s)"
 
 
 def gramians(lin: LinearModel, duration: float | None = None) -> Gramians:

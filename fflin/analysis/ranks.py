@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fflin.base import html
 from fflin.base.tables import folded
 from fflin.base.validation import Array, FrozenArrays, Indices, Values
 
@@ -117,8 +118,8 @@ class FixedPoles(NamedTuple):
     settling: Margin = Margin()  # certainty that the slowest pole decays
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class RankAnalysis(FrozenArrays):
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class RankAnalysis(html.Reported, FrozenArrays):
     """Common fields of `Controllability` and `Observability`, described in their docstrings."""
 
     dimension: int
@@ -132,8 +133,27 @@ class RankAnalysis(FrozenArrays):
     notes: tuple[str, ...]
     robot: str
 
-    def _summary(self, what: str, limit: str, decays: str, lines: list[str]) -> str:
-        """Return the report: the dimension, then `lines`, then the notes.
+    def __str__(self) -> str:
+        return folded([*self._lines(), *self._noted()])
+
+    def _html_parts(self) -> list[str]:
+        head, *lines = self._lines()
+        is_good = None
+        if self.dimension == len(self.basis):
+            is_good = True
+        parts = [html.verdict(head, is_good)]
+        parts += [html.paragraph(line) for line in lines]
+        return parts + [html.paragraph(note, "note") for note in self._noted()]
+
+    def _noted(self) -> list[str]:
+        return [f"note: {note}" for note in self.notes]
+
+    def _lines(self) -> list[str]:
+        """Return the lines of the report before the notes."""
+        raise NotImplementedError
+
+    def _head(self, what: str, limit: str, decays: str) -> str:
+        """Return the first line of the report, which contains the dimension.
 
         `limit` is the reason why `bound` is less than the number of states.
         """
@@ -156,8 +176,7 @@ class RankAnalysis(FrozenArrays):
             head = (
                 f"{self.robot}: {self.dimension} of {nx} states are {what} by {frozen}"
             )
-        notes = (f"note: {note}" for note in self.notes)
-        return folded([f"{head}; {decays}", *lines, *notes])
+        return f"{head}; {decays}"
 
 
 def verdict(decided: bool | None, adjective: str) -> str:

@@ -116,12 +116,14 @@ def drawing(
     if target is not None:
         check_ending(target, FORMATS)
     require_matplotlib()
-    import matplotlib.figure
+    import matplotlib
+
+    from fflin.base.shown_figure import ShownFigure
 
     style = matplotlib.rc_params_from_file(_STYLE, use_default_template=False)
     with matplotlib.rc_context(style):
         if axes is None:
-            figure = matplotlib.figure.Figure((width, height), layout="constrained")
+            figure: Figure = ShownFigure((width, height), layout="constrained")
         else:
             figure = _in_place_of(axes)
         yield figure

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import shutil
 import sys
@@ -58,23 +57,12 @@ def cut(rows: Sequence[Sequence[str]], rest: str = "see -o") -> list[Sequence[st
     return [*rows[: 1 + MOST_ROWS], last]
 
 
-def dim(text: str) -> str:
-    """Return dimmed text if the output is a terminal with colours."""
-    if (
-        _on_terminal()
-        and "NO_COLOR" not in os.environ
-        and os.environ.get("TERM") != "dumb"
-    ):
-        return f"\x1b[2m{text}\x1b[0m"
-    return text
-
-
 def _on_terminal() -> bool:
     return sys.stdout is not None and sys.stdout.isatty()
 
 
 def grid(rows: Sequence[Sequence[str]], align: str = "l") -> str:
-    """Return rows of cells as text with aligned columns; a cell "." is dimmed.
+    """Return rows of cells as text with aligned columns.
 
     The letters of `align`, "l" or "r", align the first columns left or right. All further columns
     are aligned right.
@@ -88,9 +76,6 @@ def grid(rows: Sequence[Sequence[str]], align: str = "l") -> str:
             padded = cell.ljust(size) if side == "l" else cell.rjust(size)
             cells.append(padded)
         cells[-1] = cells[-1].rstrip()
-        for column, cell in enumerate(cells):
-            if cell.strip() == ".":
-                cells[column] = dim(cell)
         lines.append(_GAP.join(cells).rstrip())
     return "\n".join(lines)
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
 
+from fflin.base import html
 from fflin.base.errors import InputError
 
 if TYPE_CHECKING:
@@ -339,6 +340,15 @@ class Result(FrozenArrays):
 
     def _report(self) -> str:
         return repr(self)
+
+    def _repr_html_(self) -> str:
+        warning = "" if self.verified else html.paragraph(NOT_VERIFIED, "bad")
+        return html.result_card(self, warning, *self._html_parts())
+
+    def _html_parts(self) -> Sequence[str]:
+        """Return the parts of the card in HTML."""
+        report = self._report().removeprefix(repr(self)).lstrip("\n")
+        return (html.preformatted(report),)
 
 
 # Parts of the title of a result, as {attribute: function that formats its value}. Attributes that a

@@ -29,7 +29,7 @@ from fflin.base.validation import (
 )
 from fflin.base.writing import as_path, write_atomically
 from fflin.batch.files import read_rows, write_rows
-from fflin.campaign.report import campaign_report
+from fflin.campaign.report import campaign_card, campaign_report
 from fflin.campaign.runs import KINDS, MODES, WHEEL_SPEEDS, kind_named
 from fflin.campaign.spreads import SEED
 from fflin.linear.files import labels, write_table
@@ -224,6 +224,9 @@ class Campaign(FrozenArrays):
 
     def __str__(self) -> str:
         return campaign_report(self)
+
+    def _repr_html_(self) -> str:
+        return campaign_card(self)
 
     @property
     def stopped(self) -> Mask:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
+from fflin.base import html
 from fflin.base.tables import folded, grid
 from fflin.campaign.runs import KINDS, MODES, WHEEL_SPEEDS
 from fflin.simulation.run import STOPS
@@ -18,8 +19,32 @@ _SHARES = (0.5, 0.95, 0.99)
 
 def campaign_report(campaign: Campaign) -> str:
     """Return the report with success rates of goals, error quantiles and rank correlations."""
+    lines = [*_outcomes(campaign), _title(campaign), *campaign.notes]
+    table = grid(_quantiles(campaign), "ll")
+    return "\n".join([folded(lines), "", table, "", folded(_correlations(campaign))])
+
+
+def campaign_card(campaign: Campaign) -> str:
+    """Return the report as a card for notebooks."""
+    return html.result_card(
+        campaign,
+        *map(html.paragraph, _outcomes(campaign)),
+        html.paragraph(_title(campaign), "note"),
+        *(html.paragraph(note, "note") for note in campaign.notes),
+        html.table(_quantiles(campaign), "ll"),
+        html.folded("rank correlations", *map(html.paragraph, _correlations(campaign))),
+    )
+
+
+def _outcomes(campaign: Campaign) -> list[str]:
+    """Return one line for each goal, and a line on completed and stopped runs."""
+    goals = [goal_met(campaign, goal) for goal in campaign.goals]
+    return [*goals, ended_of(campaign)]
+
+
+def _title(campaign: Campaign) -> str:
+    """Return one line with the robot, the number of runs and their duration."""
     count = len(campaign)
-    quantile = campaign.quantile
     title = f"{campaign.robot}: {count:,} runs"
     if count < campaign.asked:
         title += f" of {campaign.asked:,} requested"
@@ -27,6 +52,12 @@ def campaign_report(campaign: Campaign) -> str:
     title += f", seed {campaign.seed}"
     if campaign.engine == "compiled":
         title += ", compiled"
+    return title
+
+
+def _quantiles(campaign: Campaign) -> list[list[str]]:
+    """Return the table of the quantiles of all errors."""
+    quantile = campaign.quantile
     rows = [["error", "unit", "median", "95 %", "99 %", "worst 95 %", "settle 95 %"]]
     for name, unit in _errors(campaign).items():
         figures = [quantile(name, p).value for p in _SHARES]
@@ -35,20 +66,21 @@ def campaign_report(campaign: Campaign) -> str:
         if name in KINDS:
             when = _when(quantile(f"settle {name}", 0.95).value, " s")
         rows.append([name, unit, *(f"{x:.3g}" for x in figures), when])
+    return rows
+
+
+def _correlations(campaign: Campaign) -> list[str]:
+    """Return lines with the significant rank correlations."""
     causes: dict[str, list[str]] = {}
     for name, influence in influences(campaign).items():
         first = ", ".join(
             f"{key}\u00a0{value:+.2f}" for key, value in list(influence.items())[:4]
         )
         causes.setdefault(first or "none significant", []).append(name)
-    correlations = [
+    return [
         f"rank correlations with {', '.join(names)}: {first}"
         for first, names in causes.items()
     ]
-    goals = [goal_met(campaign, goal) for goal in campaign.goals]
-    ended = ended_of(campaign)
-    head = folded([*goals, ended, title, *campaign.notes])
-    return "\n".join([head, "", grid(rows, "ll"), "", folded(correlations)])
 
 
 def _errors(campaign: Campaign) -> dict[str, str]:

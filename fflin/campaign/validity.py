@@ -8,6 +8,7 @@ from functools import partial
 
 import numpy as np
 
+from fflin.base import html
 from fflin.base.errors import InputError
 from fflin.base.intervals import until_failure
 from fflin.base.tables import folded
@@ -38,8 +39,8 @@ _ROUNDING = 1e-7  # smaller prediction errors are integration errors
 _FARTHEST = 1e6
 
 
-@dataclass(frozen=True, eq=False)
-class Validity(FrozenArrays):
+@dataclass(frozen=True, eq=False, repr=False)
+class Validity(html.Reported, FrozenArrays):
     """Range of validity of a linear model and its closed loop; ``print`` shows a summary.
 
     The closed loop is simulated from initial displacements of several levels. The level of a

@@ -19,6 +19,7 @@ import fflin
 from fflin.base import __version__
 from fflin.base.errors import FflinError, FflinWarning, FileError
 from fflin.base.tables import first_paragraph, headed
+from fflin.base.terminal import color_report
 from fflin.base.writing import (
     check_ending,
     check_output_path,
@@ -202,7 +203,7 @@ def finish(report: Report, arguments: argparse.Namespace) -> int:
                 if path.suffix in _PAGES:
                     line += f": {path.stat().st_size / 1e6:.2f} MB"
                 lines.append(line)
-            print("\n".join(lines))
+            print(color_report("\n".join(lines)))
     if report.interrupted:
         raise KeyboardInterrupt("; ".join(messages))
     return report.code

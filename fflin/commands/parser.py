@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, NoReturn, TypeAlias
 
 from fflin.base.errors import FflinWarning, one_line
+from fflin.base.terminal import color_message
 from fflin.base.writing import RECORDS
 from fflin.commands import BAD_INPUT, NO_ORBIT
 from fflin.commands.options import ABOUT, COMMON, DESCRIPTIONS, OPTIONS, OUTPUT
@@ -409,7 +410,7 @@ def add_command(
 def print_error(line: str) -> None:
     """Write a line to stderr. If stderr is closed, only the exit code reports the error."""
     try:
-        print(one_line(line), file=sys.stderr, flush=True)
+        print(color_message(one_line(line)), file=sys.stderr, flush=True)
     except OSError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())
 

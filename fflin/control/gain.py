@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 import numpy as np
 
 from fflin.analysis.ranks import DECAY
+from fflin.base import html, svg
 from fflin.base.errors import InputError, listed, require_known
 from fflin.base.names import group_of, input_keys, with_units
 from fflin.base.record import Design
@@ -23,7 +24,7 @@ from fflin.dynamics.coordinates import frame_of
 from fflin.dynamics.state import StateMap, selection
 from fflin.linear.fit import require_same
 from fflin.linear.holding import wheel_notes
-from fflin.linear.model import ControlSystem, LinearModel, state_space
+from fflin.linear.model import ControlSystem, LinearModel, gain_map, state_space
 from fflin.robot.rotors import SPINNING
 
 if TYPE_CHECKING:
@@ -147,12 +148,62 @@ class Gain(ModelDesign):
     def _report(self) -> str:
         """Return the report with the gain, poles, residual, margins, weights and warnings."""
         nu, nx = self.K.shape
-        time = f"sampled at {self.dt:g} s" if self.dt else "continuous"
-        head = f"{self.robot}: u = u0 - K (x - x0), {nx} states, {nu} inputs"
         if self.K.size <= _LARGE:
             shown = f"\n\n{matrix(self.K, self.input_names, self.state_names)}"
         else:
             shown = " is too large to show; save() (-o FILE) writes every entry"
+        title = folded(
+            [
+                summary_of_poles(self),
+                self._head(),
+                f"x: {with_units(self.state_names, self.state_units)}",
+                f"u: {with_units(self.input_names, self.input_units)}",
+            ]
+        )
+        notes = [folded([f"{label}: {text}"]) for label, text in self._notes().items()]
+        return "\n\n".join(
+            (
+                title,
+                f"K ({nu} x {nx}){shown}",
+                table_of_poles(self, "A - B K"),
+                folded([self._figures()]),
+                *notes,
+            )
+        )
+
+    def _html_parts(self) -> list[str]:
+        warnings = "; ".join(cautions(self))
+        notes = {k: x for k, x in self._notes().items() if k != "warning"}
+        lines = [html.paragraph(f"{k}: {x}", "note") for k, x in notes.items()]
+        K = gain_map(self.K, self)
+        return [
+            html.verdict(summary_of_poles(self), self.margin > 0.0),
+            html.paragraph(f"warning: {warnings}", "bad") if warnings else "",
+            html.paragraph(self._head()),
+            html.paragraph(self._figures()),
+            html.side_by_side(poles_figure(self, "A - B K"), K),
+            folded_poles(self, "A - B K"),
+            *lines,
+        ]
+
+    def _head(self) -> str:
+        """Return one line with the control law, its size, its frame and its sampling time."""
+        nu, nx = self.K.shape
+        time = f"sampled at {self.dt:g} s" if self.dt else "continuous"
+        head = f"{self.robot}: u = u0 - K (x - x0), {nx} states, {nu} inputs"
+        return f"{head}, frame {self.frame}, {time}"
+
+    def _figures(self) -> str:
+        """Return one line with the Riccati residual and the margins."""
+        margins = self.margins
+        return (
+            f"Riccati residual {self.residual:.1e} ({self.method}); margins for simultaneous "
+            f"changes of all inputs: gain {margins.gain[0]:.3g} to {margins.gain[1]:.3g}, phase "
+            f"{margins.phase:.3g} deg (disk margin {margins.disk:.3g})"
+        )
+
+    def _notes(self) -> dict[str, str]:
+        """Return the last lines of the report as {label: text}."""
         left = [
             name
             for name in self.state_names
@@ -161,36 +212,13 @@ class Gain(ModelDesign):
         not_regulated = ""
         if left:
             not_regulated = f"{listed(left)} ({_why_not_regulated(left)})"
-        more = {
+        notes = {
             "not regulated": not_regulated,
             "held at the operating point": "; ".join(self._held()),
             "weights": self.weights,
             "warning": "; ".join(cautions(self)),
         }
-        margins = self.margins
-        figures = (
-            f"Riccati residual {self.residual:.1e} ({self.method}); margins for simultaneous "
-            f"changes of all inputs: gain {margins.gain[0]:.3g} to {margins.gain[1]:.3g}, phase "
-            f"{margins.phase:.3g} deg (disk margin {margins.disk:.3g})"
-        )
-        title = folded(
-            [
-                summary_of_poles(self),
-                f"{head}, frame {self.frame}, {time}",
-                f"x: {with_units(self.state_names, self.state_units)}",
-                f"u: {with_units(self.input_names, self.input_units)}",
-            ]
-        )
-        notes = [folded([f"{label}: {text}"]) for label, text in more.items() if text]
-        return "\n\n".join(
-            (
-                title,
-                f"K ({nu} x {nx}){shown}",
-                table_of_poles(self, "A - B K"),
-                folded([figures]),
-                *notes,
-            )
-        )
+        return {label: text for label, text in notes.items() if text}
 
     def _held(self) -> list[str]:
         """Return the inputs at the operating point, and the momentum that wheels gain there."""
@@ -441,6 +469,24 @@ def table_of_poles(design: HasPoles, matrix: str) -> str:
     """
     if not len(design.poles):
         return f"{matrix} has no poles"
+    return f"poles of {matrix}, slowest first\n\n{grid(cut(_pole_rows(design)), 'l')}"
+
+
+def folded_poles(design: HasPoles, matrix: str) -> str:
+    """Return the table of the poles of a matrix in HTML, which the reader can open."""
+    if not len(design.poles):
+        return ""
+    rows = cut(_pole_rows(design), "see poles")
+    return html.folded(f"poles of {matrix}, slowest first", html.table(rows, "l"))
+
+
+def poles_figure(design: HasPoles, matrix: str) -> str:
+    """Return a map of the poles of a matrix in HTML."""
+    return svg.figure(f"poles of {matrix}", svg.pole_map(design.poles, design.dt))
+
+
+def _pole_rows(design: HasPoles) -> list[list[str]]:
+    """Return a table of the poles, slowest first."""
     poles = design.poles[design.poles.imag >= 0.0]
     rates = rates_of(poles, design.dt)
     pole_title = "pole" if design.dt else "pole [1/s]"
@@ -455,7 +501,7 @@ def table_of_poles(design: HasPoles, matrix: str) -> str:
     table = [heads, *([*row, f"{count}"] for row, count in rows.items())]
     if max(rows.values()) == 1:
         table = [row[:-1] for row in table]
-    return f"poles of {matrix}, slowest first\n\n{grid(cut(table), 'l')}"
+    return table
 
 
 def _asymmetry(gain: Gain) -> tuple[Array, Array, Array, Array]:

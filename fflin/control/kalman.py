@@ -14,6 +14,7 @@ from fflin.analysis.reduction import (
     unpushed_positions,
     wheel_inputs,
 )
+from fflin.base import html, svg
 from fflin.base.errors import DetectabilityError, InputError, listed, located
 from fflin.base.names import input_keys
 from fflin.base.process import in_one_thread
@@ -27,7 +28,14 @@ from fflin.base.validation import (
     instance,
     shaped,
 )
-from fflin.control.gain import Gain, ModelDesign, summary_of_poles, table_of_poles
+from fflin.control.gain import (
+    Gain,
+    ModelDesign,
+    folded_poles,
+    poles_figure,
+    summary_of_poles,
+    table_of_poles,
+)
 from fflin.control.lqr import at_fixed_point
 from fflin.control.optimal import differential_riccati as riccati
 from fflin.control.optimal.riccati import solve
@@ -108,28 +116,44 @@ class Estimator(ModelDesign):
 
     def _report(self) -> str:
         """Return the report with the poles and the states that are not estimated."""
+        parts = [folded([summary_of_poles(self), self._head()])]
+        parts.append(table_of_poles(self, "A - L C"))
+        parts.append(f"Riccati residual {self.residual:.1e}")
+        if left := self._not_estimated():
+            parts.append(folded([left]))
+        return "\n\n".join(parts)
+
+    def _html_parts(self) -> list[str]:
+        states = svg.Axis(self.state_names, [""] * len(self.state_names))
+        outputs = svg.Axis(self.output_names, [""] * len(self.output_names))
+        L = svg.heat_map("L", self.L, states, outputs)
+        return [
+            html.verdict(summary_of_poles(self), self.margin > 0.0),
+            html.paragraph(self._head()),
+            html.paragraph(f"Riccati residual {self.residual:.1e}"),
+            html.side_by_side(poles_figure(self, "A - L C"), L),
+            folded_poles(self, "A - L C"),
+            html.paragraph(self._not_estimated(), "note"),
+        ]
+
+    def _head(self) -> str:
         count = len(self.estimated or self.state_names)
-        head = (
+        return (
             f"{self.robot}: estimator of {count} states from {len(self.output_names)} outputs, "
             f"{_time(self.dt)}"
         )
-        parts = [folded([summary_of_poles(self), head])]
-        parts.append(table_of_poles(self, "A - L C"))
-        parts.append(f"Riccati residual {self.residual:.1e}")
+
+    def _not_estimated(self) -> str:
         left = [
             name
             for name in self.state_names
             if self.estimated and name not in self.estimated
         ]
-        if left:
-            parts.append(
-                folded(
-                    [
-                        f"not estimated: {listed(left)}, which have no effect on the other states"
-                    ]
-                )
-            )
-        return "\n\n".join(parts)
+        if not left:
+            return ""
+        return (
+            f"not estimated: {listed(left)}, which have no effect on the other states"
+        )
 
     def to_control(self) -> ControlSystem:
         """Return a `control.StateSpace` from u - u0 and y - y0 to xh, with signal names.
@@ -195,14 +219,24 @@ class Compensator(ModelDesign):
 
     def _report(self) -> str:
         """Return the report with the sizes and the poles of the closed loop."""
+        poles = table_of_poles(self, "the closed loop")
+        title = folded([summary_of_poles(self), self._head()])
+        return f"{title}\n\n{poles}"
+
+    def _html_parts(self) -> list[str]:
+        return [
+            html.paragraph(summary_of_poles(self)),
+            html.paragraph(self._head()),
+            poles_figure(self, "the closed loop"),
+            folded_poles(self, "the closed loop"),
+        ]
+
+    def _head(self) -> str:
         nu, nz = self.C.shape
-        head = (
+        return (
             f"{self.robot}: compensator with {nz} states, from {len(self.input_names)} outputs of "
             f"the robot to {nu} inputs, {_time(self.dt)}"
         )
-        poles = table_of_poles(self, "the closed loop")
-        title = folded([summary_of_poles(self), head])
-        return f"{title}\n\n{poles}"
 
     def to_control(self) -> ControlSystem:
         """Return a `control.StateSpace` from y - y0 to u - u0, with signal names.

@@ -10,6 +10,7 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
+from fflin.base import html
 from fflin.base.errors import FflinWarning, InputError, listed, optional_package
 from fflin.base.names import by_name, input_keys, stands_for_any, state_keys
 from fflin.base.process import in_one_thread
@@ -186,6 +187,10 @@ def mpc(
     return _about(source, ahead, (Q, R, Qf, weights))
 
 
+# Largest number of rows of the table on the card of a notebook.
+_SHOWN = 100
+
+
 class _Predictive(Feedback):
     horizon: Horizon
 
@@ -193,6 +198,18 @@ class _Predictive(Feedback):
         horizon = self.horizon
         summary = f"{horizon.samples} samples of {horizon.dt:g} s, {len(horizon.limited)} limits"
         return f"{type(self).__name__}('{horizon.robot}', {summary})"
+
+    def _repr_html_(self) -> str:
+        horizon = self.horizon
+        rows = [["limited signal", "", "least", "largest"]]
+        columns = horizon.limited, horizon.at, horizon.low, horizon.high
+        for name, at, low, high in zip(*columns, strict=True):
+            kind = "input" if at < len(horizon.inputs) else "soft"
+            rows.append([name, kind, f"{low:.5g}", f"{high:.5g}"])
+        table = html.table(rows[:_SHOWN], "ll")
+        left = len(rows) - _SHOWN
+        more = f"and {left} more, see horizon" if left > 0 else ""
+        return html.result_card(self, table, html.paragraph(more))
 
     def bind(self, robot: Robot) -> Command:
         """Return policy(t, q, v) -> u for a robot with the same states and inputs."""

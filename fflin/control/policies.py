@@ -8,6 +8,7 @@ from typing import ClassVar, NamedTuple, TypeAlias
 import numpy as np
 import pinocchio as pin
 
+from fflin.base import html
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, frozen, instance, shaped, vector
 from fflin.control.channel import Law
@@ -31,7 +32,7 @@ from fflin.dynamics.state_rows import readout
 from fflin.kernel.allocation import nearest
 from fflin.linear.fit import about_point, require_fit, require_turns
 from fflin.linear.holding import held_if_possible, wheel_notes
-from fflin.linear.model import LinearModel
+from fflin.linear.model import LinearModel, gain_map
 from fflin.linear.trajectory import Trajectory
 from fflin.robot.fields import input_limits, limits_of
 from fflin.robot.outputs import Gyroscope
@@ -89,7 +90,7 @@ class OutputSensing(Policy):
         return noisy
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class StateFeedback(Feedback):
     """State feedback ``u = u0 - K (x - x0)`` about the operating point of a model.
 
@@ -131,6 +132,14 @@ class StateFeedback(Feedback):
             K = K.K
         self.K = frozen(shaped("K", K, about_point(self.lin).B.shape[::-1], hint))
         self.lin = held_if_possible(self.lin)
+
+    def __repr__(self) -> str:
+        nu, nx = self.K.shape
+        time = f"dt={self.lin.dt:g} s" if self.lin.dt else "continuous"
+        return f"StateFeedback('{self.lin.robot}', nx={nx}, nu={nu}, {time})"
+
+    def _repr_html_(self) -> str:
+        return html.result_card(self, gain_map(self.K, self.lin))
 
     @property
     def notes(self) -> tuple[str, ...]:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pinocchio as pin
 
+from fflin.base import html
 from fflin.base.errors import InputError
 from fflin.base.tables import folded
 from fflin.base.validation import Array, FrozenArrays, dimension, instance, vector
@@ -69,6 +70,9 @@ class Impact(FrozenArrays):
 
     def __str__(self) -> str:
         return folded([f"{self.robot.name}, {self.robot.n} joints: {self.told}"])
+
+    def _repr_html_(self) -> str:
+        return html.result_card(self, html.paragraph(self.told))
 
     @property
     def told(self) -> str:

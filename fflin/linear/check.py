@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fflin.base import html
 from fflin.base.tables import folded, grid
 from fflin.base.validation import Array, instance, share
 from fflin.dynamics.coordinates import ANGULAR, LINEAR
@@ -46,8 +47,8 @@ _ROUTE_ROUNDING = 1e2 * EPS
 _LOOSEST = 1e-2
 
 
-@dataclass(frozen=True)
-class Check:
+@dataclass(frozen=True, repr=False)
+class Check(html.Reported):
     """Result of `check`: the errors of a linear model; ``print`` shows a table.
 
     Attributes
@@ -98,6 +99,26 @@ class Check:
 
     def __str__(self) -> str:
         """Show whether the model is verified, and the largest error of each kind of comparison."""
+        lines = folded([self._verdict()]), folded([self._counted_title()])
+        return "\n\n".join((*lines, grid(self._table(), "lrrlr")))
+
+    def _html_parts(self) -> list[str]:
+        every = [["compared with", "block", "error", "allowed"]]
+        for row in self.rows:
+            figures = f"{row.error:.1e}", f"{row.tolerance:.1e}"
+            every.append([row.test, row.block, *figures])
+        return [
+            html.verdict(self._verdict(), self.ok),
+            html.paragraph(self._counted_title(), "note"),
+            html.table(self._table(), "lrrlr"),
+            html.folded("all comparisons", html.table(every, "ll")),
+        ]
+
+    def _counted_title(self) -> str:
+        return f"{self.title}, {len(self.rows)} comparisons"
+
+    def _verdict(self) -> str:
+        """Return one line that states whether the model is verified."""
         if failures := self.failures:
             blocks = list(dict.fromkeys(row.block for row in failures))
             names = [self._failed(block) for block in blocks[:6]]
@@ -105,19 +126,20 @@ class Check:
                 names.append("...")
             verb = "is" if len(blocks) == 1 else "are"
             count = f"{len(failures)} of {len(self.rows)} comparisons FAILED"
-            verdict = f"{', '.join(names)} {verb} not verified: {count}"
-        else:
-            largest = max(self.rows, key=lambda row: row.error)
-            error_text = f"{largest.error:.1e} (allowed {largest.tolerance:.1e})"
-            verdict = f"{self._verified} are verified: largest error {error_text}"
+            return f"{', '.join(names)} {verb} not verified: {count}"
+        largest = max(self.rows, key=lambda row: row.error)
+        error_text = f"{largest.error:.1e} (allowed {largest.tolerance:.1e})"
+        return f"{self._verified} are verified: largest error {error_text}"
+
+    def _table(self) -> list[list[str]]:
+        """Return a table with the largest error of each kind of comparison."""
         table = [["compared with", "comparisons", "largest error", "of", "allowed"]]
         for test in dict.fromkeys(row.test for row in self.rows):
             rows = [row for row in self.rows if row.test == test]
             worst = max(rows, key=lambda row: (not row.ok, row.error))
             figures = f"{worst.error:.1e}", worst.block, f"{worst.tolerance:.1e}"
             table.append([test, str(len(rows)), *figures])
-        title = f"{self.title}, {len(self.rows)} comparisons"
-        return "\n\n".join((folded([verdict]), folded([title]), grid(table, "lrrlr")))
+        return table
 
 
 def check(robot: Robot, lin: LinearModel, *, tolerance: float | None = None) -> Check:

@@ -8,6 +8,7 @@ from itertools import permutations, product
 import numpy as np
 import pinocchio as pin
 
+from fflin.base import html
 from fflin.base.errors import EquilibriumError, InputError, SingularInertiaError, listed
 from fflin.base.tables import grid, signals
 from fflin.base.validation import Array, Complex, FrozenArrays, Indices, instance, truth
@@ -31,8 +32,8 @@ _ROUNDING = 1e3 * float(np.finfo(float).eps)
 _MOST_TILTS, _LONGEST_TILT, _SMALL_EFFECT = 50, 0.5, 1e-9
 
 
-@dataclass(frozen=True, eq=False)
-class Equilibrium(FrozenArrays):
+@dataclass(frozen=True, eq=False, repr=False)
+class Equilibrium(html.Reported, FrozenArrays):
     """Result of `equilibrium`: minimum-norm inputs, spring deflections and residual forces.
 
     Attributes
@@ -538,7 +539,7 @@ def _pseudo_solve(C: Array, d: Array) -> Array:
     return u
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class RelativeEquilibrium(FrozenArrays):
     """Relative equilibrium: an attitude at rest in the orbital frame, with fixed joints.
 
@@ -575,8 +576,17 @@ class RelativeEquilibrium(FrozenArrays):
     stable: bool | None
     margin: float
 
+    @property
+    def stability(self) -> str:
+        """The word "stable", "unstable" or "undecided"."""
+        return {True: "stable", False: "unstable", None: "undecided"}[self.stable]
 
-class RelativeEquilibria(tuple[RelativeEquilibrium, ...]):
+    def __repr__(self) -> str:
+        moments = ", ".join(f"{moment:.5g}" for moment in self.moments)
+        return f"RelativeEquilibrium({self.stability}, moments=({moments}) kg m^2)"
+
+
+class RelativeEquilibria(html.Reported, tuple[RelativeEquilibrium, ...]):
     """Tuple of the 24 relative equilibria, most stable first; ``print`` shows a table.
 
     Examples
@@ -593,15 +603,12 @@ class RelativeEquilibria(tuple[RelativeEquilibrium, ...]):
         """Show a table with one row for each group of four equivalent attitudes."""
         rows = [["radial", "along", "normal [kg m^2]", "", "growth [1/s]"]]
         for one in self[::4]:
-            stability = {True: "stable", False: "unstable", None: "undecided"}[
-                one.stable
-            ]
             sizes = [f"{moment:.5g}" for moment in one.moments]
             rate = 0.0
             if one.stable is False:
                 rate = float(one.poles.real.max())
             growth = f"{rate:.4g}" if rate else "."
-            rows.append([*sizes, stability, growth])
+            rows.append([*sizes, one.stability, growth])
         title = "principal moments of inertia; each row stands for 4 attitudes"
         return f"{title}\n{grid(rows, 'rrrlr')}"
 

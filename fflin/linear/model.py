@@ -7,11 +7,12 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from hashlib import sha256
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 import numpy as np
 import pinocchio as pin
 
+from fflin.base import html, svg
 from fflin.base.errors import InputError, optional_package
 from fflin.base.names import input_keys, undotted
 from fflin.base.validation import (
@@ -115,6 +116,67 @@ class StateSpace(SignalNames):
     u0: Vector
     y0: Vector
     dt: float
+
+    def _html_parts(self) -> list[str]:
+        rates = self.state_units
+        if not self.dt:
+            rates = tuple(map(svg.rate_unit, rates))
+        states = svg.Axis(self.state_names, self.state_units)
+        rows = svg.Axis(self.state_names, rates)
+        outputs = svg.Axis(self.output_names, self.output_units)
+        inputs = _input_axis(self)
+        maps = (
+            svg.heat_map("A", self.A, rows, states),
+            svg.heat_map("B", self.B, rows, inputs),
+        )
+        is_state = np.array_equal(self.C, np.eye(len(self.x0))) and not self.D.any()
+        of_outputs = ""
+        if not is_state:
+            of_outputs = html.side_by_side(
+                svg.heat_map("C", self.C, outputs, states),
+                svg.heat_map("D", self.D, outputs, inputs),
+            )
+        table = [["signal", "", "unit", "operating point"]]
+        values = (("state", states, self.x0), ("input", inputs, self.u0))
+        for kind, axis, point in values:
+            for name, unit, value in zip(*axis, point.tolist(), strict=True):
+                table.append([name, kind, unit, f"{value:.6g}"])
+        return [
+            *super()._html_parts(),
+            html.side_by_side(*maps),
+            of_outputs,
+            html.folded("states and inputs", html.table(table, "lll")),
+        ]
+
+
+class Signals(Protocol):
+    """Model or design with names and units of states and inputs."""
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """Names of the states."""
+
+    @property
+    def state_units(self) -> tuple[str, ...]:
+        """Units of the states."""
+
+    @property
+    def input_names(self) -> tuple[str, ...]:
+        """Names of the inputs."""
+
+    @property
+    def input_units(self) -> tuple[str, ...]:
+        """Units of the inputs."""
+
+
+def _input_axis(lin: Signals) -> svg.Axis:
+    return svg.Axis(input_keys(lin), lin.input_units)
+
+
+def gain_map(K: Array, lin: Signals) -> str:
+    """Return a heat map in HTML of a gain (nu, nx) from states to inputs."""
+    states = svg.Axis(lin.state_names, lin.state_units)
+    return svg.heat_map("K", K, _input_axis(lin), states)
 
 
 @dataclass(frozen=True, eq=False, repr=False, init=False)

@@ -2,14 +2,16 @@
 
 from dataclasses import dataclass
 
+from fflin.base import html
+
 # Largest stationarity and complementarity, and largest violation [rad, m, s], of a plan that counts
 # as stationary. If the effort is a quadratic function of the inputs, at most STATIONARY**2 of the
 # effort can be saved.
 STATIONARY, FEASIBLE = 1e-2, 1e-7
 
 
-@dataclass(frozen=True)
-class Optimality:
+@dataclass(frozen=True, repr=False)
+class Optimality(html.Reported):
     r"""Residuals of the Karush-Kuhn-Tucker conditions of a plan, evaluated at the plan.
 
     The Lagrangian is the sum of the effort and of the limits and goals times their multipliers. Its

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pinocchio as pin
 
+from fflin.base import html, svg
 from fflin.base.errors import FflinWarning, InputError, located
 from fflin.base.record import Design, record_of, write_record
 from fflin.base.rotation import rotation_matrices
@@ -185,13 +186,46 @@ class Trajectory(Design):
 
     def _report(self) -> str:
         """Return text about the trajectory: its largest residual, or why it is invalid."""
-        verdict = self._fault or f"residual {self.residual.max():.1e}"
-        notes = self._note.splitlines()
-        if (
-            self._optimality is not None and not notes
-        ):  # the trajectory was read from a file
-            notes = [str(self._optimality)]
-        return folded([repr(self), verdict, *notes])
+        return folded([repr(self), self._verdict(), *self._remarks()])
+
+    def _remarks(self) -> list[str]:
+        """Return the lines of the report after the verdict."""
+        remarks = self._note.splitlines()
+        if self._optimality is not None and not remarks:
+            # The trajectory was read from a file.
+            return [str(self._optimality)]
+        return remarks
+
+    def _verdict(self) -> str:
+        return self._fault or f"residual {self.residual.max():.1e}"
+
+    def _html_parts(self) -> list[str]:
+        rows = svg.sampled(len(self.t))
+        robot, q = self.robot, self.q[rows]
+        apart = np.minimum(1.0, np.abs(q[:, 3:7] @ q[0, 3:7]))
+        charts = {
+            "attitude from the start": (
+                "deg",
+                {"base": 2.0 * np.degrees(np.arccos(apart))},
+            )
+        }
+        for title, prismatic in (("joints", False), ("prismatic joints", True)):
+            joints = [
+                x for x in robot.joints if x.prismatic == prismatic and not x.mode
+            ]
+            curves = {x.name: np.array([x.value(row) for row in q]) for x in joints}
+            charts[title] = ("m" if prismatic else "rad", curves)
+        pictures = [
+            svg.figure(title, svg.curves(self.t[rows], curves, unit))
+            for title, (unit, curves) in charts.items()
+            if curves
+        ]
+        notes = [html.paragraph(note) for note in self._remarks()]
+        return [
+            html.verdict(self._verdict(), not self._fault),
+            *notes,
+            html.side_by_side(*pictures),
+        ]
 
     @cached_property
     def _aba(self) -> Aba:

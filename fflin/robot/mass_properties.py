@@ -187,6 +187,23 @@ def properties(P: Array) -> tuple[Array, Array, Array]:
     return mass, com, about
 
 
+def equivalent_box(inertia: pin.Inertia) -> tuple[Array, pin.SE3]:
+    """Return the sides (3,) [m] and the placement of a uniform box with a given inertia.
+
+    A side is at least a twentieth of the largest side and 1 mm, so that the box can be drawn. The
+    mass of the body must be positive.
+    """
+    moments, axes = np.linalg.eigh(inertia.inertia)
+    if np.linalg.det(axes) < 0.0:
+        axes[:, 0] = -axes[:, 0]
+    # Find the sides of a uniform box from its moments of inertia m (b^2 + c^2)/12. If the inertia
+    # in the file is not physically realisable, a squared side may be negative; it is set to zero.
+    squares = 6.0 / inertia.mass * (moments.sum() - 2.0 * moments)
+    sides = np.sqrt(np.maximum(squares, 0.0))
+    sides = np.maximum(sides, max(0.05 * sides.max(), 1e-3))
+    return sides, pin.SE3(axes, inertia.lever)
+
+
 class Piece(NamedTuple):
     """Mass properties of a link, or of a body of links that are fixed to each other."""
 

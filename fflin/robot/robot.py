@@ -351,3 +351,8 @@ class Robot(RobotData):
         known = self.reaction_wheels
         names = self.flown_wheels.at(speeds)
         return {x: known.get(x) or spin_inertia(self, x) for x in names}
+
+    def _repr_html_(self) -> str:
+        from fflin.robot.card import robot_card
+
+        return robot_card(self)

@@ -1,5 +1,7 @@
 """Text about a robot: a summary, and the draft of a robot file."""
 
+from __future__ import annotations
+
 import json
 import math
 import re
@@ -7,6 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from string import Template
 from textwrap import fill
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
@@ -15,7 +18,11 @@ from fflin.base.tables import counted, folded, grid, width
 from fflin.robot.fields import limits_of, travel_of
 from fflin.robot.inputs import BaseForce, BaseTorque, Thruster
 from fflin.robot.joints import ROOT, Joint
-from fflin.robot.robot import Robot
+
+if TYPE_CHECKING:
+    from fflin.robot.robot import Robot
+
+LIMIT_UNITS = "limits in rad, N m and rad/s, or in m, N and m/s for prismatic joints"
 
 _STATE = {
     "rpy": "[deg]",
@@ -55,10 +62,10 @@ def robot_info(robot: Robot, at_point: str = "") -> str:
     head += f"\nfrom {robot.urdf or 'a Pinocchio model'}"
     if robot.orbit:
         head += f"\n{folded([str(robot.orbit)])}"
-    tree = _tree(robot)
+    tree = joint_table(robot)
     limits = ""
     if any(cell != "." for row in tree[1:] for cell in row[3:]):
-        limits = "limits in rad, N m and rad/s, or in m, N and m/s for prismatic joints"
+        limits = LIMIT_UNITS
     frames = [
         frame.name for frame in robot.model.frames.tolist() if frame.parentJoint >= ROOT
     ]
@@ -72,7 +79,7 @@ def robot_info(robot: Robot, at_point: str = "") -> str:
     return "\n\n".join(filter(None, parts))
 
 
-def _tree(robot: Robot) -> list[list[str]]:
+def joint_table(robot: Robot) -> list[list[str]]:
     """Return a table with one row for the base and for each joint that is not a mode.
 
     The joints are in the order of the tree, and their names are indented by their depth. The masses

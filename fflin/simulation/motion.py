@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -10,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pinocchio as pin
 
-from fflin.base import record
-from fflin.base.errors import InputError
+from fflin.base import html, record
+from fflin.base.errors import FflinWarning, InputError
 from fflin.base.figures import Figure
 from fflin.base.record import Design
 from fflin.base.tables import data_frame
@@ -32,6 +33,7 @@ from fflin.simulation.report import (
     Passed,
     Saturated,
     curves,
+    motion_parts,
     motion_report,
     passed,
     pulse_thrusters,
@@ -42,6 +44,9 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 FORMATS = (*RECORDS, ".csv")
+
+# Frames per second of the page that notebooks show, chosen for a small file.
+_FPS = 10.0
 
 # Tolerance [SI units] of positions and rates when phases are joined: a phase must start where the
 # phase before it ended. If the largest rate at this time exceeds 1, the tolerance is multiplied by
@@ -228,6 +233,26 @@ class Motion(StatesAndInputs, Design):
 
     def _report(self) -> str:
         return motion_report(self)
+
+    def _html_parts(self) -> list[str]:
+        return motion_parts(self, self._page())
+
+    def _page(self) -> str:
+        """Return the page of the motion in HTML, or an empty text if its robot is not known."""
+        from tempfile import TemporaryDirectory
+
+        from fflin import visualize
+
+        if self._robot is None:
+            return ""
+        if html.is_shown_elsewhere(self):
+            return html.paragraph(html.SHOWN_ABOVE, "note")
+        with TemporaryDirectory() as folder, warnings.catch_warnings():
+            warnings.simplefilter("ignore", FflinWarning)  # about drawings
+            path = Path(folder) / "motion.html"
+            visualize(self._robot, self, html=path, open=False, fps=_FPS)
+            page = path.read_text("utf-8")
+        return html.frame(self.robot, 480, content=page)
 
     @property
     def reference(self) -> pin.SE3:

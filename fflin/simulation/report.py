@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from fflin.base import html
 from fflin.base.names import group_of, input_keys
 from fflin.base.tables import folded, grid
 from fflin.base.validation import Array, Indices, Mask
@@ -441,6 +442,34 @@ def pushed(model: object) -> bool:
     return not {"F_b", "thrust"}.isdisjoint(map(group_of, input_keys(model)))
 
 
+def motion_parts(motion: Motion, page: str) -> list[str]:
+    """Return the report as parts of a card in HTML, one of which is `page`."""
+    kinds = error_sizes(motion)
+    head, *lines = _heading(motion, kinds)
+    return [
+        html.verdict(head, _outcome(motion, kinds)),
+        *(html.paragraph(line, "note") for line in lines),
+        page,
+        html.folded("report", html.preformatted(motion_report(motion))),
+    ]
+
+
+def _outcome(motion: Motion, kinds: list[ErrorSize]) -> bool | None:
+    """Return whether a motion settled; None if it has no fixed target."""
+    if motion.stopped:
+        return False
+    if motion.tracked or not kinds:
+        return None
+    return all(kind.settled is not None for kind in _judged(kinds))
+
+
+def _judged(kinds: list[ErrorSize]) -> list[ErrorSize]:
+    """Return the errors that decide whether a motion has settled."""
+    steered = [kind for kind in kinds if kind.steered]
+    places = [kind for kind in steered if kind.title in _PLACES]
+    return places or [kind for kind in steered if kind.title not in _ALL_OF_MODES]
+
+
 def motion_report(motion: Motion) -> str:
     """Return a text about settling, inputs, limit violations and conserved quantities."""
     kinds = error_sizes(motion)
@@ -591,9 +620,7 @@ def verdict(motion: Motion, kinds: list[ErrorSize]) -> str:
     if motion.stopped:
         return f"stopped: {motion.stopped}"
     places = [kind for kind in kinds if kind.title in _PLACES]
-    judged = [kind for kind in places if kind.steered] or [
-        kind for kind in kinds if kind.steered and kind.title not in _ALL_OF_MODES
-    ]
+    judged = _judged(kinds)
     moved = [kind for kind in judged if kind.largest > THERE]
     aside = [kind.last for kind in places if kind.settled is None and not kind.steered]
     if motion.tracked and not motion.phases:

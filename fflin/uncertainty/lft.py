@@ -33,6 +33,7 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
+from fflin.base import html
 from fflin.base.errors import InputError
 from fflin.base.names import matching
 from fflin.base.record import Design
@@ -111,18 +112,28 @@ class LFT(Design):
     robot: str
 
     def _report(self) -> str:
-        rows = [("parameter", "unit", "least", "largest", "repeated")]
+        return f"{folded([self._head()])}\n\n{grid(cut(self._rows()), 'll')}"
+
+    def _html_parts(self) -> list[str]:
+        rows = cut(self._rows(), "see parameters")
+        return [html.paragraph(self._head()), html.table(rows, "ll")]
+
+    def _head(self) -> str:
+        many = counted(len(self.repeats), "parameter")
+        count = f"{self.repeats.sum():g}"
+        return f"{self.robot}: {many}, {len(self.A)} states; Delta is {count} x {count}"
+
+    def _rows(self) -> list[tuple[str, ...]]:
+        """Return the table of the parameters and their ranges."""
+        rows: list[tuple[str, ...]] = [
+            ("parameter", "unit", "least", "largest", "repeated")
+        ]
         columns = self.parameters, self.units, self.middle, self.half, self.repeats
         for name, unit, middle, half, repeats in zip(*columns, strict=True):
             ends = f"{middle - half:.6g}", f"{middle + half:.6g}"
             shown_unit = "." if unit == "1" else unit
             rows.append((name, shown_unit, *ends, f"{repeats:g}"))
-        many = counted(len(self.repeats), "parameter")
-        count = f"{self.repeats.sum():g}"
-        title = (
-            f"{self.robot}: {many}, {len(self.A)} states; Delta is {count} x {count}"
-        )
-        return f"{folded([title])}\n\n{grid(cut(rows), 'll')}"
+        return rows
 
     @property
     def dt(self) -> float:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from fflin.base import html
 from fflin.base.errors import InputError
 from fflin.base.record import Record, write_record
 from fflin.base.tables import folded, grid
@@ -251,6 +252,24 @@ class Sensitivity:
             ``link_3``, or a pattern such as ``*.density``. Bodies whose links are listed are
             omitted.
         """
+        title, table, left = self._ranked(top, only)
+        if not table:
+            return title
+        lines = [folded([title]), "", grid(table, "ll")]
+        if left:
+            lines.append(f"... and {left} more, see --top")
+        return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        title, table, left = self._ranked(15, None)
+        more = f"... and {left} more, see table(top={15 + left})" if left else ""
+        rows = html.table(table, "ll") if table else ""
+        return html.result_card(self, html.paragraph(title), rows, html.paragraph(more))
+
+    def _ranked(
+        self, top: int, only: str | None
+    ) -> tuple[str, list[tuple[str, ...]], int]:
+        """Return the title and the rows of `table`, and the number of rows that are left out."""
         instance(
             "only", only, (str, type(None)), "the name of a kind, a link or a pattern"
         )
@@ -279,7 +298,7 @@ class Sensitivity:
         rows.sort(key=lambda row: -row[0])
         most = [row[1:] for row in rows[: whole("top", top, 1)]]
         if not most:
-            return f"{lin.robot}: none of these parameters changes A or B"
+            return f"{lin.robot}: none of these parameters changes A or B", [], 0
         name, unit, _, step, *_ = most[0]
         change = step if unit == "." else f"{step} {unit}"
         title = (
@@ -287,10 +306,7 @@ class Sensitivity:
             f"changes by {100.0 * rows[0][0]:.2g} % of its largest entry, to first order"
         )
         heads = ("parameter", "unit", "value", "change", "A [%]", "B [%]")
-        lines = [folded([title]), "", grid([heads, *most], "ll")]
-        if len(rows) > top:
-            lines.append(f"... and {len(rows) - top} more, see --top")
-        return "\n".join(lines)
+        return title, [heads, *most], max(0, len(rows) - top)
 
     def save(self, path: str | Path) -> None:
         """Write the derivatives to a .npz, .mat or .json file, atomically.

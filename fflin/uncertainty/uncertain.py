@@ -6,6 +6,7 @@ from itertools import permutations
 
 import numpy as np
 
+from fflin.base import html
 from fflin.base.errors import InputError
 from fflin.base.validation import (
     Array,
@@ -28,6 +29,8 @@ from fflin.uncertainty.worst import Worst, searched
 
 # Ranges are refused if the number of rejected draws per valid draw exceeds this.
 _TRIES = 1000
+
+_SHOWN = 100  # largest number of parameters on the card of a notebook
 
 # Largest number of robots in a list; a robot takes about 50 kB.
 _MOST_ROBOTS = 100_000
@@ -61,6 +64,16 @@ class Uncertain:
 
     def __repr__(self) -> str:
         return f"Uncertain('{self.robot.name}', {len(self.ranges)} parameters)"
+
+    def _repr_html_(self) -> str:
+        rows = [["parameter", "unit", "least", "largest"]]
+        for interval in self.ranges[:_SHOWN]:
+            one = interval.parameter
+            low, high = interval.middle - interval.half, interval.middle + interval.half
+            rows.append([one.name, one.unit, f"{low:.6g}", f"{high:.6g}"])
+        left = len(self.ranges) - _SHOWN
+        more = f"and {left} more, see ranges" if left > 0 else ""
+        return html.result_card(self, html.table(rows, "ll"), html.paragraph(more))
 
     @property
     def ranges(self) -> tuple[Range, ...]:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
 
+from fflin.base import html
 from fflin.base.errors import InputError
 from fflin.base.process import Progress, in_one_thread
 from fflin.base.tables import folded
@@ -67,8 +68,8 @@ class Found:
     parameters: Mapping[str, float]
 
 
-@dataclass(frozen=True)
-class Worst:
+@dataclass(frozen=True, repr=False)
+class Worst(html.Reported):
     """Worst-case closed loops over a set of robots; print it for a report.
 
     Attributes

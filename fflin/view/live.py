@@ -18,12 +18,14 @@ from tornado.httpserver import HTTPServer
 from tornado.web import Application, HTTPError, RequestHandler
 from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
+from fflin.base import html
 from fflin.base.errors import FflinError, InputError
 from fflin.base.validation import Array
 from fflin.dynamics.impact import inertia_at
 from fflin.dynamics.state import StateMap
 from fflin.robot.fields import travel_of
 from fflin.robot.robot import Robot
+from fflin.view.html_page import HEIGHT
 from fflin.view.page import Page, body_poses
 
 _HOST = "127.0.0.1"
@@ -159,6 +161,20 @@ class Live:
             self._began = now, t
         sleep(max(0.0, self._began[0] + (t - self._began[1]) / self._speed - now))
         self.show(q, t)
+
+    def __repr__(self) -> str:
+        return f"Live('{self.robot.name}', {self.url})"
+
+    def _repr_html_(self) -> str:
+        """Return the address, and a frame with the page if the browser can reach this machine."""
+        link = f'<a href="{self.url}" target="_blank">{self.url}</a>'
+        if not html.browser_is_local():
+            note = "Only browsers on the machine of this kernel can open the live page."
+            return html.card(
+                "Live", self.robot.name, link, html.paragraph(note, "note")
+            )
+        shown = html.frame(self.robot.name, HEIGHT, address=self.url)
+        return html.card("Live", self.robot.name, link, shown)
 
     def open(self) -> None:
         """Open the page in a browser."""

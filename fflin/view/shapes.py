@@ -26,6 +26,7 @@ from fflin.base.writing import read_file, reason, require_regular, shown
 from fflin.robot.catalog import find_mesh
 from fflin.robot.equipment.appendages import FlexibleAppendage, Slosh
 from fflin.robot.joints import ROOT, Carried, find_frame, find_joint
+from fflin.robot.mass_properties import equivalent_box
 from fflin.robot.robot import Robot
 from fflin.robot.urdf.description import read_pose
 from fflin.robot.urdf.reader import SIZE_LIMIT, plain_root
@@ -212,16 +213,7 @@ def _inertia_boxes(robot: Robot) -> Iterator[Shape]:
     for joint, inertia in enumerate(robot.model.inertias.tolist()):
         if joint < ROOT or inertia.mass <= 0.0:
             continue
-        moments, axes = np.linalg.eigh(inertia.inertia)
-        if np.linalg.det(axes) < 0.0:
-            axes[:, 0] = -axes[:, 0]
-        # Find the sides of a uniform box from its moments of inertia m (b^2 + c^2)/12. If the
-        # inertia in the file is not physically realisable, a squared side may be negative; it is
-        # set to zero.
-        squares = 6.0 / inertia.mass * (moments.sum() - 2.0 * moments)
-        sides = np.sqrt(np.maximum(squares, 0.0))
-        sides = np.maximum(sides, max(0.05 * sides.max(), 1e-3))
-        placement = pin.SE3(axes, inertia.lever)
+        sides, placement = equivalent_box(inertia)
         link = "base" if joint == ROOT else robot.model.names[joint]
         yield Shape(
             joint, "box", tuple(sides.tolist()), placement, finish="inertia", link=link

@@ -13,6 +13,7 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import FflinWarning, FileError, InputError
+from fflin.base.html import in_notebook
 from fflin.base.validation import Array, instance, number, positive, truth, whole
 from fflin.base.writing import (
     as_path,
@@ -24,6 +25,7 @@ from fflin.dynamics.points import start_of
 from fflin.dynamics.state import Actuation, StateMap
 from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.robot import Robot
+from fflin.view.html_page import HtmlPage
 
 if TYPE_CHECKING:
     from os import PathLike
@@ -31,6 +33,7 @@ if TYPE_CHECKING:
     from fflin.analysis.modes import Modes
     from fflin.simulation.motion import Motion
     from fflin.view.live import Live
+    from fflin.view.page import Page
 
 SCENES = ("space", "lab")
 
@@ -56,7 +59,7 @@ def visualize(
     q: Array | None = None,
     port: int = 0,
     frame: str | None = None,
-) -> Live | Path | None:
+) -> Live | HtmlPage | None:
     """Show a robot live, or write a motion of a robot to one HTML file for offline use.
 
     The page of a motion shows
@@ -101,7 +104,8 @@ def visualize(
         picture shows one image with its panel. With several times, the picture is a strip of
         images.
     open : bool, optional
-        Whether to open a browser. By default, a browser is opened if no output file is given.
+        Whether to open a browser. By default, a browser is opened if no output file is given, but
+        not in a notebook, which shows the page itself.
     scene : {"space", "lab"}, optional
         "space" shows stars and a planet. "lab" shows a floor with a grid, and is the default under
         gravity. In orbit, the planet is the central body, below the robot and in its true size. The
@@ -130,8 +134,9 @@ def visualize(
 
     Returns
     -------
-    Live, Path or None
-        The live page, or the path of the HTML file; None if only pictures were requested.
+    Live, HtmlPage or None
+        The live page, or the path of the HTML file; None if only pictures were requested. The path
+        is a `pathlib.Path`. A notebook shows the page instead of the path, and stores one copy.
 
     Raises
     ------
@@ -176,15 +181,9 @@ def visualize(
     if motion is None:
         port = whole("port", port, 0, 2**16 - 1)
         q = start_of(robot)[0] if q is None else _configuration(robot, "q", q)
-        from fflin.view.live import Live
-
-        speed = 1.0 if speed is None else speed
-        pace = positive("speed", speed)
-        page = Page(robot, q, scene, tool, frame)
-        live = Live(page, q, follow=follow, speed=pace, port=port)
-        for note in page.notes:
-            warn(note, FflinWarning, stacklevel=2)
-        if opened is not False:
+        pace = positive("speed", 1.0 if speed is None else speed)
+        live = _live(Page(robot, q, scene, tool, frame), q, follow, pace, port)
+        if _opens(opened, default=True):
             live.open()
         return live
     from fflin.analysis.modes import Modes
@@ -215,12 +214,28 @@ def visualize(
     if shown:
         contents[shown] = page_html.encode()
     write_atomically(contents)
-    is_opened = not outputs if opened is None else opened
-    if shown and is_opened:
+    if shown and _opens(opened, default=not outputs):
         import webbrowser
 
         webbrowser.open(shown.resolve().as_uri())
-    return shown
+    return None if shown is None else HtmlPage(shown)
+
+
+def _live(page: Page, q: Array, follow: bool | None, speed: float, port: int) -> Live:
+    """Return a live page, and warn of drawings that are missing."""
+    from fflin.view.live import Live
+
+    live = Live(page, q, follow=follow, speed=speed, port=port)
+    for note in page.notes:
+        warn(note, FflinWarning, stacklevel=3)
+    return live
+
+
+def _opens(asked: bool | None, *, default: bool) -> bool:
+    """Return whether to open a browser; a notebook shows pages itself, unless `asked` is true."""
+    if asked is None:
+        return default and not in_notebook()
+    return asked
 
 
 def _at_rest(robot: Robot, q: Array | None) -> Motion:

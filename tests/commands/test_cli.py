@@ -1,7 +1,6 @@
 """The command line as a user runs it: in a process of its own."""
 
 import json
-import os
 import re
 import subprocess
 import sys
@@ -187,20 +186,6 @@ def test_joints_beyond_their_limits_are_named(command):
     assert done.returncode == 0
     assert says(done.stderr, "'joint_2' at 9 rad", "-2.094 to 2.094 rad")
     assert done.stderr.startswith("fflin: warning: ") and done.stderr.count("\n") == 1
-
-
-@pytest.mark.process
-def test_terminal_dims_zeros():
-    # `script` gives the command a terminal.
-    done = finished(
-        ["script", "-qec", f"{sys.executable} -m fflin linearize cubesat", "/dev/null"],
-        capture_output=True,
-        text=True,
-        env={**os.environ, "TERM": "xterm", "COLUMNS": "80"},
-        check=True,
-        stdin=subprocess.DEVNULL,
-    )
-    assert "\x1b[2m" in done.stdout
 
 
 @pytest.mark.parametrize("ending", [".npz", ".mat", ".json"])

@@ -1,6 +1,7 @@
 """Figures: what they show and are named by, and the files they are saved to."""
 
 import math
+import pickle
 import sys
 from dataclasses import replace
 from types import SimpleNamespace
@@ -321,3 +322,26 @@ def test_invalid_figures_are_refused(loop, tmp_path, monkeypatch):
     with pytest.raises(fflin.MissingPackageError, match=r"'fflin\[plot\]'"):
         motion.plot()
     assert not list(tmp_path.iterdir())
+
+
+def test_a_figure_has_a_picture_and_is_unknown_to_pyplot(loop):
+    from matplotlib import pyplot
+
+    *_, motion = loop
+    before = pyplot.get_fignums()
+    figure = fflin.plot_motion(motion, show=["q_b"])
+    assert pyplot.get_fignums() == before
+    content, shown = figure._repr_png_()
+    assert content.startswith(b"\x89PNG") and 400 < shown["width"] < 1000
+    copied = pickle.loads(pickle.dumps(figure))
+    assert type(copied) is type(figure) and len(copied.axes) == len(figure.axes)
+
+
+def test_a_figure_is_not_drawn_before_it_is_shown_or_saved(loop, monkeypatch):
+    from matplotlib.figure import Figure
+
+    drawn = []
+    monkeypatch.setattr(Figure, "draw", lambda *_: drawn.append(1))
+    fflin.plot_motion(loop[-1], show=["q_b"])
+    fflin.plot_poles(loop[1])
+    assert not drawn

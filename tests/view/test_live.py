@@ -19,8 +19,10 @@ import pinocchio as pin
 import pytest
 
 import fflin
+from fflin.base import html
 from fflin.robot.robot import ROOT
 from tests.support.browser import Watched
+from tests.support.cards import Parsed
 from tests.support.messages import any_wording
 from tests.support.patience import STALL, finishing, wait_until
 
@@ -324,3 +326,16 @@ def test_the_page_follows_in_a_browser(live, robots, browser):
         live.close()
         watched.page.wait_for_selector("#problem:not([hidden])")
         watched.errors.clear()  # of the connection that is gone
+
+
+def test_a_notebook_shows_the_address_and_the_page_of_a_local_kernel(live, monkeypatch):
+    for name in html._REMOTE:
+        monkeypatch.delenv(name, raising=False)
+    assert repr(live) == f"Live('ets_vii', {live.url})"
+    local = Parsed(live._repr_html_())
+    (frame,) = local.frames
+    assert frame["src"] == live.url and live.url in local.text
+    monkeypatch.setenv("SSH_CONNECTION", "192.0.2.1 50000 192.0.2.2 22")
+    remote = Parsed(live._repr_html_())
+    assert not remote.frames and live.url in remote.text
+    assert "on the machine of this kernel" in remote.text

@@ -3,6 +3,7 @@
 import base64
 import json
 import os
+import pickle
 import subprocess
 import sys
 import warnings
@@ -16,6 +17,8 @@ import fflin
 from fflin.commands.cli import main
 from fflin.view.pages import frame_indices
 from fflin.view.visualize import tool_frame
+from tests.support.browser import Watched
+from tests.support.cards import Parsed
 from tests.support.messages import hear_lines, says
 from tests.support.motions import settling
 from tests.support.patience import finished
@@ -227,3 +230,37 @@ def test_assets_are_part_of_the_package():
         for path in Path(fflin.__file__).parent.joinpath("view", "assets").iterdir()
     }
     assert {"page.html", "style.css", "main.js", "sky.js"} <= names
+
+
+def test_visualize_returns_a_path_that_notebooks_show_as_its_page(robots, tmp_path):
+    robot = robots["planar_detumble"]
+    file = tmp_path / "<b>.html"
+    page = fflin.visualize(robot, html=file, open=False)
+    assert isinstance(page, Path) and os.fspath(page) == str(page) == str(file)
+    assert page == file and hash(page) == hash(file) and page.read_bytes()
+    card = Parsed(page._repr_html_())
+    (frame,) = card.frames
+    assert frame["srcdoc"] == file.read_text("utf-8") and frame["title"] == "<b>.html"
+    assert card.tags == {"iframe"}
+    assert page.with_suffix(".png")._repr_html_() is None
+    page.unlink()
+    assert page._repr_html_() is None
+    copied = pickle.loads(pickle.dumps(page))
+    assert copied == page and type(copied) is type(page)
+
+
+@pytest.mark.browser
+def test_the_frame_of_a_notebook_plays_the_page(robots, browser, tmp_path):
+    robot = robots["planar_detumble"]
+    path = tmp_path / "motion.html"
+    page = fflin.visualize(robot, settling(robot, 1.0), html=path, open=False)
+    notebook = tmp_path / "notebook.html"
+    card = f"<!doctype html><title>x</title><meta charset='utf-8'>{page._repr_html_()}"
+    notebook.write_text(card, "utf-8")
+    framed = "document.querySelector('iframe')"
+    with Watched(browser, notebook.as_uri(), size=(900, 700), ready=framed) as watched:
+        frame = watched.page.query_selector("iframe").content_frame()
+        watched.wait("window.fflin && fflin.ready", frame)
+        assert "planar_detumble" in frame.inner_text("body")
+        # The page cannot reach the notebook.
+        assert frame.evaluate("origin") == "null"

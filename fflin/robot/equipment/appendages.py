@@ -19,6 +19,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import pinocchio as pin
 
+from fflin.base import html
 from fflin.base.errors import InputError
 from fflin.base.validation import (
     Array,
@@ -37,8 +38,8 @@ _FIRST_ROOT = 1.8411837813406593
 _FASTEST = 1e12  # [Hz]
 
 
-@dataclass(frozen=True, eq=False)
-class FlexibleAppendage(FrozenArrays):
+@dataclass(frozen=True, eq=False, repr=False)
+class FlexibleAppendage(html.Reported, FrozenArrays):
     r"""Flexible part of a link, such as a solar array, described by its modes when clamped.
 
     Each mode adds a coordinate to q_m, with the name NAME_mode_1, NAME_mode_2 and so on. The
