@@ -175,7 +175,7 @@ def _stops(engine):
     tumbling = x0.copy()
     tumbling[6 + robot.n : 9 + robot.n] = 1.0
     result = {}
-    for name, gain, start in (("diverged", -K, x0), ("left", 0.0 * K, tumbling)):
+    for name, gain, start in (("diverged", -3.0 * K, x0), ("left", 0.0 * K, tumbling)):
         policy = fflin.StateFeedback(lin, gain)
         options = SimulationOptions(
             robot=robot, policy=policy, x0=start, duration=8.0, dt=0.01

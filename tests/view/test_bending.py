@@ -8,7 +8,7 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from fflin.robot.robot import ROOT
+from fflin.robot.joints import ROOT
 from fflin.view.page import body_poses
 from fflin.view.pages import mode_page, panel
 from fflin.view.shapes import shapes

@@ -20,7 +20,7 @@ import pytest
 
 import fflin
 from fflin.base import html
-from fflin.robot.robot import ROOT
+from fflin.robot.joints import ROOT
 from tests.support.browser import Watched
 from tests.support.cards import Parsed
 from tests.support.messages import any_wording

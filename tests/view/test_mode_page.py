@@ -9,7 +9,7 @@ from scipy.optimize import minimize_scalar
 
 import fflin
 from fflin.commands.cli import main
-from fflin.robot.robot import ROOT
+from fflin.robot.joints import ROOT
 from tests.support.browser import Watched
 from tests.support.messages import says
 

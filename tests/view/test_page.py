@@ -10,7 +10,7 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from fflin.robot.robot import ROOT
+from fflin.robot.joints import ROOT
 from fflin.view.visualize import tool_frame
 from tests.support.browser import Watched
 from tests.support.marks import exhaustive

@@ -5,8 +5,7 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from fflin.robot.joints import find_frame
-from fflin.robot.robot import ROOT
+from fflin.robot.joints import ROOT, find_frame
 from fflin.view.page import Page
 from fflin.view.pages import moved, play_back
 from tests.support.robots import random_point, random_pose
