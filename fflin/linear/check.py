@@ -56,6 +56,8 @@ class Check:
         One row per comparison of a block of A, B, C or D, with its error and tolerance.
     title : str
         Description of the checked model.
+    robot : str
+        Name of the robot.
 
     Examples
     --------
@@ -67,6 +69,7 @@ class Check:
 
     rows: tuple[Row, ...]
     title: str
+    robot: str
 
     @property
     def ok(self) -> bool:
@@ -109,7 +112,8 @@ class Check:
         else:
             largest = max(self.rows, key=lambda row: row.error)
             error_text = f"{largest.error:.1e} (allowed {largest.tolerance:.1e})"
-            verdict = f"{self._verified} are verified: largest error {error_text}"
+            matrices = f"{self._verified} of {self.robot}"
+            verdict = f"{matrices}: verified, largest error {error_text}"
         table = [["compared with", "comparisons", "largest error", "of", "allowed"]]
         for test in dict.fromkeys(row.test for row in self.rows):
             rows = [row for row in self.rows if row.test == test]
@@ -196,7 +200,7 @@ def check_all(
             title = f"{robot.name}, frame {lin.frame}, scaled cond(M) {condition:.1e}"
     if tolerance is not None:
         title += f", each error at most {tolerance:.1e}"
-    return Check(tuple(largest.values()), title)
+    return Check(tuple(largest.values()), title, robot.name)
 
 
 def _comparisons(robot: Robot, lin: LinearModel) -> Iterator[Row]:
