@@ -152,6 +152,9 @@ def test_formulas_search_and_pages_that_play_work_from_disk(site, browser):
     found = "document.querySelectorAll('ul.search li').length > 5"
     with opened("search.html?q=momentum", found) as watched:
         assert "momentum_reduction" in watched.page.inner_text("ul.search")
+        watched.page.wait_for_selector("ul.search p.context")
+        excerpts = watched.page.query_selector_all("ul.search p.context")
+        assert any("momentum" in each.inner_text() for each in excerpts)
     framed = "document.querySelector('iframe.fflin-page')"
     with opened("tutorials/first_loop.html", framed) as watched:
         element = watched.page.query_selector("iframe.fflin-page")
@@ -178,6 +181,16 @@ SOUGHT = {
     "slosh": {"guide/flexible"},
     "Nastran": {"guide/flexible"},
     "Craig-Bampton": {"guide/flexible"},
+    "citation": {"start"},
+    "cite": {"start"},
+    "conda": {"start"},
+    "colab": {"start"},
+    "notebook": {"start", "tutorials/index"},
+    "install on Windows": {"start"},
+    "install on macOS": {"start"},
+    "platforms": {"start"},
+    "quaternion sign": {"conventions"},
+    "closed loop poles": {"guide/lqr_kalman"},
 }
 
 

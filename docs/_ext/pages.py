@@ -1,9 +1,11 @@
 """For the pages that are run: figures and warnings as a reader sees them, and pages that play."""
 
 import os
+import re
 import shutil
 import warnings
 from pathlib import Path
+from typing import Any
 
 from IPython import get_ipython
 from IPython.display import HTML
@@ -24,4 +26,49 @@ def embed(page: str, height: int = 480) -> HTML:
         f'<iframe class="fflin-page" src="{address}" height="{height}" loading="lazy" '
         f'title="{page}"></iframe>'
         f'<p class="fflin-page-link"><a href="{address}">{page} by itself</a></p>'
+    )
+
+
+# Shows the scene alone, and plays it again and again. Where readers prefer reduced motion, the
+# scene stays at a time at which the robot turns.
+_HERO = """<script>
+const wait = setInterval(() => {
+  if (!window.fflin || !window.fflin.ready) return;
+  clearInterval(wait);
+  fflin.plain(true, false);
+  parent.postMessage("fflin-hero", "*");
+  if (matchMedia("(prefers-reduced-motion: reduce)").matches) {
+    fflin.pause();
+    fflin.seek(8);
+    return;
+  }
+  fflin.play();
+  setInterval(() => { if (!fflin.state.playing) fflin.play(); }, 1500);
+}, 50);
+</script>
+</body>"""
+
+
+def hero() -> HTML:
+    """Run the Python of the front page, and show its motion without panel and controls.
+
+    Until the scene is drawn, a picture stands in its place. A click opens the page itself.
+    """
+    import fflin
+
+    source = Path(__file__).parents[1] / "index.md"
+    code = re.findall(r"```python\n(.*?)```", source.read_text("utf-8"), re.DOTALL)[0]
+    names: dict[str, Any] = {}
+    exec(code, names)
+    embed("motion.html")
+    page = fflin.visualize(names["robot"], names["motion"], html="hero.html", speed=8.0)
+    text = Path(str(page)).read_text("utf-8")
+    Path("hero.html").write_text(text.replace("</body>", _HERO), "utf-8")
+    embed("hero.html")
+    folder = f"pages/{os.environ['FFLIN_DOCS_PAGE']}"
+    return HTML(
+        f'<a class="fflin-hero" href="{folder}/motion.html" title="open the page of this motion">'
+        '<img src="_static/hero.png" alt="A satellite with an arm returns from 30 degrees">'
+        f'<iframe src="{folder}/hero.html" title="the motion of the example" tabindex="-1">'
+        "</iframe></a>"
     )

@@ -1,14 +1,18 @@
 """Draw moving pictures of the documents: ``python docs/scripts/film.py hero`` or ``... tutorials``.
 
-``hero`` simulates the example of the README and draws docs/hero.webp and docs/hero.png.
-``tutorials`` draws docs/tutorials/NAME.webp from the pages that the last build of the site kept.
+``hero`` simulates the example of the README and draws docs/hero.webp and docs/_static/hero.png.
+``tutorials`` draws docs/_static/tutorials/NAME.webp from the page that the tutorial wrote in the last
+build of the site. If a tutorial writes no page, its code is run, and its motion is shown.
 Needs Chromium and playwright, which the extra ``test`` installs.
 """
 
 import io
+import os
+import re
 import sys
 import tempfile
 from pathlib import Path
+from typing import Any
 
 from PIL import Image
 from playwright.sync_api import Page, sync_playwright
@@ -85,15 +89,36 @@ def hero() -> None:
         html = fflin.visualize(robot, motion, html=Path(folder, "hero.html"))
         pictures = frames(Path(html), (830, 467), 72, 1.0)
     save(pictures, DOCS / "hero.webp", 70)
-    pictures[7].quantize(256).save(DOCS / "hero.png", optimize=True)
+    pictures[7].quantize(256).save(DOCS / "_static" / "hero.png", optimize=True)
 
 
 def tutorials() -> None:
-    """Draw a small film of the first page of each tutorial."""
-    for folder in sorted(PAGES.iterdir()):
-        html = sorted(folder.glob("*.html"))[0]
-        pictures = frames(html, (416, 260), 36, 1.0)
-        save(pictures, DOCS / "tutorials" / f"{folder.name}.webp", 55)
+    """Draw a small film of each tutorial."""
+    target = DOCS / "_static" / "tutorials"
+    target.mkdir(exist_ok=True)
+    for source in sorted((DOCS / "tutorials").glob("*.md")):
+        if source.stem == "index":
+            continue
+        with tempfile.TemporaryDirectory() as folder:
+            written = sorted((PAGES / source.stem).glob("*.html"))
+            html = written[0] if written else run(source, Path(folder))
+            pictures = frames(html, (416, 260), 30, 1.0)
+        save(pictures, target / f"{source.stem}.webp", 55)
+
+
+def run(source: Path, folder: Path) -> Path:
+    """Run the code of a tutorial in a folder, and return the page of its motion, or of its robot at rest."""
+    code = re.findall(
+        r"```\{code-cell\}\n(?::[^\n]*\n)*(.*?)```", source.read_text("utf-8"), re.DOTALL
+    )
+    names: dict[str, Any] = {}
+    os.chdir(folder)
+    exec("\n".join(cell for cell in code if "pages" not in cell), names)
+    html = folder / "page.html"
+    motion = names.get("motion", names.get("in_python"))
+    fflin.visualize(names["robot"], motion, html=html)
+    os.chdir(DOCS)
+    return html
 
 
 if __name__ == "__main__":

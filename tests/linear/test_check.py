@@ -281,7 +281,9 @@ def test_an_accelerometer_in_free_fall_is_verified(frame):
     lin = fflin.linearize(robot)
     found = fflin.check(robot, lin)
     assert found.ok
-    assert str(found).startswith("A, B, C and D of servicer_7dof: verified, largest error")
+    assert str(found).startswith(
+        "A, B, C and D of servicer_7dof: verified, largest error"
+    )
     # An error of 1e-8 of gravity, which cancels in C, is found.
     C = lin.C.copy()
     C[1, 0] += 1e-8 * 9.81
