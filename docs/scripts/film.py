@@ -1,8 +1,8 @@
-"""Draw moving pictures of the documents: ``python docs/scripts/film.py hero`` or ``... tutorials``.
+"""Draw moving pictures: ``python docs/scripts/film.py hero`` or ``... tutorials``.
 
 ``hero`` simulates the example of the README and draws docs/hero.webp and docs/_static/hero.png.
-``tutorials`` draws docs/_static/tutorials/NAME.webp from the page that the tutorial wrote in the last
-build of the site. If a tutorial writes no page, its code is run, and its motion is shown.
+``tutorials`` draws docs/_static/tutorials/NAME.webp from the page that the tutorial wrote in the
+last build of the site. If a tutorial writes no page, its code is run, and its motion is shown.
 Needs Chromium and playwright, which the extra ``test`` installs.
 """
 
@@ -107,7 +107,7 @@ def tutorials() -> None:
 
 
 def run(source: Path, folder: Path) -> Path:
-    """Run the code of a tutorial in a folder, and return the page of its motion, or of its robot at rest."""
+    """Run the code of a tutorial, and return the page of its motion, or of its robot at rest."""
     code = re.findall(
         r"```\{code-cell\}\n(?::[^\n]*\n)*(.*?)```", source.read_text("utf-8"), re.DOTALL
     )
