@@ -5,12 +5,12 @@ import re
 import shutil
 import warnings
 from pathlib import Path
-from typing import Any
 
 from IPython import get_ipython
 from IPython.display import HTML
 
 get_ipython().run_line_magic("matplotlib", "inline")
+get_ipython().run_line_magic("config", "InlineBackend.figure_formats = ['svg']")
 # As the command line shows them, without the place in a notebook that nobody sees.
 warnings.showwarning = lambda message, category, *_: print(f"{category.__name__}: {message}")
 
@@ -29,22 +29,25 @@ def embed(page: str, height: int = 480) -> HTML:
     )
 
 
-# Shows the scene alone, and plays it again and again. Where readers prefer reduced motion, the
-# scene stays at a time at which the robot turns.
+# At the address #hero, a page shows the scene alone, and plays it again and again. Where readers
+# prefer reduced motion, the scene stays at a time at which the robot turns.
 _HERO = """<script>
-const wait = setInterval(() => {
-  if (!window.fflin || !window.fflin.ready) return;
-  clearInterval(wait);
-  fflin.plain(true, false);
-  parent.postMessage("fflin-hero", "*");
-  if (matchMedia("(prefers-reduced-motion: reduce)").matches) {
-    fflin.pause();
-    fflin.seek(8);
-    return;
-  }
-  fflin.play();
-  setInterval(() => { if (!fflin.state.playing) fflin.play(); }, 1500);
-}, 50);
+if (location.hash === "#hero") {
+  const begin = () => {
+    if (!window.fflin || !window.fflin.ready) return;
+    clearInterval(wait);
+    fflin.plain(true, false);
+    parent.postMessage("fflin-hero", "*");
+    if (matchMedia("(prefers-reduced-motion: reduce)").matches) {
+      fflin.pause();
+      fflin.seek(8);
+      return;
+    }
+    fflin.play();
+    setInterval(() => { if (!fflin.state.playing) fflin.play(); }, 1500);
+  };
+  const wait = setInterval(begin, 50);
+}
 </script>
 </body>"""
 
@@ -54,21 +57,16 @@ def hero() -> HTML:
 
     Until the scene is drawn, a picture stands in its place. A click opens the page itself.
     """
-    import fflin
-
     source = Path(__file__).parents[1] / "index.md"
     code = re.findall(r"```python\n(.*?)```", source.read_text("utf-8"), re.DOTALL)[0]
-    names: dict[str, Any] = {}
-    exec(code, names)
+    exec(code, {})
+    page = Path("motion.html")
+    page.write_text(page.read_text("utf-8").replace("</body>", _HERO), "utf-8")
     embed("motion.html")
-    page = fflin.visualize(names["robot"], names["motion"], html="hero.html", speed=8.0)
-    text = Path(str(page)).read_text("utf-8")
-    Path("hero.html").write_text(text.replace("</body>", _HERO), "utf-8")
-    embed("hero.html")
-    folder = f"pages/{os.environ['FFLIN_DOCS_PAGE']}"
+    address = f"pages/{os.environ['FFLIN_DOCS_PAGE']}/motion.html"
     return HTML(
-        f'<a class="fflin-hero" href="{folder}/motion.html" title="open the page of this motion">'
+        f'<a class="fflin-hero" href="{address}" title="open the page of this motion">'
         '<img src="_static/hero.png" alt="A satellite with an arm returns from 30 degrees">'
-        f'<iframe src="{folder}/hero.html" title="the motion of the example" tabindex="-1">'
+        f'<iframe src="{address}#hero" title="the motion of the example" tabindex="-1">'
         "</iframe></a>"
     )

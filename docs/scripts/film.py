@@ -1,4 +1,4 @@
-"""Draw moving pictures: ``python docs/scripts/film.py hero`` or ``... tutorials``.
+"""Draw moving pictures: ``python docs/scripts/film.py hero`` or ``... tutorials [NAME ...]``.
 
 ``hero`` simulates the example of the README and draws docs/hero.webp and docs/_static/hero.png.
 ``tutorials`` draws docs/_static/tutorials/NAME.webp from the page that the tutorial wrote in the
@@ -86,21 +86,24 @@ def hero() -> None:
     q0 = fflin.configuration(robot, rpy=(30, 0, 0))
     motion = fflin.simulate(robot, policy, q0=q0, duration=80.0)
     with tempfile.TemporaryDirectory() as folder:
-        html = fflin.visualize(robot, motion, html=Path(folder, "hero.html"))
+        html = fflin.visualize(robot, motion, html=Path(folder, "hero.html"), speed=8.0)
         pictures = frames(Path(html), (830, 467), 72, 1.0)
     save(pictures, DOCS / "hero.webp", 70)
     pictures[7].quantize(256).save(DOCS / "_static" / "hero.png", optimize=True)
 
 
-def tutorials() -> None:
-    """Draw a small film of each tutorial."""
+def tutorials(names: list[str]) -> None:
+    """Draw a small film of each tutorial, or only of those named."""
     target = DOCS / "_static" / "tutorials"
     target.mkdir(exist_ok=True)
     for source in sorted((DOCS / "tutorials").glob("*.md")):
-        if source.stem == "index":
+        if source.stem == "index" or (names and source.stem not in names):
             continue
         with tempfile.TemporaryDirectory() as folder:
-            written = sorted((PAGES / source.stem).glob("*.html"))
+            # A page of modes has no time.
+            written = [
+                file for file in (PAGES / source.stem).glob("*.html") if file.stem != "modes"
+            ]
             html = written[0] if written else run(source, Path(folder))
             pictures = frames(html, (416, 260), 30, 1.0)
         save(pictures, target / f"{source.stem}.webp", 55)
@@ -122,4 +125,7 @@ def run(source: Path, folder: Path) -> Path:
 
 
 if __name__ == "__main__":
-    {"hero": hero, "tutorials": tutorials}[sys.argv[1]]()
+    if sys.argv[1:] == ["hero"]:
+        hero()
+    else:
+        tutorials(sys.argv[2:])
