@@ -66,7 +66,7 @@ def hero() -> HTML:
     address = f"pages/{os.environ['FFLIN_DOCS_PAGE']}/motion.html"
     return HTML(
         f'<a class="fflin-hero" href="{address}" title="open the page of this motion">'
-        '<img src="_static/hero.png" alt="A satellite with an arm returns from 30 degrees">'
+        '<img src="_static/hero_still.webp" alt="A satellite with an arm returns from 30 degrees">'
         f'<iframe src="{address}#hero" title="the motion of the example" tabindex="-1">'
         "</iframe></a>"
     )

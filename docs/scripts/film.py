@@ -1,6 +1,6 @@
 """Draw moving pictures: ``python docs/scripts/film.py hero`` or ``... tutorials [NAME ...]``.
 
-``hero`` simulates the example of the README and draws docs/hero.webp and docs/_static/hero.png.
+``hero`` simulates the example of the README, and draws docs/hero.webp and a still picture.
 ``tutorials`` draws docs/_static/tutorials/NAME.webp from the page that the tutorial wrote in the
 last build of the site. If a tutorial writes no page, its code is run, and its motion is shown.
 Needs Chromium and playwright, which the extra ``test`` installs.
@@ -89,7 +89,7 @@ def hero() -> None:
         html = fflin.visualize(robot, motion, html=Path(folder, "hero.html"), speed=8.0)
         pictures = frames(Path(html), (830, 467), 72, 1.0)
     save(pictures, DOCS / "hero.webp", 70)
-    pictures[7].quantize(256).save(DOCS / "_static" / "hero.png", optimize=True)
+    pictures[7].save(DOCS / "_static" / "hero_still.webp", quality=82, method=6)
 
 
 def tutorials(names: list[str]) -> None:

@@ -6,11 +6,10 @@ A page that shows NAME_scene.png also gets a strip of pictures of its `motion` u
 
 import os
 import re
+import shutil
 import sys
 import tempfile
 from pathlib import Path
-
-from PIL import Image
 
 import fflin
 
@@ -28,6 +27,5 @@ for page in sys.argv[1:]:
             fflin.visualize(names["robot"], motion, png=scene, times=times, open=False)
         for picture in Path().glob("*.png"):
             if f"](../{picture})" in text:
-                # 256 colours, for a picture of a third of the size.
-                Image.open(picture).convert("RGB").quantize(256).save(DOCS / picture, optimize=True)
+                shutil.copy(picture, DOCS)
         os.chdir(DOCS)
