@@ -165,6 +165,23 @@ def test_formulas_search_and_pages_that_play_work_from_disk(site, browser):
     ), asked
 
 
+@pytest.mark.browser
+@pytest.mark.parametrize("width", [1280, 390])
+def test_the_front_page_shows_its_motion_without_panel(site, browser, width):
+    ready = "document.querySelector('.fflin-hero.drawn')"
+    address = (site / "index.html").as_uri()
+    with Watched(browser, address, ready=ready, size=(width, 900)) as watched:
+        element = watched.page.query_selector(".fflin-hero iframe")
+        frame = element.content_frame()
+        for part in ("panel", "bar"):
+            assert not frame.is_visible(f"#{part}")
+        start = frame.evaluate("fflin.state.time")
+        watched.wait(f"fflin.state.time > {start}", frame)
+        # The picture that stands there before is no taller and no wider.
+        still = watched.page.query_selector(".fflin-hero img")
+        assert still.bounding_box() == element.bounding_box()
+
+
 # Words that people type, and pages of which one must be among the first three hits.
 SOUGHT = {
     "spring": {"guide/equilibria_modes", "guide/robot_files"},

@@ -6,8 +6,14 @@ if (location.protocol === "file:" && document.getElementById("search-results")) 
   script.src = new URL("_static/excerpts.js", location.href).href;
   document.head.append(script);
   const fetched = window.fetch;
+  let make = null;
   window.fetch = async (address, ...rest) => {
     await loaded;
+    if (make === null) {
+      make = Search.makeSearchSummary;
+      // Without the place in the page, which the text does not contain.
+      Search.makeSearchSummary = (text, words) => make(text, words);
+    }
     const root = location.href.replace(/search\.html.*/, "");
     const page = decodeURI(new URL(address, root).href.replace(root, "").replace(/\.html.*/, ""));
     const text = window.FFLIN_EXCERPTS[page];
