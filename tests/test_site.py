@@ -108,6 +108,17 @@ def test_nothing_is_loaded_from_elsewhere_and_all_that_is_loaded_is_there(site, 
 
 
 @pytest.mark.process
+def test_every_picture_is_described(site, pages):
+    figures = 0
+    for path in pages:
+        for tag in re.findall(r"<img [^>]*>", path.read_text(encoding="utf-8")):
+            alt = re.search(r'alt="([^"]*)"', tag)
+            assert alt and "_images/" not in alt[1], f"{path.name}: {tag}"
+            figures += alt[1].startswith("Figure: ") and ".svg" in tag
+    assert figures > 10
+
+
+@pytest.mark.process
 def test_links_lead_somewhere(site, pages):
     for path, page in pages.items():
         for address in page.links:

@@ -7,6 +7,7 @@ in `docs/_build/executed`, beside the page's doctree, and every build copies the
 from __future__ import annotations
 
 import os
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -48,6 +49,24 @@ def announce(app: Sphinx, page: str, source: list[str]) -> None:
     os.environ["FFLIN_DOCS_PAGE"] = page
 
 
+def name_figures(
+    app: Sphinx, page: str, template: str, context: dict[str, Any], doctree: object
+) -> None:
+    """Describe each figure that a page drew by the heading above it, not by the name of a file."""
+    heading = ""
+
+    def describe(match: re.Match[str]) -> str:
+        nonlocal heading
+        if match["title"] is None:
+            return f'<img alt="Figure: {heading}"'
+        heading = re.sub(r"<[^>]*>", "", match["title"]).replace('"', "&quot;")
+        return match[0]
+
+    pattern = r'<h[1-3]>(?P<title>.*?)<a class="headerlink"|<img alt="[^"]*_images/[^"]*"'
+    if "body" in context:
+        context["body"] = re.sub(pattern, describe, context["body"])
+
+
 def deliver(app: Sphinx, error: Exception | None) -> None:
     """Copy the files of all pages into the site."""
     folder = Path(app.outdir) / "pages"
@@ -73,5 +92,6 @@ def setup(app: Sphinx) -> dict[str, Any]:
     app.connect("env-purge-doc", forget)
     app.connect("env-before-read-docs", spread)
     app.connect("source-read", announce)
+    app.connect("html-page-context", name_figures)
     app.connect("build-finished", deliver)
     return {"version": "1", "parallel_read_safe": True, "parallel_write_safe": True}
