@@ -23,6 +23,7 @@ extensions = [
     "numpydoc",
     "sphinx_copybutton",
     "executed",
+    "excerpts",
     "from_code",
     "index_terms",
     "notebooks",
@@ -61,8 +62,10 @@ toc_object_entries = False
 html_theme = "furo"
 html_title = f"fflin {release}"
 html_static_path = ["_static"]
+html_logo = "_static/logo.svg"
+html_favicon = "_static/logo.svg"
 html_css_files = ["fflin.css"]
-html_js_files = ["from_disk.js"]
+html_js_files = ["from_disk.js", "hero.js"]
 html_copy_source = False
 html_show_sphinx = False
 html_theme_options = {"navigation_with_keys": True}

@@ -5,7 +5,7 @@ import pinocchio as pin
 
 import fflin
 
-robot = fflin.load("inspector_flexible.toml", lock=["arm_*"])
+robot = fflin.load("inspector_flexible", lock=["arm_*"])
 lin = fflin.linearize(robot)
 print(fflin.modes(lin))
 

@@ -60,8 +60,10 @@ def test_the_package_and_its_citation_have_the_same_version():
     root = Path(__file__).parents[1]
     project = (root / "pyproject.toml").read_text(encoding="utf-8")
     citation = (root / "CITATION.cff").read_text(encoding="utf-8")
+    start = (root / "docs" / "start.md").read_text(encoding="utf-8")
     result = [
         re.search(r'^version = "(.*)"$', project, re.M),
         re.search(r"^version: (.*)$", citation, re.M),
+        re.search(r"^  version = \{(.*)\},$", start, re.M),
     ]
-    assert [match and match[1] for match in result] == [fflin.__version__] * 2
+    assert [match and match[1] for match in result] == [fflin.__version__] * 3

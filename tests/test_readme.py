@@ -35,6 +35,25 @@ def test_python_examples_run(tmp_path, page):
     assert "undecided" not in done.stderr
 
 
+def test_the_moving_picture_is_small_and_as_wide_as_the_readme():
+    image = pytest.importorskip("PIL.Image")
+    path, still = re.findall(r'(?:src|srcset)="([^"]+)"', README)[::-1]
+    assert (ROOT / path).stat().st_size < 2e6
+    with image.open(ROOT / path) as film, image.open(ROOT / still) as picture:
+        assert film.size == picture.size and film.width == 830
+        assert film.n_frames >= 48 and film.info["loop"] == 0
+        # The robot moves: the first and the middle picture differ at many points.
+        first = film.convert("L").histogram()
+        film.seek(film.n_frames // 2)
+        middle = film.convert("L").histogram()
+    assert first != middle
+
+
+def test_one_example_on_all_front_pages():
+    index = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
+    assert code_blocks("python", index) == code_blocks("python")
+
+
 def test_links_lead_somewhere():
     pages = [
         path
@@ -93,6 +112,10 @@ def test_two_commands_set_up_from_nothing():
             check=False,
         )
         assert done.returncode == 0 and done.stdout
+        assert not done.stderr  # no warning of the first robot that a reader meets
+    # The verdict comes first, then the matrices, which are cut.
+    assert "check" in job.split(" && ")[2]
+    assert "more columns, see -o" in done.stdout
     assert tests.endswith(".venv/bin/pytest")
 
 

@@ -110,6 +110,17 @@ def test_nothing_is_loaded_from_elsewhere_and_all_that_is_loaded_is_there(site, 
 
 
 @pytest.mark.process
+def test_every_picture_is_described(site, pages):
+    figures = 0
+    for path in pages:
+        for tag in re.findall(r"<img [^>]*>", path.read_text(encoding="utf-8")):
+            alt = re.search(r'alt="([^"]*)"', tag)
+            assert alt and "_images/" not in alt[1], f"{path.name}: {tag}"
+            figures += alt[1].startswith("Figure: ") and ".svg" in tag
+    assert figures > 10
+
+
+@pytest.mark.process
 def test_links_lead_somewhere(site, pages):
     for path, page in pages.items():
         for address in page.links:
@@ -154,6 +165,9 @@ def test_formulas_search_and_pages_that_play_work_from_disk(site, browser):
     result = "document.querySelectorAll('ul.search li').length > 5"
     with opened("search.html?q=momentum", result) as watched:
         assert "momentum_reduction" in watched.page.inner_text("ul.search")
+        watched.page.wait_for_selector("ul.search p.context")
+        excerpts = watched.page.query_selector_all("ul.search p.context")
+        assert any("momentum" in each.inner_text() for each in excerpts)
     framed = "document.querySelector('iframe.fflin-page')"
     with opened("tutorials/first_loop.html", framed) as watched:
         element = watched.page.query_selector("iframe.fflin-page")
@@ -162,6 +176,23 @@ def test_formulas_search_and_pages_that_play_work_from_disk(site, browser):
     assert all(
         url.startswith(("file:", "data:", "blob:", "about:")) for url in asked
     ), asked
+
+
+@pytest.mark.browser
+@pytest.mark.parametrize("width", [1280, 390])
+def test_the_front_page_shows_its_motion_without_panel(site, browser, width):
+    ready = "document.querySelector('.fflin-hero.drawn')"
+    address = (site / "index.html").as_uri()
+    with Watched(browser, address, ready=ready, size=(width, 900)) as watched:
+        element = watched.page.query_selector(".fflin-hero iframe")
+        frame = element.content_frame()
+        for part in ("panel", "bar"):
+            assert not frame.is_visible(f"#{part}")
+        start = frame.evaluate("fflin.state.time")
+        watched.wait(f"fflin.state.time > {start}", frame)
+        # The picture that stands there before is no taller and no wider.
+        still = watched.page.query_selector(".fflin-hero img")
+        assert still.bounding_box() == element.bounding_box()
 
 
 # Words that people type, and pages of which one must be among the first three hits.
@@ -180,6 +211,16 @@ SOUGHT = {
     "slosh": {"guide/flexible"},
     "Nastran": {"guide/flexible"},
     "Craig-Bampton": {"guide/flexible"},
+    "citation": {"start"},
+    "cite": {"start"},
+    "conda": {"start"},
+    "colab": {"start"},
+    "notebook": {"start", "tutorials/index"},
+    "install on Windows": {"start"},
+    "install on macOS": {"start"},
+    "platforms": {"start"},
+    "quaternion sign": {"conventions"},
+    "closed loop poles": {"guide/lqr_kalman"},
 }
 
 

@@ -9,6 +9,9 @@ from __future__ import annotations
 
 import os
 import re
+import subprocess
+import sys
+import tempfile
 from html import unescape
 from pathlib import Path
 from typing import Any
@@ -28,6 +31,19 @@ _STARTUP = """\
 import warnings
 
 warnings.showwarning = lambda message, category, *_: print(f"{category.__name__}: {message}")
+
+
+def drawing(figure):
+    # An SVG is sharp on every screen.
+    import io
+
+    content = io.StringIO()
+    figure.savefig(content, format="svg")
+    return content.getvalue()
+
+
+formatter = get_ipython().display_formatter.formatters["image/svg+xml"]
+formatter.for_type_by_name("fflin.base.shown_figure", "ShownFigure", drawing)
 """
 
 
@@ -88,12 +104,67 @@ def move_frames(app: Sphinx, doctree: nodes.document, page: str) -> None:
             output.rawsource = ""
 
 
+def name_figures(
+    app: Sphinx, page: str, template: str, context: dict[str, Any], doctree: object
+) -> None:
+    """Describe each figure that a page drew by the heading above it, not by the name of a file."""
+    heading = ""
+
+    def describe(match: re.Match[str]) -> str:
+        nonlocal heading
+        if match["title"] is None:
+            return f'<img alt="Figure: {heading}"'
+        heading = re.sub(r"<[^>]*>", "", match["title"]).replace('"', "&quot;")
+        return match[0]
+
+    pattern = r'<h[1-3]>(?P<title>.*?)<a class="headerlink"|<img alt="[^"]*_images/[^"]*"'
+    if "body" in context:
+        context["body"] = re.sub(pattern, describe, context["body"])
+
+
 def remove_strays(app: Sphinx, error: Exception | None) -> None:
     """Remove the files of pages that no longer exist."""
     folder = Path(app.outdir) / "pages"
     for file in folder.rglob("*.html"):
         if file.parent.relative_to(folder).as_posix() not in app.env.all_docs:
             file.unlink()
+
+
+# At the address #hero, a page shows the scene alone, and plays it again and again. Where readers
+# prefer reduced motion, the scene stays at a time at which the robot turns.
+_HERO = """<script>
+if (location.hash === "#hero") {
+  const begin = () => {
+    if (!window.fflin || !window.fflin.ready) return;
+    clearInterval(wait);
+    fflin.plain(true, false);
+    parent.postMessage("fflin-hero", "*");
+    if (matchMedia("(prefers-reduced-motion: reduce)").matches) {
+      fflin.pause();
+      fflin.seek(8);
+      return;
+    }
+    fflin.play();
+    setInterval(() => { if (!fflin.state.playing) fflin.play(); }, 1500);
+  };
+  const wait = setInterval(begin, 50);
+}
+</script>
+</body>"""
+
+
+def write_hero(app: Sphinx, error: Exception | None) -> None:
+    """Run the Python of the front page, and write the page of its motion for the front page."""
+    if error or app.builder.format != "html":
+        return
+    source = (Path(app.srcdir) / "index.md").read_text("utf-8")
+    code = re.findall(r"```python\n(.*?)```", source, re.DOTALL)[0]
+    with tempfile.TemporaryDirectory() as folder:
+        subprocess.run([sys.executable, "-c", code], cwd=folder, check=True)
+        text = (Path(folder) / "motion.html").read_text("utf-8")
+    target = Path(app.outdir) / "pages" / "index" / "motion.html"
+    target.parent.mkdir(parents=True, exist_ok=True)
+    target.write_text(text.replace("</body>", _HERO), "utf-8")
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
@@ -109,5 +180,7 @@ def setup(app: Sphinx) -> dict[str, Any]:
     app.connect("builder-inited", keep_pictures, priority=900)  # after myst_nb has chosen
     app.connect("env-before-read-docs", spread)
     app.connect("doctree-resolved", move_frames)
+    app.connect("html-page-context", name_figures)
     app.connect("build-finished", remove_strays)
+    app.connect("build-finished", write_hero)
     return {"version": "1", "parallel_read_safe": True, "parallel_write_safe": True}

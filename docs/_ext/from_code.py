@@ -124,6 +124,25 @@ def link_pages(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines:
         lines[at] = re.sub(r"docs/([\w/]+)\.md", r":doc:`/\1`", line)
 
 
+# A closed group of the reference in the navigation: its link, the button that opens it, its names.
+_GROUP = re.compile(
+    r'(<li class="toctree-l2) has-children("><a [^>]*href="[^"]*"[^>]*>[^<]*</a>)'
+    r'<input [^>]*id="toctree-checkbox-\d+"[^>]*/><label [^>]*>.*?</label><ul>\n'
+    r'(?:<li class="toctree-l3"><a [^>]*fflin\.\w+\.html">[^<]*</a></li>\n)+</ul>\n',
+)
+
+
+def fold_names(
+    app: Sphinx, page: str, template: str, context: dict[str, Any], doctree: nodes.document | None
+) -> None:
+    """Leave the names of the other groups of the reference out of the navigation of a page.
+
+    With all names in the navigation of each page, they would be a tenth of the site.
+    """
+    if tree := context.get("furo_navigation_tree"):
+        context["furo_navigation_tree"] = _GROUP.sub(r"\1\2", tree)
+
+
 def keep_template() -> None:
     """Make numpydoc compile its template once, not for every docstring."""
     kept: list[SandboxedEnvironment] = []
@@ -144,5 +163,6 @@ def setup(app: Sphinx) -> dict[str, Any]:
     app.connect("doctree-read", link_names)
     app.connect("autodoc-process-docstring", link_pages)
     app.connect("autodoc-process-signature", short_signature)
+    app.connect("html-page-context", fold_names, priority=900)  # after the theme
     app.add_directive("command-help", CommandHelp)
     return {"version": "1", "parallel_read_safe": True, "parallel_write_safe": True}

@@ -1,15 +1,16 @@
 """Redraw the pictures of pages: ``python docs/scripts/pictures.py capture uncertain_models``.
 
 Run the Python of each page of docs/guide in a temporary folder and keep the figures that it saves.
-A page that shows NAME_scene.png also gets a strip of pictures of its `motion` under this name.
+A page that shows NAME_scene.webp also gets a strip of pictures of its `motion` under this name.
 """
 
 import os
 import re
-import shutil
 import sys
 import tempfile
 from pathlib import Path
+
+from PIL import Image
 
 import fflin
 
@@ -21,11 +22,14 @@ for page in sys.argv[1:]:
         os.chdir(folder)
         names: dict = {}
         exec("\n".join(re.findall(r"```python\n(.*?)```", text, re.DOTALL)), names)
-        for scene in re.findall(r"\]\(\.\./(\w+_scene\.png)\)", text):
+        for scene in re.findall(r"\]\(\.\./(\w+_scene)\.webp\)", text):
             motion, start = names["motion"], names["motion"].starts[-1]
             times = [0.0, start, start + 5.0, motion.t[-1]]
-            fflin.visualize(names["robot"], motion, png=scene, times=times, open=False)
+            fflin.visualize(names["robot"], motion, png=f"{scene}.png", times=times, open=False)
         for picture in Path().glob("*.png"):
-            if f"](../{picture})" in text:
-                shutil.copy(picture, DOCS)
+            target = picture.with_suffix(".webp")
+            if f"](../{target})" in text:
+                # Pictures of scenes lose a little detail, figures none.
+                scene = picture.stem.endswith("_scene")
+                Image.open(picture).save(DOCS / target, lossless=not scene, quality=90, method=6)
         os.chdir(DOCS)

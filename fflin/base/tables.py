@@ -80,17 +80,20 @@ def grid(rows: Sequence[Sequence[str]], align: str = "l") -> str:
     return "\n".join(lines)
 
 
-def matrix(values: Array, rows: Sequence[str], columns: Sequence[str]) -> str:
+def matrix(
+    values: Array, rows: Sequence[str], columns: Sequence[str], rest: str | None = None
+) -> str:
     """Format a matrix with names of rows and columns; leave out rows and columns of zeros.
 
-    "~0" stands for an entry that is only a rounding error.
+    "~0" stands for an entry that is only a rounding error. Columns that do not fit into the
+    terminal's width follow below. If `rest` is given, they are left out, and `rest` says where they
+    are.
     """
     text = [
         [_number(x, below) for x, below in zip(row, limits, strict=True)]
         for row, limits in zip(values.tolist(), rounding(values).tolist(), strict=True)
     ]
-    # Columns that do not fit into the terminal's width follow below, in blocks that omit rows of
-    # zeros.
+    # The columns in blocks that fit into the terminal's width. A block omits rows of zeros.
     label = max(map(len, rows))
     used = 0
     folds: list[list[int]] = []
@@ -103,11 +106,14 @@ def matrix(values: Array, rows: Sequence[str], columns: Sequence[str]) -> str:
             used = label
         folds[-1].append(j)
         used += size
+    left = sum(map(len, folds[1:]))
     blocks = []
-    for fold in folds:
+    for fold in folds[:1] if rest else folds:
         shown = [i for i in range(len(rows)) if values[i, fold].any()]
         body = [[rows[i], *(text[i][j] for j in fold)] for i in shown]
         blocks.append(grid(cut([["", *(columns[j] for j in fold)], *body])))
+    if rest and left:
+        blocks.append(f"... and {counted(left, 'more column')}, {rest}")
     return "\n\n".join(blocks)
 
 

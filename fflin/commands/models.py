@@ -268,7 +268,7 @@ def model_report(lin: fflin.LinearModel) -> str:
         text = f"{title} ({len(rows)} x {len(columns)})"
         if values.any():
             text += "; rows and columns of zeros are not shown\n\n"
-            text += matrix(values, rows, columns)
+            text += matrix(values, rows, columns, "see -o")
         else:
             text += " is zero"
         parts.append(text)

@@ -16,6 +16,7 @@ from fflin.base.validation import (
     looks_like_degrees,
     numbers,
     placement,
+    shaped,
 )
 from fflin.dynamics.state import Actuation, StateMap
 from fflin.robot.fields import input_limits, limits_of, travel_of, warn_of_degrees
@@ -31,7 +32,11 @@ LIMIT_SLACK = 1e-9
 
 
 def configuration(
-    robot: Robot, joints: Mapping[str, float] | None = None, base: pin.SE3 | None = None
+    robot: Robot,
+    joints: Mapping[str, float] | None = None,
+    base: pin.SE3 | None = None,
+    *,
+    rpy: ArrayLike | None = None,
 ) -> Array:
     """Return the Pinocchio configuration for joint values given by name and a base placement.
 
@@ -43,6 +48,9 @@ def configuration(
         neutral positions. A name may be a pattern such as ``hinge_*``.
     base : pin.SE3, optional
         Placement of the base in the world; the identity by default.
+    rpy : array_like (3,), optional
+        Roll, pitch and yaw [deg] of the base about fixed axes, with the base at the origin. It
+        takes the place of `base`.
 
     Returns
     -------
@@ -53,7 +61,8 @@ def configuration(
     UnknownNameError
         If a name or pattern in `joints` matches no joint.
     InputError
-        If a value is not a finite number, or a named joint is a mimic joint.
+        If a value is not a finite number, a named joint is a mimic joint, or both `base` and `rpy`
+        are given.
 
     Warns
     -----
@@ -68,9 +77,18 @@ def configuration(
     array([0.        , 0.        , 0.        , 0.        , 0.        ,
            0.        , 1.        , 1.        , 0.        , 0.92106099,
            0.38941834, 1.        , 0.        ])
+
+    The base rotated by 30 deg about x has the quaternion (sin 15 deg, 0, 0, cos 15 deg):
+
+    >>> fflin.configuration(robot, rpy=(30, 0, 0))[3:7].round(4)
+    array([0.2588, 0.    , 0.    , 0.9659])
     """
     instance("robot", robot, Robot, "a fflin.Robot")
     q = pin.neutral(robot.model)
+    if rpy is not None:
+        if base is not None:
+            raise InputError("base and rpy are both given; give one of them")
+        base = base_of({"rpy": shaped("rpy", rpy, (3,), " [deg]")})
     if base is not None:
         root = robot.model.jointPlacements[ROOT]
         q[:7] = pin.SE3ToXYZQUAT(root.actInv(placement("base", base)))

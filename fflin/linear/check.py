@@ -57,6 +57,8 @@ class Check(html.Reported):
         One row per comparison of a block of A, B, C or D, with its error and tolerance.
     title : str
         Description of the checked model.
+    robot : str
+        Name of the robot.
 
     Examples
     --------
@@ -68,6 +70,7 @@ class Check(html.Reported):
 
     rows: tuple[Row, ...]
     title: str
+    robot: str
 
     @property
     def ok(self) -> bool:
@@ -129,7 +132,8 @@ class Check(html.Reported):
             return f"{', '.join(names)} {verb} not verified: {count}"
         largest = max(self.rows, key=lambda row: row.error)
         error_text = f"{largest.error:.1e} (allowed {largest.tolerance:.1e})"
-        return f"{self._verified} are verified: largest error {error_text}"
+        matrices = f"{self._verified} of {self.robot}"
+        return f"{matrices}: verified, largest error {error_text}"
 
     def _table(self) -> list[list[str]]:
         """Return a table with the largest error of each kind of comparison."""
@@ -218,7 +222,7 @@ def check_all(
             title = f"{robot.name}, frame {lin.frame}, scaled cond(M) {condition:.1e}"
     if tolerance is not None:
         title += f", each error at most {tolerance:.1e}"
-    return Check(tuple(largest.values()), title)
+    return Check(tuple(largest.values()), title, robot.name)
 
 
 def _comparisons(robot: Robot, lin: LinearModel) -> Iterator[Row]:

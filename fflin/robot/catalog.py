@@ -32,8 +32,15 @@ def bundled_directory() -> Path:
 
 @cache
 def _bundled() -> dict[str, RobotFile]:
-    paths = sorted(bundled_directory().glob("*.urdf"))
-    return {path.stem: RobotFile(path.stem, path, "fflin") for path in paths}
+    folder = bundled_directory()
+    paths = {path.stem: path for path in folder.glob("*.urdf")}
+    # A robot file of another name than its URDF, such as inspector_flexible.toml, is a robot of its
+    # own. The file inspector.toml shares its name with a URDF, which `load("inspector")` reads.
+    for path in folder.glob("*.toml"):
+        paths.setdefault(path.stem, path)
+    return {
+        name: RobotFile(name, path, "fflin") for name, path in sorted(paths.items())
+    }
 
 
 @cache
@@ -75,9 +82,9 @@ def list_robots() -> tuple[str, ...]:
 def find_robot(robot: str | Path, folder: str | Path = "") -> RobotFile:
     """Find a robot by its name, or by the path of its file; a relative path starts at `folder`.
 
-    The name of a bundled URDF takes precedence over a path, and the path of a file over a name in
-    example-robot-data. The name of a bundled TOML file, such as "inspector.toml", is used only if
-    no file has this path.
+    The name of a bundled robot takes precedence over a path, and the path of a file over a name in
+    example-robot-data. The name of a bundled TOML file with its ending, such as "inspector.toml",
+    is used only if no file has this path.
     """
     instance("robot", robot, (str, os.PathLike), "a robot name or a path")
     if isinstance(robot, str) and robot in _bundled():

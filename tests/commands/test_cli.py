@@ -104,6 +104,18 @@ def test_round_off_is_not_shown_as_figures():
     ]
 
 
+def test_a_cut_matrix_shows_the_columns_that_fit_and_counts_the_others():
+    names = [f"input_{j:04d}" for j in range(20)]
+    whole = matrix(np.ones((2, 20)), ["a", "b"], names)
+    text = matrix(np.ones((2, 20)), ["a", "b"], names, "see -o")
+    # A column takes 12 characters, and 6 columns fit beside the name of the row into 80.
+    assert all(name in whole for name in names)
+    assert [name for name in names if name in text] == names[:6]
+    assert text.endswith("\n\n... and 14 more columns, see -o")
+    few = matrix(np.ones((2, 6)), ["a", "b"], names[:6], "see -o")
+    assert few == matrix(np.ones((2, 6)), ["a", "b"], names[:6])
+
+
 def test_linearize_prints_readable_tables():
     code, out, err = run("linearize", "ets_vii", "--joint", "joint_2=0.5")
     assert code == 0 and not err
@@ -401,7 +413,7 @@ def test_negative_numbers_are_not_options():
     code, out, _ = run(
         "check", "cubesat", "--rpy", "-30", "-1e-3", "0", "--position", "-.5", 0, 0
     )
-    assert code == 0 and "A and B are verified" in out
+    assert code == 0 and "A and B of cubesat: verified" in out
 
 
 def test_passive_joints_and_gravity(tmp_path):
@@ -436,7 +448,7 @@ def test_passive_joints_and_gravity(tmp_path):
         "tau_m.joint_1=2",
     )
     code, out, _ = run("check", "planar_detumble", *options)
-    assert code == 0 and "A and B are verified" in out
+    assert code == 0 and "A and B of planar_detumble: verified" in out
 
 
 def test_inputs_and_outputs_match_python(tmp_path):
@@ -461,7 +473,7 @@ def test_inputs_and_outputs_match_python(tmp_path):
         saved.input_names == lin.input_names and saved.output_names == lin.output_names
     )
     code, out, _ = run("check", "servicer_7dof", *options)
-    assert code == 0 and "A and B are verified" in out
+    assert code == 0 and "A and B of servicer_7dof: verified" in out
 
 
 def test_output_and_output_file_are_distinguished(tmp_path):

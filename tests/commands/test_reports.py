@@ -16,7 +16,7 @@ ROBOTS = ("planar_detumble", "ets_vii", "servicer_7dof", "inspector", "canadarm2
 COMMANDS = {
     "info": ((), r"\d+ joints, \d+ states"),
     "linearize": ((), r"\d+ states, \d+ inputs"),
-    "check": ((), r"A and B are verified: largest error \S+ \(allowed"),
+    "check": ((), r"A and B of \w+: verified, largest error \S+ \(allowed"),
     "analyze": ((), "controllable"),
     "modes": ((), r"\d+ rigid-body modes"),
     "lqr": ((), r"\d+ poles, slowest decay \S+ 1/s, smallest damping ratio"),
@@ -53,7 +53,7 @@ def test_a_report_is_read_at_a_glance(robot, command, tmp_path, brief_validity):
 # Those of a trajectory, in the order that each needs, and those of many runs.
 CHAIN = {
     "linearize": (("--trajectory", "plan.npz"), r"\d+ knots, 0 to 0.5 s"),
-    "check": (("--trajectory", "plan.npz"), "A and B are verified: largest error"),
+    "check": (("--trajectory", "plan.npz"), r"A and B of \w+: verified, largest error"),
     "tvlqr": (("--trajectory", "plan.npz", "-o", "gains.npz"), r"knots=\d+"),
     "funnel": (
         (

@@ -66,7 +66,7 @@ def test_the_chain_goes_from_a_file_to_gains(flown):
     code, out, err = run("check", *mat, "--plot", folder / "check.png")
     assert (code, err) == (0, "")
     assert (folder / "check.png").stat().st_size
-    assert "A and B are verified" in out
+    assert "A and B of planar_detumble: verified" in out
 
     weights = ("--bryson", "q_b=0.05", "--bryson", "tau_m=0.5", "--qf", "q_b=9")
     code, out, err = run(

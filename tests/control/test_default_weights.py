@@ -13,11 +13,10 @@ import fflin
 from fflin.control.default_weights import BANDWIDTH, _damping, displacements
 from fflin.control.gain import cautions
 from fflin.dynamics.state import StateMap
-from fflin.robot.catalog import find_robot
 from tests.support.messages import says
 from tests.support.patience import finished
+from tests.support.robots import BUNDLED
 
-BUNDLED = [n for n in fflin.list_robots() if find_robot(n).origin == "fflin"]
 # Arms, legs, hands, rotorcraft; limits that are zero, infinite, absurd or slow (pr2's torso).
 OTHERS = (
     *("a1", "anymal_kinova", "asr_twodof", "b1", "baxter", "borinot", "bravo7_no_ee"),

@@ -35,6 +35,22 @@ def test_round_trip_is_the_identity(robots, name, frame, degrees):
         assert np.abs(turns - np.round(turns)).max() < 1e-14 * max(1, np.abs(x).max())
 
 
+def test_roll_pitch_and_yaw_are_degrees_about_fixed_axes():
+    robot = fflin.load("planar_detumble")
+    angles = np.array([30.0, -20.0, 70.0])
+    roll, pitch, yaw = np.diag(np.deg2rad(angles))
+    rotation = pin.exp3(yaw) @ pin.exp3(pitch) @ pin.exp3(roll)
+    base = pin.SE3(rotation, np.zeros(3))
+    joints = {"joint_1": 0.4}
+    q = fflin.configuration(robot, joints, rpy=angles)
+    # Unit quaternions: a few roundings of one.
+    assert np.abs(q - fflin.configuration(robot, joints, base)).max() < 1e-15
+    with pytest.raises(fflin.InputError, match="base and rpy"):
+        fflin.configuration(robot, base=base, rpy=angles)
+    with pytest.raises(fflin.InputError, match="rpy has shape"):
+        fflin.configuration(robot, rpy=(30.0, 0.0))
+
+
 def test_default_reference_gives_the_inertial_attitude_and_position():
     robot = fflin.load("cubesat")
     pose = random_pose(np.random.default_rng(2), 70.0)

@@ -183,7 +183,7 @@ def test_report_fits_80_columns():
     text = str(fflin.check(robot, fflin.linearize(robot)))
     assert max(map(len, text.splitlines())) <= 80
     assert (
-        text.startswith("A and B are verified: largest error")
+        text.startswith("A and B of tiago_dual: verified, largest error")
         and "123 comparisons" in text
     )
 
@@ -303,7 +303,9 @@ def test_an_accelerometer_in_free_fall_is_verified(frame):
     lin = fflin.linearize(robot)
     result = fflin.check(robot, lin)
     assert result.ok
-    assert str(result).startswith("A, B, C and D are verified: largest error")
+    assert str(result).startswith(
+        "A, B, C and D of servicer_7dof: verified, largest error"
+    )
     # An error of 1e-8 of gravity, which cancels in C, is found.
     C = lin.C.copy()
     C[1, 0] += 1e-8 * 9.81

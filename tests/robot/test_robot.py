@@ -25,11 +25,27 @@ def free_flyer(*joints):
 
 
 def test_bundled_names_come_first():
-    assert set(BUNDLED) == {
-        *("astrobee_arm", "canadarm2", "cubesat", "dual_arm"),
-        *("ets_vii", "inspector", "planar_detumble", "servicer_7dof"),
-    }
-    assert fflin.list_robots()[: len(BUNDLED)] == BUNDLED
+    names = (
+        *("astrobee_arm", "canadarm2", "cubesat", "dual_arm", "ets_vii"),
+        *("inspector", "inspector_flexible", "planar_detumble", "servicer_7dof"),
+    )
+    assert fflin.list_robots()[: len(names)] == names
+    assert set(names) - set(BUNDLED) == {"inspector_flexible"}
+
+
+def test_a_bundled_robot_file_loads_by_its_name():
+    robot = fflin.load("inspector_flexible")
+    assert robot.name == "inspector_flexible"
+    assert len(robot.modes) == 6
+
+
+def test_a_urdf_has_the_name_before_a_robot_file():
+    # inspector.toml has springs at its hinges, and the URDF has none.
+    assert not fflin.load("inspector").stiffness
+    assert fflin.load("inspector.toml").stiffness
+
+
+def test_list_of_robots_ends_with_example_robot_data():
     assert "talos" in fflin.list_robots()
 
 

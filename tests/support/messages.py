@@ -34,6 +34,8 @@ VARIES = [
     (re.escape(str(Path.home())), "HOME"),
     (r"[\d.,]+ [kMGTP]B\b", "SIZE"),
     (r"tcp://[\d.]+:\d+", "ADDRESS"),
+    # The name of the robot, and the place at which the line is folded.
+    (r"A and B of \w+: verified, .*", "A and B of ROBOT: verified, RESIDUAL"),
     (r"\(choose from [^)]*\)", "(choose from CHOICES)"),
     # Texts of NumPy, and lists of SciPy's distributions, which depend on their versions.
     (r"\((This file contains|Cannot load file containing) pickled.*", "(PICKLED)"),

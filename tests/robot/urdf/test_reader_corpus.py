@@ -70,7 +70,7 @@ def test_corpus(case, tmp_path, command_of):
         assert len(lines) == 1 and lines[0].startswith("fflin: error: "), result.err
     else:
         assert result.code == 0, result.err
-        assert re.search(r"^check: A and B are verified", result.out, re.MULTILINE)
+        assert re.search(r"^check: A and B of .*: verified", result.out, re.MULTILINE)
         assert all(line.startswith("fflin: warning: ") for line in lines), result.err
         assert len(lines) == (case.expected == WARN), result.err
     for word in case.words:
