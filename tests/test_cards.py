@@ -144,7 +144,7 @@ def test_entries_that_are_rounding_errors_stay_blank():
 def test_verdicts_are_green_or_red(results, robot):
     check = results["Check"]
     kinds = dict(Parsed(check._repr_html_()).verdicts)
-    assert "are verified" in kinds["good"]
+    assert "verified, largest error" in kinds["good"]
     lin = fflin.linearize(robot)
     wrong = copy.copy(lin)
     vars(wrong)["B"] = 1.001 * lin.B
