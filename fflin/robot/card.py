@@ -13,7 +13,7 @@ from fflin.base import html, svg
 from fflin.base.html import escape
 from fflin.base.validation import Array
 from fflin.robot.fields import limits_of
-from fflin.robot.inputs import Input
+from fflin.robot.inputs import Input, JointTorque
 from fflin.robot.joints import ROOT
 from fflin.robot.mass_properties import equivalent_box
 from fflin.robot.summary import LIMIT_UNITS, joint_table
@@ -60,7 +60,9 @@ def _input_table(robot: Robot) -> list[list[str]]:
 
 def _place(item: Input) -> str:
     """Return the name of the frame or joint on which an input acts."""
-    return getattr(item, "frame", None) or getattr(item, "joint", None) or "base"
+    if isinstance(item, JointTorque):
+        return item.joint
+    return ", ".join(item.frames) or "base"
 
 
 def thumbnail(robot: Robot) -> str:
