@@ -34,6 +34,7 @@ ENGINES = ("python", "compiled")
 # {name of a kernel function that Python calls: description of this function in messages}.
 _COMPILED = {
     "advance": "the loop that simulates eight runs at a time",
+    "advance_one": "the loop that simulates one run",
     "derive": "the batch kernel",
     "take": "the run statistics",
 }

@@ -243,6 +243,7 @@ ARGUMENTS = Struct(
     stop=STOP_CONDITIONS,
     point=POINT,
 )
+ARGUMENTS_OF_ONE = ARGUMENTS.with_one_lane()
 
 
 def _combine(shares, row, rates, out):
@@ -293,9 +294,22 @@ def _move(robot, method, point, stage):
 
 
 def advance(words, clock, last, every, rows, work):
-    """Advance eight runs to the step `last`, or until one of the runs meets a stop condition.
+    """Advance eight runs; `words` are the 64-bit words of `ARGUMENTS`, see `_advance`."""
+    _advance(ARGUMENTS(words), clock, last, every, rows, work)
 
-    `words` are the 64-bit words of `Arguments`, see `kernel.tree`. The function updates the point,
+
+def advance_one(words, clock, last, every, rows, work):
+    """Advance one run; `words` are the words of `ARGUMENTS_OF_ONE`, see `_advance`.
+
+    A single run would be slower in eight equal lanes.
+    """
+    _advance(ARGUMENTS_OF_ONE(words), clock, last, every, rows, work)
+
+
+def _advance(arguments, clock, last, every, rows, work):
+    """Advance all runs to the step `last`, or until one of the runs meets a stop condition.
+
+    The function updates the point,
     the momentum reference, the state of the policy and the state of the channel. clock (1,) is the
     number of finished steps. Before step 0, the initial momentum and centre of mass are written
     into the momentum reference.
@@ -304,7 +318,6 @@ def advance(words, clock, last, every, rows, work):
     `every`. A row consists of q, nu, u, the reference momentum (6,) and the reference centre of
     mass (3,). `work` has `WorkOffsets.size` entries.
     """
-    arguments = ARGUMENTS(words)
     robot = arguments.robot
     method = arguments.method
     law = arguments.law

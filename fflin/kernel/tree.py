@@ -35,26 +35,32 @@ def address_of(array: NDArray[np.generic]) -> int:
     return address
 
 
-def work_space(size: int) -> Array:
-    """Return an uninitialised array (size, LANES)."""
-    space = np.empty((size + 1) * LANES)
-    # An entry consists of eight doubles, which have 64 bytes. Access is faster if the address of
-    # each entry is a multiple of 64 bytes.
+def work_space(size: int, lanes: int = LANES) -> Array:
+    """Return an uninitialised array (size, lanes)."""
+    space = np.empty(size * lanes + LANES)
+    # An entry with eight lanes consists of eight doubles, which have 64 bytes. Access is faster if
+    # the address of each entry is a multiple of 64 bytes.
     first = -(address_of(space) // 8) % LANES
-    return space[first : first + size * LANES].reshape(size, LANES)
+    return space[first : first + size * lanes].reshape(size, lanes)
 
 
 class Kind(NamedTuple):
-    """Type of a field: a number if `axes` is 0, else a C-contiguous array with `axes` axes."""
+    """Type of a field: a number if `axes` is 0, else a C-contiguous array with `axes` axes.
+
+    If `lanes` is not 0, the array has a further axis of this length in Python.
+    """
 
     dtype: type[np.generic]
     axes: int = 0
+    lanes: int = 0
 
 
 WHOLE, REAL, FLAG = Kind(np.intp), Kind(np.float64), Kind(np.bool_)
 INDICES, REALS, FLAGS = Kind(np.intp, 1), Kind(np.float64, 1), Kind(np.bool_, 1)
-# Array of doubles with one column per lane.
-LANED = Kind(np.float64, 2)
+# Array of doubles with one column per lane. Compiled code sees a single lane as an array of
+# numbers, which has one axis.
+LANED = Kind(np.float64, 2, LANES)
+ONE_LANE = Kind(np.float64, 1, 1)
 
 T_co = TypeVar("T_co", bound=NamedTuple, covariant=True)
 T = TypeVar("T", bound=NamedTuple)
@@ -87,6 +93,20 @@ class Struct(Generic[T_co]):
         self.places = dict(zip(self.kinds, ends, strict=False))
         self.size: int = ends[-1]
         self.name = f"Struct({made.__name__})"
+
+    def with_one_lane(self) -> Struct[T_co]:
+        """Return the same struct, but with a single lane in every array with lanes."""
+        kinds: dict[str, Kind | Struct[NamedTuple]] = {}
+        for field, kind in self.kinds.items():
+            if isinstance(kind, Struct):
+                kinds[field] = kind.with_one_lane()
+            else:
+                kinds[field] = ONE_LANE if kind == LANED else kind
+        if kinds == self.kinds:
+            return self
+        struct = Struct(self.made, REALS, None, **kinds)
+        struct.name = f"Struct({self.made.__name__}, one lane)"
+        return struct
 
     def __call__(self, words: T) -> T:
         """Return a named tuple unchanged. In compiled code, `opener` replaces this method."""
@@ -137,13 +157,15 @@ def _lay_out(
             parts.append(_lay_out(part, field_kind, words, fresh))
         elif field_kind.axes:
             array = np.ascontiguousarray(part, field_kind.dtype)
-            if field_kind == LANED:
-                column, array = array.reshape(-1, 1).copy(), work_space(len(array))
+            if field_kind.lanes:
+                column = array.reshape(-1, 1).copy()
+                array = work_space(len(array), field_kind.lanes)
                 array[:] = column
                 fresh.append((array, column))
-            assert array.ndim == field_kind.axes
+            else:
+                assert array.ndim == field_kind.axes
             parts.append(array)
-            words += (address_of(array), *array.shape)
+            words += (address_of(array), *array.shape[: field_kind.axes])
         else:
             number = field_kind.dtype(part).item()
             parts.append(number)

@@ -60,7 +60,9 @@ def engine_of(engine: object, plan: Plan, *, many: bool = False) -> str:
     """
     if not compiles(engine, lambda: not_compilable(plan)):
         return "python"
-    wanted = engine or many or (plan.times.steps > LONG and is_kept("loop", "advance"))
+    wanted = (
+        engine or many or (plan.times.steps > LONG and is_kept("loop", "advance_one"))
+    )
     if wanted:
         return "compiled"
     return "python"
@@ -187,15 +189,20 @@ class Statistics:
 
 
 class LaneLoop:
-    """The compiled loop for a plan, with memory for eight runs; each thread needs its own loop.
+    """The compiled loop for a plan, with memory for its lanes; each thread needs its own loop.
+
+    `lanes` is the number of runs at a time: eight, or one for a single run.
 
     `parts` are the arguments of the loop, with one lane per run. A recorded row consists of q, nu,
     u, momentum and centre of mass. For each of these five vectors, `ends` (5,) contains the column
     after its last entry.
     """
 
-    def __init__(self, plan: Plan, runs: Runs | None = None) -> None:
+    def __init__(
+        self, plan: Plan, runs: Runs | None = None, *, lanes: int = LANES
+    ) -> None:
         runs = runs or {}
+        self.lanes = lanes
         if "delay" in runs:  # provide space for the largest delay
             plan = plan.replace(
                 times=plan.times._replace(delay=int(runs["delay"].max()))
@@ -210,9 +217,14 @@ class LaneLoop:
         self._noisy = len(parts.law.added) > len(parts.law.y)
         # `_fresh` contains a pair for each array with lanes: the array, and the column of initial
         # values that is copied to all lanes.
-        self.parts, self._words, self._fresh = laid_out(parts, loop.ARGUMENTS)
-        self._work = work_space(self.parts.robot.tree.offsets.size)
-        self._advance = kernel("loop", "advance")
+        arguments = loop.ARGUMENTS
+        name = "advance"
+        if lanes == 1:
+            arguments = loop.ARGUMENTS_OF_ONE
+            name = "advance_one"
+        self.parts, self._words, self._fresh = laid_out(parts, arguments)
+        self._work = self._space(self.parts.robot.tree.offsets.size)
+        self._advance = kernel("loop", name)
         robot, point = self.parts.robot, self.parts.point
         self.ends = np.cumsum([len(point.q), len(point.nu), len(point.u), 6, 3])
         self.width = int(self.ends[-1])
@@ -220,12 +232,19 @@ class LaneLoop:
         self._of_run = {"q": point.q, "nu": point.nu, "delay": self.parts.channel.delay}
         self._of_run |= robot.tree._asdict() | robot.faults._asdict()
 
+    def _space(self, size: int) -> Array:
+        """Return work space for the compiled code, which sees one lane as one axis."""
+        space = work_space(size, self.lanes)
+        if self.lanes == 1:
+            space = space[:, 0]
+        return space
+
     # A diverging motion may overflow before it is stopped, so NumPy's warnings are suppressed.
     @np.errstate(over="ignore", invalid="ignore")
     def fly(
         self, statistics: Statistics, out: Runs, runs: Runs | None = None
     ) -> list[str]:
-        """Simulate up to eight runs; return why each run ended early, or an empty text.
+        """Simulate at most one run per lane; return why each run ended early, or an empty text.
 
         `runs` contains the values that differ between the runs. Without `runs`, the plan itself is
         simulated. Row i of each array in `out` receives the outcome of run i. If
@@ -234,11 +253,12 @@ class LaneLoop:
         times, every, point = self._plan.times, statistics.every, self.parts.point
         steps = times.steps
         count = len(next(iter(out.values()))) if out else 1
-        of_lane = np.minimum(np.arange(LANES), count - 1)
+        of_lane = np.minimum(np.arange(self.lanes), count - 1)
         sense = self._begin(runs or {}, of_lane)
         statistics.reset()
-        most = max(1, min(-(-steps // every), _MEMORY // (8 * LANES * self.width)))
-        space = work_space(most * self.width)
+        row_size = 8 * self.lanes * self.width  # [bytes]
+        most = max(1, min(-(-steps // every), _MEMORY // row_size))
+        space = self._space(most * self.width)
         # The steps are divided into slices. A slice of `most * every` steps contains exactly `most`
         # recorded steps, whichever step comes first. These rows fit into `space`.
         span = min(most * every, statistics.span)
@@ -255,7 +275,8 @@ class LaneLoop:
                 self._advance(self._words, clock, last, every, space, self._work)
                 self.done = done = int(clock[0])
                 if kept := -(-done // every) - -(-first // every):
-                    rows = space[: kept * self.width].reshape(kept, self.width, LANES)
+                    rows = space[: kept * self.width]
+                    rows = rows.reshape(kept, self.width, self.lanes)
                     statistics.add(first, rows)
                 bar(done, steps)
                 v = self._state.spread(point.nu.T)
@@ -285,7 +306,7 @@ class LaneLoop:
     def _begin(self, runs: Runs, of_lane: Indices) -> Callable[[int, int], None]:
         """Write the initial values of all runs; return a function that writes sensor noise.
 
-        `of_lane` (LANES,) contains the index of the run in each lane. The returned function must be
+        `of_lane` (lanes,) contains the index of the run in each lane. The returned function must be
         called before each slice of steps. Its arguments are the first step of the slice and the
         step after the last one.
         """
@@ -301,8 +322,8 @@ class LaneLoop:
         self.done = 0
         law = self.parts.law
         size = len(self.parts.law.y)
-        rows = law.added.reshape(len(law.added) // max(size, 1), size, LANES)
-        nothing = np.zeros((LANES, size))
+        rows = law.added.reshape(len(law.added) // max(size, 1), size, self.lanes)
+        nothing = np.zeros((self.lanes, size))
         bias, deviation = (
             runs.get(key, nothing)[of_lane].T for key in ("sensed", "noise")
         )
@@ -365,7 +386,8 @@ def recorded(plan: Plan, runs: Runs | None = None) -> Recording:
     """Simulate a plan with the compiled loop; `runs` contains the values of one dispersed run."""
     every = plan.times.every
     dt = plan.times.dt
-    loop = LaneLoop(plan, runs)
+    # A replayed run of a campaign is computed with the machine code of the campaign.
+    loop = LaneLoop(plan, runs, lanes=LANES if runs else 1)
     rows = LaneRows(plan.times, loop.width)
     try:
         [stopped] = loop.fly(rows, {}, runs)

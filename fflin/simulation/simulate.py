@@ -264,7 +264,7 @@ def simulate(
         run = recorded(plan) if compiled else go(plan, hint)
         if hint and (spent := perf_counter() - began) > LONG_RUN:
             once = ""
-            if not is_kept("loop", "advance"):
+            if not is_kept("loop", "advance_one"):
                 once = f", and {_COMPILING:g} s once to compile"
             message = "the simulation took %.0f s in Python; engine='compiled' (--engine compiled)"
             _log.warning(
