@@ -11,9 +11,17 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from fflin.base.errors import InputError
+from fflin.base.html import Reported
 from fflin.base.process import in_one_thread
 from fflin.base.tables import cut, folded, grid
-from fflin.base.validation import Array, Result, Values, instance, number, positive
+from fflin.base.validation import (
+    Array,
+    FrozenArrays,
+    Values,
+    instance,
+    number,
+    positive,
+)
 from fflin.control.gain import Gain
 from fflin.control.optimal.disk import Loop, largest_structured_gain
 from fflin.control.optimal.largest_gain import largest_gain
@@ -83,7 +91,7 @@ class ChannelMargins(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Margins(Result):
+class Margins(FrozenArrays, Reported):
     r"""Margins of a linear loop for changes in each channel, and in all channels at once.
 
     The signal of each channel is multiplied by a complex factor
@@ -138,9 +146,6 @@ class Margins(Result):
     robot: str
     dt: float
     delay: float
-
-    def __repr__(self) -> str:
-        return str(self)
 
     def __str__(self) -> str:
         where = self.at

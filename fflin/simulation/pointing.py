@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from fflin.base.errors import InputError
+from fflin.base.html import Reported
 from fflin.base.tables import folded, grid
 from fflin.base.validation import (
     Array,
     ArrayLike,
+    FrozenArrays,
     Mask,
-    Result,
     number,
     positive,
     vector,
@@ -67,7 +68,7 @@ class PointingError(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Pointing(Result):
+class Pointing(FrozenArrays, Reported):
     """Pointing errors of a motion from its target, in the terms of ECSS-E-ST-60-10C.
 
     All errors are in deg, and counted from the time `after` on.
@@ -127,9 +128,6 @@ class Pointing(Result):
     torque_used: dict[str, float]
     firings: Firings | None
     robot: str
-
-    def __repr__(self) -> str:
-        return str(self)
 
     def __str__(self) -> str:
         head = [

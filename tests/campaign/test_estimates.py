@@ -49,6 +49,7 @@ def loop_of(robot):
     return lin, gain, fflin.StateFeedback(lin, gain.K)
 
 
+@pytest.mark.exhaustive
 def test_a_campaign_and_validity_estimate_their_duration(clock):
     robot = fflin.load("cubesat")
     lin, gain, policy = loop_of(robot)

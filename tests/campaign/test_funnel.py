@@ -139,6 +139,7 @@ def test_a_narrower_goal_is_a_narrower_funnel(still, schedule):
     assert weak.rho[0] < strong.rho[0]
 
 
+@pytest.mark.exhaustive
 def test_confidence_intervals_have_their_stated_coverage(still, schedule):
     """The share inside that succeeds at least, over many funnels of the linear loop."""
     goal, rng = 1e-8, np.random.default_rng(1)
@@ -244,6 +245,7 @@ def test_sizes_and_contains(arm, found):
             found.contains(*arguments)
 
 
+@pytest.mark.exhaustive
 def test_it_prints_saves_and_is_drawn(arm, found, tmp_path):
     assert max(map(len, str(found).splitlines())) <= 80 and says(
         str(found), "95 % confidence"

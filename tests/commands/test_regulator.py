@@ -185,6 +185,7 @@ def test_thrusters_that_are_to_pull_are_warned_of_where_they_are_designed_with(c
         assert (code, err) == (0, "") and "negative thrust" not in out
 
 
+@pytest.mark.exhaustive
 def test_the_loop_that_lqr_reports_is_the_loop_that_is_simulated(capsys, tmp_path):
     path, other = tmp_path / "gain.npz", tmp_path / "thrusts.npz"
     robot = ("cubesat", "--inputs", "cubesat")

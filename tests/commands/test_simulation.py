@@ -205,6 +205,7 @@ def interrupted(monkeypatch):
     )
 
 
+@pytest.mark.exhaustive
 def test_a_run_that_is_interrupted_takes_no_earlier_files_place(
     tmp_path, interrupted, capsys
 ):

@@ -15,6 +15,7 @@ from tests.support.patience import in_own_session
 pytest.importorskip("h5py")
 
 
+@pytest.mark.exhaustive
 def test_grid_random_and_file_say_the_same(tmp_path, robots):
     robot = robots["ets_vii"]
     code, out, err = run(

@@ -41,6 +41,7 @@ def flown(tmp_path_factory):
     return folder, robot, motion.trajectory()
 
 
+@pytest.mark.exhaustive
 def test_the_chain_goes_from_a_file_to_gains(flown):
     folder, robot, motion = flown
     given = (

@@ -39,6 +39,7 @@ def test_mass_properties_match_the_bodies_in_base_axes():
     np.testing.assert_allclose(inertia, total.inertia, rtol=1e-12, atol=1e-9)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("m", [3, 6])
 def test_the_least_reach_matches_linear_programs(m):
     rng = np.random.default_rng(m)

@@ -165,6 +165,7 @@ def test_loops_of_a_turn_and_a_slide_reach_an_attitude_within_limits(polar, degr
     assert joints[-1] == pytest.approx(loops.path[0], abs=1e-12)
 
 
+@pytest.mark.exhaustive
 def test_more_circles_reach_an_attitude_that_one_circle_cannot(polar):
     start = fflin.configuration(polar, {"slide": 0.6})
     target = pin.exp3(np.deg2rad(20.0) * np.array([0.0, 0.0, 1.0]))

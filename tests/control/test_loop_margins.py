@@ -57,7 +57,7 @@ def test_a_delay_is_split_into_samples_and_a_rest():
         assert (samples - 1) * 0.1 + rest == pytest.approx(delay)
 
 
-@pytest.mark.parametrize("count", [1, 2, 3])
+@pytest.mark.parametrize("count", [1, 2, pytest.param(3, marks=pytest.mark.exhaustive)])
 def test_the_best_scaling_is_exact_for_up_to_three_channels(count):
     rng = np.random.default_rng(count)
     for _ in range(5):
@@ -111,7 +111,10 @@ def test_the_margins_of_a_double_integrator_are_those_of_its_closed_form():
     assert len(margins.channels) == 3
 
 
-@pytest.fixture(scope="module", params=[1, 2, 3])
+@pytest.fixture(
+    scope="module",
+    params=[1, 2, pytest.param(3, marks=pytest.mark.exhaustive)],
+)
 def joints(request):
     """Return the model and a law of a robot whose first one to three joints are actuated."""
     names = [f"joint_{i + 1}" for i in range(request.param)]
@@ -242,6 +245,7 @@ def test_a_continuous_loop_with_a_delay_has_the_margins_of_the_exponential(joint
     assert lost == pytest.approx(math.degrees(w * tau), rel=1e-8)
 
 
+@pytest.mark.exhaustive
 def test_the_bounds_of_many_channels_are_within_a_fifth():
     robot = fflin.load("canadarm2")
     lin = fflin.linearize(robot)

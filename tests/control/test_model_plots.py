@@ -44,6 +44,7 @@ def test_the_pattern_matches_a_and_b_by_groups(name, inputs):
     assert any("SI units" in text for text in written)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(
     "name", mostly(["planar_detumble", "talos"], "planar_detumble")
 )

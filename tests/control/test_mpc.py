@@ -371,6 +371,7 @@ def test_thrusters_do_not_pull_and_motors_may_have_failed():
     assert u[:, thrust].min() > -1e-9 and u[:, thrust].max() == pytest.approx(0.01)
 
 
+@pytest.mark.exhaustive
 def test_a_part_of_the_states_and_allocated_inputs_will_do():
     robot = fflin.load("servicer_7dof")
     arm = robot.replace(inputs=[fflin.JointTorque(name) for name in robot.joint_names])

@@ -440,6 +440,7 @@ def test_a_regulator_tracks_a_plan_of_wheels_alone():
     assert flown.attitude_error[0] > 1.0 and flown.attitude_error[-1] < 0.01
 
 
+@pytest.mark.exhaustive
 def test_starts_and_goals_are_given_in_every_form():
     robot = fflin.load("astrobee_arm", start={"joints": {"arm_proximal": 0.2}})
     q = fflin.configuration(robot, {"arm_proximal": -0.3})
@@ -974,6 +975,7 @@ def test_a_file_with_other_inputs_names_the_difference(free_floating, tmp_path):
         fflin.Trajectory.load(path, whole)
 
 
+@pytest.mark.exhaustive
 def test_a_failed_plan_of_internal_inputs_advises_to_free_the_base_velocities():
     """Joint torques conserve the momentum: an end value of omega_b and v_b is no choice."""
     robot = fflin.load("planar_detumble").replace(inputs=[fflin.JointTorque("*")])

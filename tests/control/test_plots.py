@@ -17,6 +17,7 @@ def lines(axes):
     return {line.get_label(): line for line in axes.get_lines()}
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("dt", [0.0, 0.5])
 def test_bode_plots_are_of_the_loops_broken_one_at_a_time(dt):
     lin = fflin.linearize(fflin.load("servicer_7dof"))
@@ -103,6 +104,7 @@ def test_pole_map_has_the_poles_of_each_set():
     assert len(sampled.axes[0].get_lines()) == 2  # with the unit circle
 
 
+@pytest.mark.exhaustive
 def test_poles_of_a_sampled_loop_are_shown_as_rates():
     lin = fflin.linearize(fflin.load("canadarm2"))
     gain = fflin.lqr(lin.discretize(0.1))

@@ -326,6 +326,7 @@ def test_speeds_come_back_where_something_else_turns_the_body():
         fflin.lqr(lin, {"q_b": 1.0, "omega_b": 1.0}, 1.0)
 
 
+@pytest.mark.exhaustive
 def test_four_wheels_turn_against_each_other_on_request():
     robot = wheeled(PYRAMID)
     lin = fflin.linearize(robot)
@@ -436,6 +437,7 @@ def test_the_closed_form_holds_too():
         assert gain.P == pytest.approx(same.P, abs=1e-7 * np.abs(gain.P).max())
 
 
+@pytest.mark.exhaustive
 def test_a_filter_estimates_the_regulated_states():
     robot = wheeled(AXES[:3]).replace(
         outputs=[fflin.BasePose(), fflin.JointVelocities()]

@@ -98,6 +98,7 @@ def test_the_weld_is_closed_and_the_impulse_changes_both(name):
         )
 
 
+@pytest.mark.exhaustive
 def test_it_is_the_limit_of_a_stiff_grasp():
     """A spring and damper at the grasp, the stiffer the nearer: the rest halves with its time."""
     rng = np.random.default_rng(3)

@@ -124,6 +124,7 @@ def test_a_page_without_a_target_shows_neither_ghost_nor_errors(tmp_path):
         ) is expected_value
 
 
+@pytest.mark.exhaustive
 def test_the_figure_of_a_motion_without_a_target_is_drawn(tmp_path):
     pytest.importorskip("matplotlib")
     motion = fflin.simulate(fflin.load("ets_vii"), duration=0.1)

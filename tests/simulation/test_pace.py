@@ -129,6 +129,7 @@ def barely_unstable(robot, dt, radius):
     return lin, K
 
 
+@pytest.mark.exhaustive
 def test_a_sampled_loop_that_is_unstable_by_the_exact_model_grows():
     # The mode turns by more than half a turn in a sample, so feedback of the rate excites it.
     robot = hub_with_mode(14.0, damping=0.005)
@@ -318,6 +319,7 @@ def test_the_pace_of_a_rotation_matches_an_undamped_mode():
     assert 60.0 * 8.0 * (60.0 * step) ** 5 / 144.0 < 0.011
 
 
+@pytest.mark.exhaustive
 def test_a_sample_far_above_the_period_of_a_mode_needs_short_steps():
     robot = hub_with_mode(300.0)
     lin = fflin.linearize(robot).discretize(1.0)

@@ -38,6 +38,7 @@ def lines(axes):
     return {line.get_label(): line for line in axes.get_lines()}
 
 
+@pytest.mark.exhaustive
 def test_motion_shows_linear_next_to_nonlinear_and_their_difference(loop):
     _, _, motion = loop
     figure = motion.plot()
@@ -127,6 +128,7 @@ def rests(figure):
     return [line.get_xdata()[0] for (line,) in filter(None, marks)]
 
 
+@pytest.mark.exhaustive
 def test_a_line_marks_where_the_reference_comes_to_rest(along):
     traj, motion = along
     figure = motion.plot()
@@ -144,6 +146,7 @@ def test_motion_without_a_prediction_has_no_differences():
     assert not [ax for ax in figure.axes if ax.get_ylabel().startswith("difference")]
 
 
+@pytest.mark.exhaustive
 def test_many_inputs_and_joints_are_named_next_to_the_panels_each_in_its_colour():
     bare = fflin.load("servicer_7dof")
     thrusters = [
@@ -275,6 +278,7 @@ def test_a_motion_without_limits_has_no_lines_of_them(loop):
         assert "limit" not in lines(axes)
 
 
+@pytest.mark.exhaustive
 def test_panels_of_wheels_and_limits_do_not_lie_on_each_other(limited):
     figure = limited.plot()
     figure.draw_without_rendering()

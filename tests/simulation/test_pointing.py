@@ -41,7 +41,7 @@ def turned(flown, angles, t):
 
 
 def test_errors_of_an_oscillation_about_an_offset(flown):
-    t = np.linspace(0.0, 40.0, 40001)
+    t = np.linspace(0.0, 40.0, 8001)
     offset, size, period = np.radians([0.3, 0.1, 2.0])
     period = 2.0
     motion = turned(flown, offset + size * np.sin(2.0 * np.pi * t / period), t)
@@ -89,11 +89,11 @@ def test_a_line_of_sight_is_judged_by_its_own_angle(flown):
 
 
 def test_the_settling_time_is_that_after_which_the_error_stays_small(flown):
-    t = np.linspace(0.0, 50.0, 5001)
+    t = np.linspace(0.0, 50.0, 2501)
     angles = np.radians(5.0) * np.exp(-0.2 * t)
     motion = turned(flown, angles, t)
     found = motion.pointing(5.0, accuracy=0.1)
-    assert found.settled == pytest.approx(5.0 * np.log(50.0), abs=0.01)
+    assert found.settled == pytest.approx(5.0 * np.log(50.0), abs=0.02)
     assert found.after == found.settled
     assert motion.pointing(5.0, accuracy=1e-9).settled is None
     # It must stay for at least a window.

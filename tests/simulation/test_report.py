@@ -282,6 +282,7 @@ def test_the_command_says_it_first_and_unsettled_is_not_a_failure(
     assert max(map(len, out.splitlines())) <= 80
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("duration", [10.0, 30.0, *exhaustive(40.0, 50.0, 60.0)])
 def test_a_robot_that_passes_through_its_target_has_not_settled(duration):
     robot = fflin.load("cubesat")

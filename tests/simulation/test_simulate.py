@@ -249,6 +249,7 @@ def test_limits_by_name_and_group_and_thrusters_never_pull():
             assert acted[name] == min(max(value, 0.0), 0.5)
 
 
+@pytest.mark.exhaustive
 def test_allocation_gives_the_wrench_with_thrusts_that_push():
     design = fflin.load("cubesat", inputs=[fflin.BaseTorque(), fflin.BaseForce()])
     robot = design.replace(inputs=strong_thrusters())

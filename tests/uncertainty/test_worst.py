@@ -155,6 +155,7 @@ def test_no_rebuilt_corner_or_draw_is_worse_than_the_result(monkeypatch, springy
     assert least.gain.value == pytest.approx(named, rel=1e-4)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
 def test_more_samples_never_find_less(monkeypatch, springy):
     monkeypatch.setattr(worst, "_safe", lambda loops: np.inf)

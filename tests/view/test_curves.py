@@ -38,6 +38,7 @@ def lines_of_page(robot, motion):
     }
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("name", ["canadarm2", "dual_arm", "planar_detumble"])
 def test_a_joint_has_one_colour_in_all_figures_and_on_the_page(robots, name):
     robot = robots[name]

@@ -16,6 +16,7 @@ def area(vertices, faces):
     return np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2.0
 
 
+@pytest.mark.exhaustive
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize(
     "robot",

@@ -59,6 +59,7 @@ def largest_difference(watched, robot, q, node="robot"):
     return worst
 
 
+@pytest.mark.exhaustive
 @pytest.mark.sample
 @pytest.mark.browser
 def test_bodies_stand_where_forward_kinematics_puts_them(settled, watch):

@@ -57,6 +57,7 @@ def test_title_and_verdict_are_drawn_before_the_scene(panda, browser):
         assert not watched.page.locator("#wait").count()
 
 
+@pytest.mark.exhaustive
 def test_coarse_meshes_are_few_triangles_near_the_fine_ones(panda):
     files = {shape.mesh for shape in shapes(panda[0])[0] if shape.mesh}
     counts = []
