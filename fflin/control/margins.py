@@ -1,4 +1,4 @@
-"""Margins of gain, phase and delay of linear loops, in each channel and in all at once."""
+"""Margins of gain, phase and delay of linear loops, for each channel and for all together."""
 
 from __future__ import annotations
 
@@ -39,12 +39,21 @@ _PADE = 10
 # magnitude.
 _ROUNDING = 1e-9
 
-# Eigenvalues whose real part is at most this fraction of their magnitude count as imaginary.
-_ON_AXIS = 1e-7
+# Eigenvalues whose real part is at most the fraction _NEAR_AXIS of their magnitude may be
+# crossings. A crossing is a change of sign within one of the fractions _WIDTHS of the frequency, or
+# a value of at most _TOUCHES.
+_NEAR_AXIS = 1e-2
+_WIDTHS = (1e-6, 1e-4, 2e-3)
+_TOUCHES = 1e-10
 
-# Of the frequencies at which the gain of a sampled loop is 1, those are refined whose delay is
-# estimated to be at most this factor times the least.
-_NEAR = 1.5
+# Stability of a sampled loop is tested at _FRACTIONS parts of each of the first two samples of
+# delay, and then at each sample up to _LONGEST. A delay may have at most _MOST_SAMPLES samples.
+_FRACTIONS = 10
+_LONGEST = 40
+_MOST_SAMPLES = 500
+
+# Number of frequencies of the grid on which a continuous loop with a delay is examined.
+_GRID = 600
 
 # A loop gain below this at a phase crossing is rounding: it would be a gain margin above 1e6.
 _NOTHING = 1e-6
@@ -107,7 +116,8 @@ class Margins(FrozenArrays, Reported):
         Size of the smallest ``delta`` that is known to make the loop unstable. It equals `disk` for
         up to three channels.
     gain : tuple of float
-        Gain factors in the disk: the loop is stable if those of all channels are between them.
+        Gain factors in the disk: the loop is stable if the factors of all channels are between
+        these values.
     phase : float
         Phase in the disk [deg].
     frequency : float
@@ -242,7 +252,7 @@ def margins(
     if sample is not None:
         sample = positive("sample", sample, "s")
     law = _law_of(policy, lin, sample)
-    with np.errstate(over="ignore", invalid="ignore"):
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         return _Closed(law, lin, delay, sample, at).margins()
 
 
@@ -275,10 +285,13 @@ def _law_of(policy: Policy | Gain, lin: LinearModel, sample: float | None) -> Li
     known = lin.output_names if outputs else lin.state_names
     missing = [name for name in law.signals if name not in known]
     if missing or inputs != lin.input_names:
-        what = f"measures {missing[0]}" if missing else "has other inputs"
+        if missing:
+            what = f"the law measures {missing[0]}, which the model does not contain"
+        else:
+            what = "the inputs of the law are not those of the model"
         raise InputError(
-            f"the law {what}, which does not fit the model; give the model of the robot for which "
-            "the law was designed, with the same inputs and outputs"
+            f"{what}; give the model of the robot for which the law was designed, with the same "
+            "inputs and outputs"
         )
     return law
 
@@ -308,6 +321,7 @@ class _Closed:
         self.delay = delay
         self.dt = _sampling_time(law, lin, sample)
         self.law = law
+        self.grid: Array = np.zeros(0)
         self.plant = self._continuous_or_sampled(lin)
         names = lin.input_names if at == "inputs" else law.signals
         acting = law.D.any(axis=1) | law.C.any(axis=1)
@@ -315,6 +329,8 @@ class _Closed:
             acting = law.D.any(axis=0) | law.B.any(axis=0)
         self.channels = np.flatnonzero(acting)
         self.names = [names[index] for index in self.channels]
+        if not self.names:
+            raise InputError("the law has no gain, so its loop has no margins")
 
     def _continuous_or_sampled(self, lin: LinearModel) -> _System:
         """Return the plant from all inputs to the measured signals, without a delay.
@@ -345,6 +361,7 @@ class _Closed:
             return _delayed(self.plant, delays)
         if self.is_continuous_plant:
             A, B, C, D = self.plant
+            self._require_short(delays)
             held = HeldSystem(A, B, self.dt, delays)
             return _System(*held.sampled(), *held.outputs(C, D))
         if delays.any():
@@ -353,6 +370,15 @@ class _Closed:
                 "give the continuous model"
             )
         return self.plant
+
+    def _require_short(self, delays: Array) -> None:
+        """Raise `InputError` if commands on their way would need very many states."""
+        longest = float(delays.max(initial=0.0))
+        if longest > _MOST_SAMPLES * self.dt:
+            raise InputError(
+                f"delay is {longest:g} s, more than {_MOST_SAMPLES} samples of {self.dt:g} s; give "
+                "a shorter delay or a longer sample time"
+            )
 
     def closed(self, plant: _System) -> tuple[Array, Array, Array, Array]:
         """Return F, G, H and J from the changes of all channels to (S - T)/2."""
@@ -385,7 +411,7 @@ class _Closed:
                 "the response of the loop overflows; give smaller gains, a shorter sample time or "
                 "a shorter delay"
             )
-        if not _is_stable(loop[0], self.dt):
+        if not self._is_stable(loop[0]):
             count = len(self.channels)
             return Margins(
                 disk=0.0,
@@ -402,6 +428,12 @@ class _Closed:
                 delay=self.delay,
             )
         system = _as_continuous(loop, self.dt)
+        if self.delay and not self.dt:
+            # The fast poles of the approximation of a short delay hide crossings from the
+            # eigenvalues.
+            rates = np.abs(np.linalg.eigvals(self.closed(self.plant)[0]))
+            rates = rates[rates > 0.0]
+            self.grid = np.geomspace(0.01 * rates.min(), 100.0 * rates.max(), _GRID)
         channels = tuple(
             self._channel(index, system.channel(index), delays)
             for index in range(len(self.channels))
@@ -427,6 +459,16 @@ class _Closed:
             delay=self.delay,
         )
 
+    def _is_stable(self, F: Array) -> bool:
+        """Return whether the loop is stable, by more than rounding errors."""
+        poles = np.linalg.eigvals(F)
+        if self.dt:
+            return bool(np.abs(poles).max(initial=0.0) < 1.0 - _ROUNDING)
+        # The poles of the approximation of a short delay are fast, and are no scale for others.
+        own = np.linalg.eigvals(self.closed(self.plant)[0])
+        largest = np.abs(own).max(initial=0.0)
+        return bool(poles.real.max(initial=-np.inf) < -_ROUNDING * largest)
+
     def _frequency(self, w: float) -> float:
         """Return the frequency [rad/s] of a frequency of the transformed loop."""
         if not self.dt:
@@ -438,7 +480,7 @@ class _Closed:
         gain, w_disk = largest_gain(*loop)
         disk = min(1.0 / gain, 2.0)
         low, high = (0.0, math.nan), (math.inf, math.nan)
-        for frequency in _real_points(loop):
+        for frequency in [0.0, *_axis_zeros(loop, -1.0, self.grid), math.inf]:
             value = _loop_gain(loop, frequency)
             if not (value.real < -_NOTHING and math.isfinite(value.real)):
                 continue
@@ -449,7 +491,7 @@ class _Closed:
                 high = factor, self._frequency(frequency)
         phase = (180.0, math.nan)
         crossings = []
-        for w in _unit_points(loop):
+        for w in _axis_zeros(loop, 1.0, self.grid):
             lag = np.angle(-_loop_gain(loop, w)) % (2.0 * math.pi)
             frequency = self._frequency(w)
             size = math.degrees(min(lag, 2.0 * math.pi - lag))
@@ -475,43 +517,73 @@ class _Closed:
         `crossings` are the estimated delay [s] and the frequency of each crossing of a gain of 1.
         In continuous time they are exact. In a sampled loop, a part of a sample changes the gain.
         """
-        least = min(crossings, default=(math.inf, 0.0))[0]
+        estimate, w = min(crossings, default=(math.inf, 0.0))
         if not (self.dt and self.is_continuous_plant):
-            return least
-        near = [pair for pair in crossings if pair[0] <= _NEAR * least]
-        return min(
-            (self._exact_delay(index, *pair, delays) for pair in near), default=math.inf
-        )
+            return estimate
+        unstable = self._first_unstable(index, estimate, delays)
+        if unstable is None and math.isfinite(estimate):
+            return self._refined(index, estimate, w, delays)
+        return math.inf if unstable is None else unstable
 
-    def _exact_delay(
-        self, index: int, estimate: float, w: float, delays: Array
-    ) -> float:
-        """Return the delay [s] near an estimate at which a sampled loop oscillates.
+    def _first_unstable(
+        self, index: int, estimate: float, delays: Array
+    ) -> float | None:
+        """Return the delay [s] at which the exact loop becomes unstable, or None if it is long.
+
+        Stability is tested in fractions of the first two samples, because a part of a sample can
+        make a loop unstable that whole samples leave stable, and then at each sample.
+        """
+        from scipy.optimize import brentq
+
+        h = self.dt
+
+        def growth(extra: float) -> float:
+            F = self.closed(self.delayed_plant(index, extra, delays))[0]
+            return float(np.abs(np.linalg.eigvals(F)).max()) - 1.0
+
+        last = _LONGEST
+        if estimate < _LONGEST * h:
+            last = math.ceil(estimate / h) + 1
+        fractions = np.arange(1, 2 * _FRACTIONS + 1) / _FRACTIONS
+        times = h * np.concatenate((fractions, np.arange(3, last + 1)))
+        before = 0.0
+        for time in times.tolist():
+            if growth(time) >= 0.0:
+                return float(brentq(growth, before, time, xtol=1e-9 * h))
+            before = time
+        return None
+
+    def _refined(self, index: int, estimate: float, w: float, delays: Array) -> float:
+        """Return the delay [s] near a long estimate at which a sampled loop oscillates.
 
         A whole number of samples delays the loop gain by their phase alone. So the rest of the
-        delay is sought for which the lag of the loop is that of a whole number of samples.
+        delay is sought for which the lag of the loop is that of a whole number of samples. If none
+        is found within a sample of the estimate, the estimate is returned.
         """
         from scipy.optimize import newton
 
         h = self.dt
-        samples = math.floor(estimate / h)
+        samples = max(math.floor(estimate / h) - 1, 0)
 
         def excess(rest: float) -> float:
-            nonlocal w
+            rest = min(max(rest, 0.0), 3.0 * h)
             loop = self._delayed_channel(index, rest, delays)
             level = partial(_log_gain, loop)
-            w = float(newton(level, w, x1=w * (1.0 + 1e-4), rtol=1e-12, disp=False))
-            frequency = self._frequency(w)
-            lag = float(np.angle(-_loop_gain(loop, w)))
+            at = float(newton(level, w, x1=w * (1.0 + 1e-4), rtol=1e-12))
+            frequency = self._frequency(at)
+            lag = float(np.angle(-_loop_gain(loop, at)))
             turn = 2.0 * math.pi
             expected = samples * h * frequency
             lag += turn * round((expected - lag) / turn)
             return lag / frequency - samples * h
 
         rest = estimate - samples * h
-        if samples and rest < 0.1 * h:
-            samples, rest = samples - 1, rest + h
-        found = newton(excess, rest, x1=rest + 1e-3 * h, tol=1e-10 * h, disp=False)
+        try:
+            found = newton(excess, rest, x1=rest + 1e-3 * h, tol=1e-10 * h)
+        except (RuntimeError, ValueError, np.linalg.LinAlgError):
+            return estimate
+        if not abs(found - rest) <= h:
+            return estimate
         return samples * h + float(found)
 
     def _delayed_channel(self, index: int, extra: float, delays: Array) -> Loop:
@@ -533,15 +605,15 @@ class _Closed:
         Cd, Dd = held.outputs(C, D)
         samples, rest = split(extra, self.dt)
         if samples:
-            of_states, of_commands = held.after(self.dt - rest)
+            within = held.outputs(C[[channel]], D[[channel]], self.dt - rest)
             size = len(Ad)
             chain = np.eye(samples, k=-1)
             Ad = np.block(
                 [[Ad, np.zeros((size, samples))], [np.zeros((samples, size)), chain]]
             )
-            Ad[size, :size] = C[channel] @ of_states
+            Ad[size, :size] = within[0][0]
             Bd = np.vstack((Bd, np.zeros((samples, Bd.shape[1]))))
-            Bd[size] = C[channel] @ of_commands
+            Bd[size] = within[1][0]
             Cd = np.hstack((Cd, np.zeros((len(Cd), samples))))
             Cd[channel] = 0.0
             Cd[channel, -1] = 1.0
@@ -587,14 +659,6 @@ def _joined(A: Array, B: Array, C: Array) -> list[int]:
     return np.flatnonzero(reached & seen).tolist()
 
 
-def _is_stable(F: Array, dt: float) -> bool:
-    poles = np.linalg.eigvals(F)
-    if dt:
-        return bool(np.abs(poles).max(initial=0.0) < 1.0 - _ROUNDING)
-    largest = np.abs(poles).max(initial=0.0)
-    return bool(poles.real.max(initial=-np.inf) < -_ROUNDING * largest)
-
-
 def _as_continuous(system: Sequence[Array], dt: float) -> Loop:
     """Return a stable system in continuous time, by the bilinear map s = (z - 1)/(z + 1)."""
     F, G, H, J = system
@@ -625,20 +689,12 @@ def _log_gain(loop: Loop, frequency: float) -> float:
     return math.log(abs(_loop_gain(loop, frequency)))
 
 
-def _unit_points(loop: Loop) -> list[float]:
-    """Return the frequencies at which the open-loop gain is 1: the real part of M is zero."""
-    return _axis_zeros(loop, 1.0)
-
-
-def _real_points(loop: Loop) -> list[float]:
-    """Return the frequencies at which the open-loop gain is real: M is real."""
-    return [0.0, *_axis_zeros(loop, -1.0), math.inf]
-
-
-def _axis_zeros(loop: Loop, sign: float) -> list[float]:
+def _axis_zeros(loop: Loop, sign: float, grid: Array) -> list[float]:
     """Return the frequencies > 0 at which M(jw) + sign M(-jw) is zero, for one channel.
 
-    They are the zeros on the imaginary axis of a system of twice the size.
+    With the sign 1, the real part of M is zero there, and the open-loop gain has the magnitude 1.
+    With the sign -1, M and the open-loop gain are real. The frequencies are the zeros on the
+    imaginary axis of a system of twice the size. Changes of sign along `grid` (k,) are also found.
     """
     from scipy.linalg import eigvals
 
@@ -654,12 +710,57 @@ def _axis_zeros(loop: Loop, sign: float) -> list[float]:
     )
     mass = np.diag(np.concatenate((np.ones(2 * n), [0.0])))
     zeros = eigvals(pencil, mass)
-    zeros = zeros[np.isfinite(zeros)]
-    on_axis = np.abs(zeros.real) <= _ON_AXIS * np.abs(zeros)
-    frequencies: list[float] = np.unique(
-        zeros.imag[on_axis & (zeros.imag > 0.0)]
-    ).tolist()
+    zeros = zeros[np.isfinite(zeros) & (zeros.imag > 0.0)]
+    near = zeros[np.abs(zeros.real) <= _NEAR_AXIS * np.abs(zeros)].imag
+    frequencies = list[float]()
+    crossings = [_crossing(loop, sign, w) for w in np.unique(near).tolist()]
+    for crossing in (*_changes(loop, sign, grid), *crossings):
+        apart = [abs(crossing - other) > 1e-9 * crossing for other in frequencies]
+        if crossing and all(apart):
+            frequencies.append(crossing)
     return frequencies
+
+
+def _changes(loop: Loop, sign: float, grid: Array) -> list[float]:
+    """Return the frequencies between those of a grid at which M(jw) + sign M(-jw) changes sign."""
+    from scipy.optimize import brentq
+
+    if not len(grid):
+        return []
+
+    def values(frequencies: Array) -> Array:
+        inner = 1j * frequencies[:, None, None] * np.eye(len(loop.F)) - loop.F
+        response = (loop.H @ np.linalg.solve(inner, loop.G))[:, 0, 0] + loop.J[0, 0]
+        chosen: Array = response.real if sign > 0.0 else response.imag
+        return chosen
+
+    signs = np.signbit(values(grid))
+    at = np.flatnonzero(signs[1:] != signs[:-1])
+    return [
+        float(
+            brentq(
+                lambda w: float(values(np.array([w]))[0]), *grid[k : k + 2], rtol=1e-13
+            )
+        )
+        for k in at
+    ]
+
+
+def _crossing(loop: Loop, sign: float, w: float) -> float:
+    """Return the frequency near w at which M(jw) + sign M(-jw) is zero, or 0 if there is none."""
+    from scipy.optimize import brentq
+
+    def value(frequency: float) -> float:
+        response = complex(loop.at(frequency)[0, 0])
+        return response.real if sign > 0.0 else response.imag
+
+    for width in _WIDTHS:
+        low, high = w * (1.0 - width), w * (1.0 + width)
+        if value(low) * value(high) < 0.0:
+            return float(brentq(value, low, high, xtol=1e-14 * w, rtol=1e-14))
+    if abs(value(w)) <= _TOUCHES:
+        return w
+    return 0.0
 
 
 def _delayed(plant: _System, delays: Array) -> _System:

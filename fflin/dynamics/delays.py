@@ -103,18 +103,29 @@ class HeldSystem:
                     Ad[place, place - 1] = 1.0
         return Ad, Bd
 
-    def outputs(self, C: Array, D: Array) -> tuple[Array, Array]:
-        """Return the output matrices of the sampled system; D acts on the inputs that arrive.
+    def applied(self, s: float) -> tuple[Array, Array]:
+        """Return the maps of the states (nu, size) and of the commands (nu, nu) to the inputs.
 
-        At a sample, these are the commands of k samples ago.
+        The inputs are those that act at the time s [s] after a sample, 0 <= s < h.
         """
-        nx, nu = self.B.shape
-        Cd = np.zeros((len(C), self.size))
-        Dd = np.zeros((len(C), nu))
-        Cd[:, :nx] = C
-        for index, (samples, _) in enumerate(self.delays):
-            if samples:
-                Cd[:, self.first[index] + samples - 1] = D[:, index]
+        nu = self.B.shape[1]
+        of_states = np.zeros((nu, self.size))
+        of_commands = np.zeros((nu, nu))
+        for index, (samples, rest) in enumerate(self.delays):
+            ago = samples
+            if samples and s >= rest:
+                ago = samples - 1
+            if ago:
+                of_states[index, self.first[index] + ago - 1] = 1.0
             else:
-                Dd[:, index] = D[:, index]
-        return Cd, Dd
+                of_commands[index, index] = 1.0
+        return of_states, of_commands
+
+    def outputs(self, C: Array, D: Array, s: float = 0.0) -> tuple[Array, Array]:
+        """Return the output matrices of the sampled system at the time s [s] after a sample.
+
+        D acts on the inputs that have arrived at this time.
+        """
+        of_states, of_commands = self.after(s)
+        held_states, held_commands = self.applied(s)
+        return C @ of_states + D @ held_states, C @ of_commands + D @ held_commands

@@ -26,14 +26,20 @@ from fflin.simulation.report import Firings, curves, firings
 if TYPE_CHECKING:
     from fflin.simulation.motion import Motion
 
-# Share of the time in which an error is below the values of the columns "95 %" and "99.7 %".
+# Fraction of the time in which an error is below the values of the columns "95 %" and "99.7 %".
 _LEVELS = (0.95, 0.997)
 
-# Errors are counted from this share of the run on, if neither `after` nor `accuracy` is given.
+# Errors are counted from this fraction of the run on, if neither `after` nor `accuracy` is given.
 _LATE = 0.5
 
 # At most this number of windows is evaluated; their starts are then evenly distributed.
 _WINDOWS = 2000
+
+# At most about this number of rows of windows is evaluated for the relative error.
+_ROWS = 1_000_000
+
+# Errors of at most this size in the unit of the table are rounding errors, and shown as a dot.
+_ZERO = 1e-12
 
 # Seconds of arc in a degree. The report uses them if no error exceeds _SMALL [deg].
 _ARCSEC = 3600.0
@@ -85,8 +91,8 @@ class Pointing(FrozenArrays, Reported):
         Relative performance error: the error at each time minus its mean over the window. It is the
         instability within a window.
     drift : PointingError or None
-        Performance drift error: the difference of the means of two windows that begin `apart` one
-        after the other; None if the run is too short for it.
+        Performance drift error: the difference of the means of two windows that begin `apart`
+        seconds apart; None if the run is too short for it.
     window, apart, after : float
         Length of the windows, time between the windows of the drift, and time from which errors
         are counted [s].
@@ -154,7 +160,7 @@ class Pointing(FrozenArrays, Reported):
                 continue
             for column, axis in enumerate(self.axes):
                 values = [factor * float(array[column]) for array in error]
-                cells = [f"{value:.3g}" if value else "." for value in values]
+                cells = [f"{value:.3g}" if value > _ZERO else "." for value in values]
                 title = "" if column else name
                 rows.append([title, axis, *cells])
         text = [folded(head), grid(rows, "ll")]
@@ -191,23 +197,22 @@ def pointing(
             "the motion has no target; simulate a policy about a point or along a trajectory"
         )
     errors = np.degrees(attitude_rotations(motion.x, motion.target))
-    angle = np.linalg.norm(errors, axis=1)
     axes: tuple[str, ...] = ("x", "y", "z", "angle")
     if line_of_sight is not None:
         sight = vector("line_of_sight", line_of_sight, 3, "a direction")
         if not sight.any():
             raise InputError("line_of_sight is zero, expected a direction")
         sight = sight / np.abs(sight).max()
-        angle = _sight_angles(errors, sight / np.linalg.norm(sight))
-        errors = angle[:, None]
+        errors = _sight_errors(errors, sight / np.linalg.norm(sight))
         axes = ("line of sight",)
+    angle = np.linalg.norm(errors, axis=1)
     settled = None
     if accuracy is not None:
         accuracy = positive("accuracy", accuracy, "deg")
         settled = _settled(motion.t, angle <= accuracy, window)
     if after is None:
         after = settled if settled is not None else _start(motion.t)
-    after = number("after", after)
+    after = max(number("after", after), float(motion.t[0]))
     apart = window if apart is None else positive("apart", apart, "s")
     counted = motion.t >= after - 1e-9 * max(1.0, abs(after))
     left = float(motion.t[-1]) - after
@@ -217,16 +222,20 @@ def pointing(
             f"{after:.4g} s; simulate longer, or give a shorter window or an earlier after"
         )
     t, errors = motion.t[counted], errors[counted]
-    whole = len(axes) > 1
+    columns = len(axes)
     means, starts = _means(t, errors, window)
     later = _drifts(t, errors, window, apart)
+    drift = None
+    if later is not None:
+        differences, of_starts = later
+        drift = _statistics(differences, _durations(of_starts), columns)
     speeds, torques = _wheels(motion)
     return Pointing(
         axes=axes,
-        absolute=_statistics(errors, whole),
-        mean=_statistics(means, whole),
-        relative=_relative(t, errors, means, starts, window, whole),
-        drift=None if later is None else _statistics(later, whole),
+        absolute=_statistics(errors, _durations(t), columns),
+        mean=_statistics(means, _durations(starts), columns),
+        relative=_relative(t, errors, means, starts, window, columns),
+        drift=drift,
         window=window,
         apart=apart,
         after=after,
@@ -243,17 +252,28 @@ def _start(t: Array) -> float:
     return float(t[0] + _LATE * (t[-1] - t[0]))
 
 
-def _sight_angles(errors: Array, sight: Array) -> Array:
-    """Return the angles [deg] by which rotations (N, 3) [deg] turn a direction (3,)."""
+def _sight_errors(errors: Array, sight: Array) -> Array:
+    """Return the angles (N, 2) [deg] by which rotations (N, 3) [deg] turn a unit vector (3,).
+
+    The two columns are the components of the angle about two axes across the vector.
+    """
     turns = np.radians(errors)
     angle = np.linalg.norm(turns, axis=1, keepdims=True)
     axis = np.divide(turns, angle, out=np.zeros_like(turns), where=angle > 0.0)
-    # A rotation by an angle a about an axis at the angle b from the direction turns it by g, with
-    # sin(g/2) = sin(a/2) sin(b).
-    across = np.linalg.norm(np.cross(axis, sight), axis=1)
-    half = np.abs(np.sin(0.5 * angle[:, 0])) * across
-    angles: Array = np.degrees(2.0 * np.arcsin(half.clip(0.0, 1.0)))
-    return angles
+    sine, cosine = np.sin(angle), np.cos(angle)
+    along = (axis @ sight)[:, None]
+    turned = (
+        cosine * sight + sine * np.cross(axis, sight) + (1.0 - cosine) * along * axis
+    )
+    first = np.cross(sight, np.eye(3)[np.abs(sight).argmin()])
+    first /= np.linalg.norm(first)
+    across = np.column_stack((first, np.cross(sight, first)))
+    parts = turned @ across
+    size = np.linalg.norm(parts, axis=1)
+    angles = np.arctan2(size, turned @ sight)
+    scale = np.divide(angles, size, out=np.ones_like(size), where=size > 0.0)
+    components: Array = np.degrees(parts * scale[:, None])
+    return components
 
 
 def _settled(t: Array, inside: Mask, window: float) -> float | None:
@@ -302,34 +322,69 @@ def _means(t: Array, errors: Array, window: float) -> tuple[Array, Array]:
     return _window_means(t, errors, starts, window), starts
 
 
-def _drifts(t: Array, errors: Array, window: float, apart: float) -> Array | None:
-    """Return the differences (m, k) of the means of two windows, or None in a short run."""
+def _drifts(
+    t: Array, errors: Array, window: float, apart: float
+) -> tuple[Array, Array] | None:
+    """Return the differences (m, k) of the means of two windows, and when the first begin.
+
+    Return None if the motion is too short.
+    """
     if t[-1] - t[0] < (window + apart) * (1.0 - 1e-9):
         return None
     starts = _starts(t, window + apart)
     later = _window_means(t, errors, starts + apart, window)
-    return later - _window_means(t, errors, starts, window)
+    return later - _window_means(t, errors, starts, window), starts
 
 
 def _relative(
-    t: Array, errors: Array, means: Array, starts: Array, window: float, whole: bool
+    t: Array, errors: Array, means: Array, starts: Array, window: float, columns: int
 ) -> PointingError:
     """Return the statistics of the errors minus the mean of their window."""
-    ends = starts + window * (1.0 + 1e-9)
+    per_window = len(t) * window / (t[-1] - t[0])
+    most = max(int(_ROWS / per_window), 2)
+    kept = np.unique(
+        np.linspace(0, len(starts) - 1, min(most, len(starts))).astype(int)
+    )
+    starts, means = starts[kept], means[kept]
     first = np.searchsorted(t, starts - 1e-9 * window)
-    after = np.searchsorted(t, ends, side="right")
-    parts = [errors[a:b] - mean for a, b, mean in zip(first, after, means, strict=True)]
-    return _statistics(np.vstack(parts), whole)
+    after = np.searchsorted(t, starts + window * (1.0 + 1e-9), side="right")
+    shares = _durations(starts)
+    parts = list[Array]()
+    weights = list[Array]()
+    for a, b, mean, share in zip(first, after, means, shares, strict=True):
+        durations = _durations(t[a:b])
+        parts.append(errors[a:b] - mean)
+        weights.append(share * durations / durations.sum())
+    return _statistics(np.vstack(parts), np.concatenate(weights), columns)
 
 
-def _statistics(errors: Array, whole: bool) -> PointingError:
-    """Return the statistics of errors (m, k); `whole` adds the column of the whole angle."""
-    sizes = np.abs(errors)
-    if whole:
-        sizes = np.column_stack((sizes, np.linalg.norm(errors, axis=1)))
-    levels = np.quantile(sizes, _LEVELS, axis=0)
-    rms = np.sqrt((sizes**2).mean(axis=0))
-    return PointingError(sizes.max(axis=0), rms, levels[0], levels[1])
+def _durations(t: Array) -> Array:
+    """Return the time (N,) for which each of the times (N,) stands."""
+    if len(t) < 2 or t[-1] <= t[0]:
+        return np.ones(len(t))
+    steps = np.diff(t)
+    durations = np.zeros(len(t))
+    durations[:-1] += 0.5 * steps
+    durations[1:] += 0.5 * steps
+    return durations
+
+
+def _statistics(errors: Array, durations: Array, columns: int) -> PointingError:
+    """Return the statistics of errors (m, k), each of which lasts for a duration (m,).
+
+    With one column, they are those of the whole angle alone; otherwise it is the last column.
+    """
+    sizes = np.column_stack((np.abs(errors), np.linalg.norm(errors, axis=1)))
+    sizes = sizes[:, -columns:]
+    share = durations / durations.sum()
+    order = np.argsort(sizes, axis=0)
+    ordered = np.take_along_axis(sizes, order, axis=0)
+    below = np.cumsum(share[order], axis=0)
+    rows = [(below < level * (1.0 - 1e-12)).sum(axis=0) for level in _LEVELS]
+    rows = [np.minimum(row, len(sizes) - 1) for row in rows]
+    p95, p997 = (ordered[row, np.arange(columns)] for row in rows)
+    rms = np.sqrt(share @ sizes**2)
+    return PointingError(sizes.max(axis=0), rms, p95, p997)
 
 
 def _wheels(motion: Motion) -> tuple[dict[str, float], dict[str, float]]:

@@ -11,6 +11,7 @@ import fflin
 from fflin.control.margins import _Closed, _law_of
 from fflin.control.optimal.disk import best_scaling, worst_perturbation
 from fflin.dynamics.delays import HeldSystem, split
+from tests.support.marks import exhaustive
 
 
 def satellite(inputs=None, **fields):
@@ -295,7 +296,9 @@ def test_margins_of_laws_that_do_not_fit_are_refused():
     robot, lin = satellite()
     gain = fflin.lqr(lin)
     other = fflin.linearize(robot.replace(inputs=[fflin.BaseForce()]))
-    with pytest.raises(fflin.InputError, match="has other inputs, which does not fit"):
+    with pytest.raises(
+        fflin.InputError, match="inputs of the law are not those of the model"
+    ):
         fflin.margins(gain, other)
     with pytest.raises(fflin.InputError, match="expected a linear law about a point"):
         fflin.margins(lambda t, q, v: np.zeros(3), lin)
@@ -305,3 +308,69 @@ def test_margins_of_laws_that_do_not_fit_are_refused():
         fflin.margins(gain, lin, delay=-1.0)
     with pytest.raises(fflin.InputError, match="expected 'inputs' or 'outputs'"):
         fflin.margins(gain, lin, at="all")
+
+
+def varied(seed=4):
+    """Return a model, and a law whose gain is 20 % off, near instability at slow samples."""
+    lin = fflin.linearize(fflin.load("planar_detumble"))
+    K = np.array(fflin.lqr(lin).K)
+    K *= 1.0 + 0.2 * np.random.default_rng(seed).standard_normal(K.shape)
+    return lin, fflin.StateFeedback(lin, K)
+
+
+@pytest.mark.parametrize("seed", [4, *exhaustive(*range(5, 14))])
+def test_no_part_of_a_sample_below_the_delay_margin_makes_a_loop_unstable(seed):
+    lin, policy = varied(seed)
+    margins = fflin.margins(policy, lin, sample=0.3)
+    loop = loop_of(policy, lin, sample=0.3)
+    none = np.zeros(len(lin.input_names))
+    for index, channel in enumerate(margins.channels):
+        most = min(channel.delay, 3.0)
+        for extra in np.linspace(0.0, most, 40)[1:-1]:
+            F = loop.closed(loop.delayed_plant(index, extra, none))[0]
+            assert np.abs(np.linalg.eigvals(F)).max() < 1.0
+
+
+def test_a_short_delay_changes_the_margins_of_a_continuous_loop_a_little():
+    lin = fflin.linearize(fflin.load("canadarm2"))
+    gain = fflin.lqr(lin)
+    without = fflin.margins(gain, lin)
+    for delay in (1e-6, 1e-3):
+        short = fflin.margins(gain, lin, delay=delay)
+        assert short.stable and short.disk == pytest.approx(without.disk, rel=0.01)
+        for one, other in zip(short.channels, without.channels, strict=True):
+            assert one.phase == pytest.approx(other.phase, abs=0.2)
+            assert one.delay == pytest.approx(other.delay - delay, rel=1e-2)
+
+
+def test_an_output_that_feels_the_input_keeps_its_feedthrough_when_delayed():
+    rng = np.random.default_rng(2)
+    A, B = rng.normal(size=(3, 3)), rng.normal(size=(3, 1))
+    C, D = rng.normal(size=(1, 3)), np.ones((1, 1))
+    held = HeldSystem(A, B, 0.1, np.array([0.13]))
+    Ad, Bd = held.sampled()
+    z, u = np.zeros(len(Ad)), rng.normal(size=6)
+    for k in range(5):
+        for s in (0.0, 0.02, 0.05, 0.09):
+            Cs, Ds = held.outputs(C, D, s)
+            arrived = math.floor((k * 0.1 + s - 0.13) / 0.1 + 1e-9)
+            of_states, of_commands = held.after(s)
+            x = of_states @ z + of_commands @ u[k : k + 1]
+            expected = C @ x + (u[arrived] if arrived >= 0 else 0.0)
+            assert Cs @ z + Ds @ u[k : k + 1] == pytest.approx(expected)
+        z = Ad @ z + Bd @ u[k : k + 1]
+
+
+def test_loops_without_gain_and_delays_of_many_samples_are_refused():
+    lin = fflin.linearize(fflin.load("planar_detumble"))
+    gain = fflin.lqr(lin)
+    nothing = fflin.StateFeedback(lin, 0.0 * np.array(gain.K))
+    with pytest.raises(fflin.InputError, match="the law has no gain"):
+        fflin.margins(nothing, lin)
+    with pytest.raises(fflin.InputError, match=r"more than 500 samples of 0\.1 s"):
+        fflin.margins(gain, lin, sample=0.1, delay=1e5)
+    for factor, sample, joint in ((6.0, 0.15, 1), (4.0, 0.2, 3)):
+        K = np.array(gain.K)
+        K[lin.input_names.index(f"tau_m.joint_{joint}")] *= factor
+        margins = fflin.margins(fflin.StateFeedback(lin, K), lin, sample=sample)
+        assert not margins.stable or min(x.delay for x in margins.channels) < 0.2

@@ -130,6 +130,45 @@ def test_wheels_report_the_used_fractions_of_their_limits():
         assert share == pytest.approx(expected)
 
 
+def test_a_line_of_sight_that_moves_on_a_cone_is_unsteady(flown):
+    """A constant angle from the target, whose direction turns: all of it is relative error."""
+    t = np.linspace(0.0, 40.0, 4001)
+    motion = turned(flown, np.zeros(4001), t)
+    x = motion.x.copy()
+    half = np.sin(np.radians(0.5))
+    x[:, 0] = half * np.cos(2.0 * np.pi * t / 5.0)
+    x[:, 1] = half * np.sin(2.0 * np.pi * t / 5.0)
+    cone = replace(motion, x=x)
+    result = cone.pointing(10.0, after=0.0, line_of_sight=(0, 0, 1))
+    assert result.absolute.largest[0] == pytest.approx(1.0, rel=1e-9)
+    assert result.mean.largest[0] < 1e-3
+    assert result.relative.rms[0] == pytest.approx(1.0, rel=1e-3)
+    whole = cone.pointing(10.0, after=0.0)
+    assert whole.relative.rms[3] == pytest.approx(1.0, rel=1e-3)
+
+
+def test_statistics_are_over_time_and_not_over_rows(flown):
+    early, late = np.linspace(0.0, 20.0, 2001), np.linspace(20.1, 40.0, 200)
+    t = np.concatenate((early, late))
+    angles = np.radians(np.where(t <= 20.0, 4.0, 2.0))
+    result = turned(flown, angles, t).pointing(1.0, after=0.0)
+    assert result.absolute.rms[2] == pytest.approx(
+        np.sqrt((16.0 + 4.0) / 2.0), rel=5e-3
+    )
+    assert result.absolute.p95[2] == pytest.approx(4.0)
+    fine = turned(flown, np.radians(0.1 * t), t).pointing(1.0, after=0.0)
+    assert fine.absolute.p95[2] == pytest.approx(0.1 * 38.0, rel=5e-3)
+
+
+def test_long_windows_of_many_rows_need_little_memory(flown):
+    t = np.linspace(0.0, 4000.0, 200_001)
+    motion = turned(flown, np.radians(np.sin(t)), t)
+    result = motion.pointing(1000.0, after=-1e9)
+    assert result.after == 0.0 and result.relative.rms[2] == pytest.approx(
+        0.707, rel=1e-2
+    )
+
+
 def test_wrong_arguments_are_refused(flown):
     with pytest.raises(fflin.InputError, match="window is 0 s, expected more than 0"):
         flown.pointing(0.0)

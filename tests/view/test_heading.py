@@ -95,5 +95,7 @@ def test_the_page_says_which_drawings_are_missing(watch, tmp_path):
     fflin.visualize(robot, settling(robot, 1.0), html=path)
     watched = watch(path.as_uri() + "#pause")
     notes = watched.page.locator("#notes")
-    assert "mesh file lost.stl (link base) not found" in notes.text_content().replace("'", "")
+    assert "mesh file lost.stl (link base) not found" in notes.text_content().replace(
+        "'", ""
+    )
     assert notes.is_visible()
