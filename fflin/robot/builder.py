@@ -29,6 +29,7 @@ from fflin.robot.equipment.assembly import (
     with_mounted,
 )
 from fflin.robot.fields import FIELDS, checked_inputs, checked_names
+from fflin.robot.inputs import named_inputs
 from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.mass_properties import as_inertia, dynamic_parameters, pieces_of
 from fflin.robot.robot_data import RobotData, link_mass
@@ -151,7 +152,14 @@ def equipped(
     gone = [name for name in robot.joint_names if name not in names]
     tables = {}
     if gone:
-        tables = {key: _without(getattr(robot, key), gone, names) for key in _BY_NAME}
+        kept = [f"{group}.{name}" for group in _GROUPS for name in names]
+        # A wheel that is no joint any more is still an input, with its limits.
+        kept += [
+            f"{x.GROUP}.{name}"
+            for x, entries in named_inputs(checked)
+            for name in entries
+        ]
+        tables = {key: _without(getattr(robot, key), gone, kept) for key in _BY_NAME}
     # Reset the springs of the modes only if appendages are given. Otherwise keep them, because the
     # user may have changed them.
     if appendages is not None:
@@ -208,20 +216,20 @@ def _with_modes(
 
 
 def _without(
-    table: Mapping[str, object], gone: list[str], left: list[str]
+    table: Mapping[str, object], gone: list[str], kept_keys: list[str]
 ) -> dict[str, object]:
     """Return a mapping without the keys that match only removed joints.
 
-    Mappings inside this mapping are reduced in the same way.
+    `gone` are the names of the removed joints, and `kept_keys` the keys GROUP.NAME of joints and
+    inputs that still exist. Mappings inside this mapping are reduced in the same way.
     """
     removed = [f"{group}.{name}" for group in _GROUPS for name in gone]
-    others = [f"{group}.{name}" for group in _GROUPS for name in left]
     kept: dict[str, object] = {}
     for key, value in table.items():
-        if stands_for_any(key, removed) and not stands_for_any(key, others):
+        if stands_for_any(key, removed) and not stands_for_any(key, kept_keys):
             continue
         if isinstance(value, Mapping):
-            kept[key] = _without(value, gone, left)
+            kept[key] = _without(value, gone, kept_keys)
         else:
             kept[key] = value
     return kept

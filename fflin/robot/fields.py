@@ -199,13 +199,15 @@ def warn_of_degrees(robot: RobotData, values: Mapping[str, float]) -> None:
     """Warn of positions and rates of revolute joints that look like degrees.
 
     `values` is {name of a state: value}. States other than q_m and qdot_m are ignored, and so are
-    wheels, which may have any angle and a high speed. One warning names all such values; see
+    wheels and continuous joints, which may have any angle. One warning names all such values; see
     `looks_like_degrees` for the rule.
     """
     wheels = {names[0] for item, names in robot.named_inputs if item.GROUP == "wheel"}
     suspicious = dict[str, float]()
     for joint in robot.joints:
         if joint.unit != "rad" or joint.name in {*wheels, *robot.wheel_joints}:
+            continue
+        if joint.unbounded:  # it may turn any number of times
             continue
         low, high = travel_of(robot.model, joint)
         if not math.isfinite(high - low) or low == high:
@@ -221,7 +223,7 @@ def warn_of_degrees(robot: RobotData, values: Mapping[str, float]) -> None:
     shown = listed([f"{name} = {value:g}" for name, value in suspicious.items()])
     first = next(iter(suspicious.values()))
     warnings.warn(
-        "angles look like degrees, because they exceed one rotation and the limits of the joint: "
+        "values look like degrees, because they exceed one rotation and the limits of the joint: "
         f"{shown}; give radians, such as {math.radians(first):.3g} for {first:g} deg",
         FflinWarning,
         stacklevel=3,

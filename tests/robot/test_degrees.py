@@ -55,6 +55,14 @@ def test_wheels_sliding_joints_and_the_base_are_never_suspected():
         warn_of_degrees(robot, {"r_b.x": 300.0, "omega_b.x": 300.0})
 
 
+def test_a_continuous_joint_may_have_any_angle():
+    robot = fflin.load("kinova")
+    joint = next(joint for joint in robot.joints if joint.unbounded)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warn_of_degrees(robot, {f"q_m.{joint.name}": 30.0})
+
+
 def displaced(arm, angle):
     """Return the neutral configuration with joint_1 at an angle [rad]."""
     q = arm.neutral()

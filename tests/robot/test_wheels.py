@@ -559,3 +559,15 @@ def test_axes_of_any_length_are_directions():
     for scale in (1e-300, 1.0, 1e300):
         axis = ReactionWheel((3.0 * scale, 0.0, -4.0 * scale)).axis
         assert axis == pytest.approx((0.6, 0.0, -0.8), rel=1e-15)
+
+
+def test_a_wheel_that_becomes_a_constant_momentum_keeps_the_limit_of_its_input():
+    spun = fflin.ReactionWheel((0, 0, 1), inertia=0.01, name="wz")
+    limits = {"wheel.wz": 0.05, "qdot_m.wz": 100.0}
+    robot = fflin.load(
+        "planar_detumble", inputs=[fflin.BaseTorque(), spun], limits=limits
+    )
+    still = fflin.ReactionWheel((0, 0, 1), momentum=0.1, name="wz")
+    changed = robot.replace(inputs=[fflin.BaseTorque(), still])
+    assert changed.limits == {"wz": (-0.05, 0.05)}
+    assert robot.replace(inputs=[fflin.BaseTorque()]).limits == {}
