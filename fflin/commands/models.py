@@ -399,6 +399,9 @@ def equilibrium(arguments: Namespace) -> Report:
         mode.margin < -1.0 for mode in lin_modes.modes
     )
     stability = "marginally stable"
+    if lin_modes.zero_eigenvalues:
+        # A push is not undone, and a double eigenvalue at zero drifts with constant velocity.
+        stability = "neutral, it may drift"
     if lin_modes.unstable:
         stability = "unstable"
     elif decays:
