@@ -53,7 +53,7 @@ class CurveStyle(NamedTuple):
 
     @property
     def is_named(self) -> bool:
-        """Whether the curve has one of COLORS, and therefore a name in the legend."""
+        """Whether the curve is coloured; only coloured curves are in the legend."""
         return self.color != GREY
 
 

@@ -175,8 +175,8 @@ ABOUT: dict[str, str] = {
     "balance the load. If no inputs can hold the robot at the operating point, the command reports "
     "an error",
     "tilt": "whether an equilibrium under gravity may tilt the base, by less than 90 deg, if no "
-    "inputs balance all forces at the given attitude (default). With --no-tilt, the base keeps the "
-    "given attitude",
+    "inputs balance all forces at the given attitude. By default, the base may tilt. With "
+    "--no-tilt, it keeps the given attitude",
     "relative-equilibrium": "for a robot in orbit: use the N-th of the 24 attitudes without "
     "gravity-gradient torque (1 by default), and the inputs that --equilibrium computes. The state "
     "measures attitude and position from this equilibrium pose",

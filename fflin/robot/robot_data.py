@@ -117,7 +117,7 @@ class RobotData(Coordinates):
 
     @cached_property
     def pulsed_thrusters(self) -> dict[int, tuple[str, Thruster]]:
-        """Thrusters with `on_off` or `least_impulse`, as {index in u: (name, thruster)}."""
+        """Return the pulsed thrusters {index in u: (name, thruster)}, see `on_off`, `least_impulse`."""
         inputs = ((name, item) for item, names in self.named_inputs for name in names)
         return {
             index: (name, item)
