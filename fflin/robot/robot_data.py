@@ -117,7 +117,7 @@ class RobotData(Coordinates):
 
     @cached_property
     def pulsed_thrusters(self) -> dict[int, tuple[str, Thruster]]:
-        """Return the pulsed thrusters {index in u: (name, thruster)}, see `on_off`, `least_impulse`."""
+        """Return the thrusters that fire pulses, as {index in u: (name, thruster)}."""
         inputs = ((name, item) for item, names in self.named_inputs for name in names)
         return {
             index: (name, item)

@@ -102,7 +102,11 @@ def test_wheels_alone_slew_a_body_at_rest(tmp_path, degrees):
 def test_an_equilibrium_has_its_inputs_and_its_stability(tmp_path):
     spring = ("--stiffness", "joint_1=3", "--joint", "joint_1=0.2")
     code, out, _ = run("equilibrium", ROBOT, *spring, "-o", "e.json", cwd=tmp_path)
-    assert code == 0 and "neutral, it may drift" in out and "tau_m.joint_1 = 0.6 N m" in out
+    assert (
+        code == 0
+        and "neutral, it may drift" in out
+        and "tau_m.joint_1 = 0.6 N m" in out
+    )
     saved = json.loads((tmp_path / "e.json").read_text())
     robot = fflin.load(ROBOT, stiffness={"joint_1": 3.0})
     held = fflin.equilibrium(robot, fflin.configuration(robot, {"joint_1": 0.2}))
