@@ -158,9 +158,11 @@ def write_hero(app: Sphinx, error: Exception | None) -> None:
     if error or app.builder.format != "html":
         return
     source = (Path(app.srcdir) / "index.md").read_text("utf-8")
-    code = re.findall(r"```python\n(.*?)```", source, re.DOTALL)[0]
+    code = re.search(r"```python\n(.*?motion\.html.*?)```", source, re.DOTALL)
+    if code is None:
+        return
     with tempfile.TemporaryDirectory() as folder:
-        subprocess.run([sys.executable, "-c", code], cwd=folder, check=True)
+        subprocess.run([sys.executable, "-c", code[1]], cwd=folder, check=True)
         text = (Path(folder) / "motion.html").read_text("utf-8")
     target = Path(app.outdir) / "pages" / "index" / "motion.html"
     target.parent.mkdir(parents=True, exist_ok=True)

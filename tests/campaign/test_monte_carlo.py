@@ -568,7 +568,7 @@ def test_goals_appear_in_the_report_with_the_worst_run(robots):
     )
     settings = ["position", "settle", "attitude", "worst attitude", "worst position"]
     assert [*influences(campaign)] == settings
-    assert "rank correlations with position: " in str(campaign)
+    assert "rank correlations with position, worst position: " in str(campaign)
     assert (
         campaign.goals == (*goals, "attitude < 2 deg") and campaign.about == "position"
     )

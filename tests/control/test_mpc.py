@@ -296,7 +296,7 @@ def test_along_a_trajectory_it_keeps_within_limits(planned):
     limits |= {"q_m.joint_2": (q_m.min() - 0.02, q_m.max() + 0.02)}
     limits |= {"qdot_m": 1.1 * np.abs(along.v[:, 6:]).max()}
     policy = fflin.mpc(along, horizon=8, dt=0.5, limits=limits)
-    q0, v0 = policy.beside({"pitch": 6.0, "q_m.joint_2": 0.01, "r_b.x": 0.1})
+    q0, v0 = policy.beside({"pitch": 4.0, "q_m.joint_2": 0.01, "r_b.x": 0.1})
     options = {"q0": q0, "v0": v0, "duration": 30.0, "limits": limits, "dt": 0.05}
     flown, cut = (
         fflin.simulate(robot, item, **options) for item in (policy, policy.schedule)
