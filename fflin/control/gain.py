@@ -17,6 +17,7 @@ from fflin.base.names import group_of, input_keys, with_units
 from fflin.base.record import Design
 from fflin.base.tables import cut, folded, grid, matrix, signals
 from fflin.base.validation import Array, Mask, Poles, Values, Vector
+from fflin.control.optimal.disk import Loop, as_continuous, disk_gain, disk_phase
 from fflin.control.optimal.largest_gain import gain_crossings, largest_gain
 from fflin.control.optimal.riccati import Solution, rates_of
 from fflin.control.policy import Policy
@@ -272,12 +273,8 @@ class Gain(ModelDesign):
     @cached_property
     def margins(self) -> Margins:
         """Gain and phase margins at the inputs, computed at first access."""
-        disk = min(1.0 / largest_gain(*_asymmetry(self))[0], 2.0)
-        most = math.inf
-        if disk < 2.0:
-            most = (2.0 + disk) / (2.0 - disk)
-        phase = math.degrees(2.0 * math.atan(disk / 2.0))
-        return Margins(disk, ((2.0 - disk) / (2.0 + disk), most), phase)
+        disk = min(1.0 / largest_gain(*asymmetry(self))[0], 2.0)
+        return Margins(disk, disk_gain(disk), disk_phase(disk))
 
 
 def gain_matrix(gain: object) -> object:
@@ -504,34 +501,19 @@ def _pole_rows(design: HasPoles) -> list[list[str]]:
     return table
 
 
-def _asymmetry(gain: Gain) -> tuple[Array, Array, Array, Array]:
-    """Return a continuous system (F, G, H, D), whose largest gain is the inverse disk margin.
+def asymmetry(gain: Gain) -> Loop:
+    """Return the loop from changes of the inputs to (S - T)/2, in continuous time.
 
-    Its transfer function is half the difference between sensitivity and complementary sensitivity
-    at the inputs. The inputs are scaled by sqrt(R_ii). See Seiler, Packard and Gahinet, IEEE
-    Control Systems 40(5), 2020. The largest gain is computed from eigenvalues of Hamiltonian
-    matrices, without a grid of frequencies. See Bruinsma and Steinbuch, Systems and Control Letters
-    14(4), 1990.
+    S and T are the sensitivity and the complementary sensitivity at the inputs, which are scaled by
+    sqrt(R_ii). The largest gain of the loop is the inverse of the disk margin. See Seiler, Packard
+    and Gahinet, IEEE Control Systems 40(5), 2020.
     """
     S = _regulated(gain)
     scale = np.sqrt(gain.R.diagonal())
-    F, G, H = (
-        S @ gain.closed_loop @ S.T,
-        S @ gain.B / scale,
-        -scale[:, None] * gain.K @ S.T,
-    )
-    D = 0.5 * np.eye(len(H))
-    if not gain.dt:
-        return F, G, H, D
-    # The bilinear map s = (z - 1)/(z + 1) preserves the H-infinity norm.
-    inverse, unit = np.linalg.inv(F + np.eye(len(F))), np.eye(len(F))
-    D = D - H @ inverse @ G
-    F, G, H = (
-        inverse @ (F - unit),
-        2.0**0.5 * inverse @ G,
-        2.0**0.5 * H @ inverse,
-    )
-    return F, G, H, D
+    F = S @ gain.closed_loop @ S.T
+    G = S @ gain.B / scale
+    H = -scale[:, None] * gain.K @ S.T
+    return as_continuous(F, G, H, 0.5 * np.eye(len(H)), gain.dt)
 
 
 def _regulated(gain: Gain) -> Array:
@@ -546,7 +528,7 @@ def _may_be_fragile(gain: Gain) -> bool:
     """
     if guaranteed_margin(gain) >= _FRAGILE:
         return False
-    F, G, H, D = _asymmetry(gain)
+    F, G, H, D = asymmetry(gain)
     bound = 1.0 / _FRAGILE
     if np.linalg.norm(D, 2) >= bound:
         return True

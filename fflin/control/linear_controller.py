@@ -9,7 +9,7 @@ from functools import cached_property
 from importlib import import_module
 from itertools import compress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -21,11 +21,11 @@ from fflin.base.writing import RECORDS, as_path, check_ending, reason
 from fflin.control.kalman import Compensator
 from fflin.control.policies import Feedback, Loop, OutputSensing, Sample
 from fflin.control.policy import (
-    LinearLaw,
     Noise,
     OutputForm,
     Policy,
     Predictor,
+    System,
     unstable_note,
 )
 from fflin.dynamics.integrators import held_exponential
@@ -38,22 +38,6 @@ from fflin.robot.robot import Robot
 
 # default signal names such as u[0], or no name
 _NUMBERED = re.compile(r"([a-z]\[\d+\])?")
-
-
-class System(NamedTuple):
-    """State-space system A, B, C, D with the names of its inputs and outputs.
-
-    The sample time dt [s] is 0 in continuous time, -1 for a sampled system with unknown sample
-    time, and None if it is not given.
-    """
-
-    A: Array
-    B: Array
-    C: Array
-    D: Array
-    dt: float | None = None
-    inputs: tuple[str, ...] = ()
-    outputs: tuple[str, ...] = ()
 
 
 @dataclass(eq=False, repr=False)
@@ -207,10 +191,10 @@ class LinearController(OutputSensing, Feedback):
         acting = self.system.B.any(axis=0) | self.system.D.any(axis=0)
         return tuple(compress(self.lin.state_names, self.lin.C[acting].any(axis=0)))
 
-    def linear_law(self) -> LinearLaw:
+    def linear_law(self) -> System:
         """Return the controller."""
-        A, B, C, D, dt, signals, _ = self.system
-        return LinearLaw(A, B, C, D, dt, signals)
+        system: System = self.system
+        return system
 
     def closed_loop(self) -> tuple[Array, float] | None:
         """Return the closed-loop matrix of model and controller, and dt [s]."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Literal, NamedTuple
@@ -23,9 +22,21 @@ from fflin.base.validation import (
     positive,
 )
 from fflin.control.gain import Gain
-from fflin.control.optimal.disk import Loop, largest_structured_gain
+from fflin.control.optimal.channel_limits import (
+    Crossing,
+    channel_limits,
+    log_gain,
+    loop_gain,
+)
+from fflin.control.optimal.disk import (
+    Loop,
+    as_continuous,
+    disk_gain,
+    disk_phase,
+    largest_structured_gain,
+)
 from fflin.control.optimal.largest_gain import largest_gain
-from fflin.control.policy import LinearLaw, Policy, as_policy
+from fflin.control.policy import Policy, System, as_policy, proportional
 from fflin.dynamics.delays import HeldSystem, split
 from fflin.linear.model import LinearModel
 
@@ -39,13 +50,6 @@ _PADE = 10
 # magnitude.
 _ROUNDING = 1e-9
 
-# Eigenvalues whose real part is at most the fraction _NEAR_AXIS of their magnitude may be
-# crossings. A crossing is a change of sign within one of the fractions _WIDTHS of the frequency, or
-# a value of at most _TOUCHES.
-_NEAR_AXIS = 1e-2
-_WIDTHS = (1e-6, 1e-4, 2e-3)
-_TOUCHES = 1e-10
-
 # Stability of a sampled loop is tested at _FRACTIONS parts of each of the first two samples of
 # delay, and then at each sample up to _LONGEST. A delay may have at most _MOST_SAMPLES samples.
 _FRACTIONS = 10
@@ -54,9 +58,6 @@ _MOST_SAMPLES = 500
 
 # Number of frequencies of the grid on which a continuous loop with a delay is examined.
 _GRID = 600
-
-# A loop gain below this at a phase crossing is rounding: it would be a gain margin above 1e6.
-_NOTHING = 1e-6
 
 
 class ChannelMargins(NamedTuple):
@@ -256,35 +257,29 @@ def margins(
         return _Closed(law, lin, delay, sample, at).margins()
 
 
-def _law_of(policy: Policy | Gain, lin: LinearModel, sample: float | None) -> LinearLaw:
+def _law_of(policy: Policy | Gain, lin: LinearModel, sample: float | None) -> System:
     """Return the linear law of a policy, sampled if it is continuous and `sample` [s] is given.
 
     Raise `InputError` if it does not fit the model.
     """
+    outputs = False
     if isinstance(policy, Gain):
-        law = LinearLaw(
-            np.zeros((0, 0)),
-            np.zeros((0, len(policy.x0))),
-            np.zeros((len(policy.u0), 0)),
-            -policy.K,
-            policy.dt,
-            policy.state_names,
-        )
-        outputs, inputs = False, policy.input_names
+        law = proportional(policy.K, policy.dt, policy.state_names, policy.input_names)
     else:
         given = as_policy(policy)
         if sample:
             given = given.held_for(sample)
         linear = given.linear_law()
-        if linear is None or given.model is None:
+        if linear is None:
             raise InputError(
                 f"policy is a {given.kind}, expected a linear law about a point: a StateFeedback, "
                 "an OutputFeedback, a LinearController or a Gain"
             )
-        law, outputs, inputs = linear, given.senses_outputs, given.model.input_names
+        law = linear
+        outputs = given.senses_outputs
     known = lin.output_names if outputs else lin.state_names
-    missing = [name for name in law.signals if name not in known]
-    if missing or inputs != lin.input_names:
+    missing = [name for name in law.inputs if name not in known]
+    if missing or law.outputs != lin.input_names:
         if missing:
             what = f"the law measures {missing[0]}, which the model does not contain"
         else:
@@ -296,21 +291,12 @@ def _law_of(policy: Policy | Gain, lin: LinearModel, sample: float | None) -> Li
     return law
 
 
-class _System(NamedTuple):
-    """Linear system A, B, C, D."""
-
-    A: Array
-    B: Array
-    C: Array
-    D: Array
-
-
 class _Closed:
     """Loop of a law and a model, with factors at the inputs or at the measured signals."""
 
     def __init__(
         self,
-        law: LinearLaw,
+        law: System,
         lin: LinearModel,
         delay: float,
         sample: float | None,
@@ -321,9 +307,8 @@ class _Closed:
         self.delay = delay
         self.dt = _sampling_time(law, lin, sample)
         self.law = law
-        self.grid: Array = np.zeros(0)
         self.plant = self._continuous_or_sampled(lin)
-        names = lin.input_names if at == "inputs" else law.signals
+        names = lin.input_names if at == "inputs" else law.inputs
         acting = law.D.any(axis=1) | law.C.any(axis=1)
         if at == "outputs":
             acting = law.D.any(axis=0) | law.B.any(axis=0)
@@ -332,7 +317,7 @@ class _Closed:
         if not self.names:
             raise InputError("the law has no gain, so its loop has no margins")
 
-    def _continuous_or_sampled(self, lin: LinearModel) -> _System:
+    def _continuous_or_sampled(self, lin: LinearModel) -> System:
         """Return the plant from all inputs to the measured signals, without a delay.
 
         The plant is continuous if its model is known in continuous time. It contains only states
@@ -340,30 +325,30 @@ class _Closed:
         """
         source = lin.generator if self.dt else lin
         model = lin if source is None else source
-        if self.law.signals == lin.output_names:
+        if self.law.inputs == lin.output_names:
             C, D = model.C, model.D
         else:
-            rows = [lin.state_names.index(name) for name in self.law.signals]
+            rows = [lin.state_names.index(name) for name in self.law.inputs]
             C = np.eye(len(model.A))[rows]
             D = np.zeros((len(rows), model.B.shape[1]))
         used = self.law.D.any(axis=0) | self.law.B.any(axis=0)
         kept = _joined(model.A, model.B, C[used])
-        return _System(model.A[np.ix_(kept, kept)], model.B[kept], C[:, kept], D)
+        return System(model.A[np.ix_(kept, kept)], model.B[kept], C[:, kept], D)
 
     @property
     def is_continuous_plant(self) -> bool:
         """Whether `plant` is in continuous time."""
         return not self.dt or self.lin.generator is not None
 
-    def with_delays(self, delays: Array) -> _System:
+    def with_delays(self, delays: Array) -> System:
         """Return the plant in the time of the loop, whose inputs arrive after `delays` (nu,)."""
         if not self.dt:
             return _delayed(self.plant, delays)
         if self.is_continuous_plant:
-            A, B, C, D = self.plant
+            A, B, C, D, *_ = self.plant
             self._require_short(delays)
             held = HeldSystem(A, B, self.dt, delays)
-            return _System(*held.sampled(), *held.outputs(C, D))
+            return System(*held.sampled(), *held.outputs(C, D))
         if delays.any():
             raise InputError(
                 "lin is sampled and its continuous model is unknown, so a delay cannot be added; "
@@ -380,9 +365,9 @@ class _Closed:
                 "a shorter delay or a longer sample time"
             )
 
-    def closed(self, plant: _System) -> tuple[Array, Array, Array, Array]:
+    def closed(self, plant: System) -> tuple[Array, Array, Array, Array]:
         """Return F, G, H and J from the changes of all channels to (S - T)/2."""
-        A, B, C, D = plant
+        A, B, C, D, *_ = plant
         law = self.law
         F = np.block(
             [
@@ -427,15 +412,10 @@ class _Closed:
                 dt=self.dt,
                 delay=self.delay,
             )
-        system = _as_continuous(loop, self.dt)
-        if self.delay and not self.dt:
-            # The fast poles of the approximation of a short delay hide crossings from the
-            # eigenvalues.
-            rates = np.abs(np.linalg.eigvals(self.closed(self.plant)[0]))
-            rates = rates[rates > 0.0]
-            self.grid = np.geomspace(0.01 * rates.min(), 100.0 * rates.max(), _GRID)
+        system = as_continuous(*loop, self.dt)
+        grid = self._grid()
         channels = tuple(
-            self._channel(index, system.channel(index), delays)
+            self._channel(index, system.channel(index), delays, grid)
             for index in range(len(self.channels))
         )
         peak = largest_structured_gain(system)
@@ -459,14 +439,30 @@ class _Closed:
             delay=self.delay,
         )
 
+    def _own_rates(self) -> Array:
+        """Return the magnitudes [rad/s] of the poles of the continuous loop without a delay."""
+        rates: Array = np.abs(np.linalg.eigvals(self.closed(self.plant)[0]))
+        return rates
+
+    def _grid(self) -> Array:
+        """Return frequencies [rad/s] between which crossings of a continuous loop are sought.
+
+        They are needed with a delay only: the fast poles of its approximation hide crossings from
+        the eigenvalues.
+        """
+        if self.dt or not self.delay:
+            return np.zeros(0)
+        rates = self._own_rates()
+        rates = rates[rates > 0.0]
+        return np.geomspace(0.01 * rates.min(), 100.0 * rates.max(), _GRID)
+
     def _is_stable(self, F: Array) -> bool:
         """Return whether the loop is stable, by more than rounding errors."""
         poles = np.linalg.eigvals(F)
         if self.dt:
             return bool(np.abs(poles).max(initial=0.0) < 1.0 - _ROUNDING)
         # The poles of the approximation of a short delay are fast, and are no scale for others.
-        own = np.linalg.eigvals(self.closed(self.plant)[0])
-        largest = np.abs(own).max(initial=0.0)
+        largest = self._own_rates().max(initial=0.0)
         return bool(poles.real.max(initial=-np.inf) < -_ROUNDING * largest)
 
     def _frequency(self, w: float) -> float:
@@ -475,55 +471,50 @@ class _Closed:
             return w
         return 2.0 * math.atan(w) / self.dt
 
-    def _channel(self, index: int, loop: Loop, delays: Array) -> ChannelMargins:
+    def _channel(
+        self, index: int, loop: Loop, delays: Array, grid: Array
+    ) -> ChannelMargins:
         """Return the margins of one channel."""
-        gain, w_disk = largest_gain(*loop)
-        disk = min(1.0 / gain, 2.0)
-        low, high = (0.0, math.nan), (math.inf, math.nan)
-        for frequency in [0.0, *_axis_zeros(loop, -1.0, self.grid), math.inf]:
-            value = _loop_gain(loop, frequency)
-            if not (value.real < -_NOTHING and math.isfinite(value.real)):
-                continue
-            factor = -1.0 / value.real
-            if max(low[0], _NOTHING) < factor < 1.0:
-                low = factor, self._frequency(frequency)
-            if 1.0 < factor < high[0]:
-                high = factor, self._frequency(frequency)
-        phase = (180.0, math.nan)
-        crossings = []
-        for w in _axis_zeros(loop, 1.0, self.grid):
-            lag = np.angle(-_loop_gain(loop, w)) % (2.0 * math.pi)
-            frequency = self._frequency(w)
-            size = math.degrees(min(lag, 2.0 * math.pi - lag))
-            if size < phase[0]:
-                phase = size, frequency
-            crossings.append((float(lag) / frequency, w))
+        peak, w_disk = largest_gain(*loop)
+        limits = channel_limits(loop, grid)
+        phase, phase_frequency = 180.0, math.nan
+        if limits.crossings:
+            nearest = min(limits.crossings, key=lambda crossing: crossing.phase)
+            phase = nearest.phase
+            phase_frequency = self._frequency(nearest.frequency)
+        low, high = limits.gain_frequencies
         return ChannelMargins(
-            self.names[index],
-            (low[0], high[0]),
-            (low[1], high[1]),
-            phase[0],
-            phase[1],
-            self._delay_margin(index, crossings, delays),
-            disk,
-            self._frequency(w_disk),
+            name=self.names[index],
+            gain=limits.gain,
+            gain_frequencies=(self._frequency(low), self._frequency(high)),
+            phase=phase,
+            phase_frequency=phase_frequency,
+            delay=self._delay_margin(index, limits.crossings, delays),
+            disk=min(1.0 / peak, 2.0),
+            disk_frequency=self._frequency(w_disk),
         )
 
     def _delay_margin(
-        self, index: int, crossings: list[tuple[float, float]], delays: Array
+        self, index: int, crossings: tuple[Crossing, ...], delays: Array
     ) -> float:
         """Return the least delay [s] of a channel at which the loop becomes unstable.
 
-        `crossings` are the estimated delay [s] and the frequency of each crossing of a gain of 1.
-        In continuous time they are exact. In a sampled loop, a part of a sample changes the gain.
+        In continuous time, the least lag of a crossing gives it. In a sampled loop, a part of a
+        sample also changes the gain.
         """
-        estimate, w = min(crossings, default=(math.inf, 0.0))
+        estimates = [
+            (crossing.lag / self._frequency(crossing.frequency), crossing.frequency)
+            for crossing in crossings
+        ]
+        estimate, w = min(estimates, default=(math.inf, 0.0))
         if not (self.dt and self.is_continuous_plant):
             return estimate
         unstable = self._first_unstable(index, estimate, delays)
-        if unstable is None and math.isfinite(estimate):
-            return self._refined(index, estimate, w, delays)
-        return math.inf if unstable is None else unstable
+        if unstable is not None:
+            return unstable
+        if math.isinf(estimate):
+            return math.inf
+        return self._refined(index, estimate, w, delays)
 
     def _first_unstable(
         self, index: int, estimate: float, delays: Array
@@ -568,10 +559,10 @@ class _Closed:
         def excess(rest: float) -> float:
             rest = min(max(rest, 0.0), 3.0 * h)
             loop = self._delayed_channel(index, rest, delays)
-            level = partial(_log_gain, loop)
+            level = partial(log_gain, loop)
             at = float(newton(level, w, x1=w * (1.0 + 1e-4), rtol=1e-12))
             frequency = self._frequency(at)
-            lag = float(np.angle(-_loop_gain(loop, at)))
+            lag = float(np.angle(-loop_gain(loop, at)))
             turn = 2.0 * math.pi
             expected = samples * h * frequency
             lag += turn * round((expected - lag) / turn)
@@ -589,9 +580,9 @@ class _Closed:
     def _delayed_channel(self, index: int, extra: float, delays: Array) -> Loop:
         """Return the loop of a channel with an additional delay [s] in it."""
         plant = self.delayed_plant(index, extra, delays)
-        return _as_continuous(self.closed(plant), self.dt).channel(index)
+        return as_continuous(*self.closed(plant), self.dt).channel(index)
 
-    def delayed_plant(self, index: int, extra: float, delays: Array) -> _System:
+    def delayed_plant(self, index: int, extra: float, delays: Array) -> System:
         """Return the sampled plant with an additional delay [s] in one channel."""
         channel = self.channels[index]
         if self.at == "inputs":
@@ -599,7 +590,7 @@ class _Closed:
             more[channel] += extra
             return self.with_delays(more)
         # The output is measured at a time within a sample, and passes a chain of samples.
-        A, B, C, D = self.plant
+        A, B, C, D, *_ = self.plant
         held = HeldSystem(A, B, self.dt, delays)
         Ad, Bd = held.sampled()
         Cd, Dd = held.outputs(C, D)
@@ -618,23 +609,10 @@ class _Closed:
             Cd[channel] = 0.0
             Cd[channel, -1] = 1.0
             Dd[channel] = 0.0
-        return _System(Ad, Bd, Cd, Dd)
+        return System(Ad, Bd, Cd, Dd)
 
 
-def disk_gain(disk: float) -> tuple[float, float]:
-    """Return the gain factors in a disk."""
-    most = math.inf
-    if disk < 2.0:
-        most = (2.0 + disk) / (2.0 - disk)
-    return (2.0 - disk) / (2.0 + disk), most
-
-
-def disk_phase(disk: float) -> float:
-    """Return the phase [deg] in a disk."""
-    return math.degrees(2.0 * math.atan(disk / 2.0))
-
-
-def _sampling_time(law: LinearLaw, lin: LinearModel, sample: float | None) -> float:
+def _sampling_time(law: System, lin: LinearModel, sample: float | None) -> float:
     """Return the sampling time [s] of the loop; 0 in continuous time."""
     times = {time for time in (law.dt, lin.dt, sample or 0.0) if time}
     if not times:
@@ -659,111 +637,7 @@ def _joined(A: Array, B: Array, C: Array) -> list[int]:
     return np.flatnonzero(reached & seen).tolist()
 
 
-def _as_continuous(system: Sequence[Array], dt: float) -> Loop:
-    """Return a stable system in continuous time, by the bilinear map s = (z - 1)/(z + 1)."""
-    F, G, H, J = system
-    if not dt:
-        return Loop(F, G, H, J)
-    unit = np.eye(len(F))
-    inverse = np.linalg.inv(F + unit)
-    factor = math.sqrt(2.0)
-    return Loop(
-        inverse @ (F - unit),
-        factor * inverse @ G,
-        factor * H @ inverse,
-        J - H @ inverse @ G,
-    )
-
-
-def _loop_gain(loop: Loop, frequency: float) -> complex:
-    """Return the open-loop gain of a channel, for negative feedback, from (S - T)/2."""
-    value = complex(loop.at(frequency)[0, 0])
-    sensitivity = 0.5 + value
-    if not abs(sensitivity):
-        return complex(math.inf)
-    return (0.5 - value) / sensitivity
-
-
-def _log_gain(loop: Loop, frequency: float) -> float:
-    """Return the logarithm of the magnitude of the open-loop gain of a channel."""
-    return math.log(abs(_loop_gain(loop, frequency)))
-
-
-def _axis_zeros(loop: Loop, sign: float, grid: Array) -> list[float]:
-    """Return the frequencies > 0 at which M(jw) + sign M(-jw) is zero, for one channel.
-
-    With the sign 1, the real part of M is zero there, and the open-loop gain has the magnitude 1.
-    With the sign -1, M and the open-loop gain are real. The frequencies are the zeros on the
-    imaginary axis of a system of twice the size. Changes of sign along `grid` (k,) are also found.
-    """
-    from scipy.linalg import eigvals
-
-    F, G, H, J = loop
-    n = len(F)
-    none = np.zeros((n, n))
-    pencil = np.block(
-        [
-            [F, none, G],
-            [none, -F, G],
-            [H, -sign * H, (1.0 + sign) * J],
-        ]
-    )
-    mass = np.diag(np.concatenate((np.ones(2 * n), [0.0])))
-    zeros = eigvals(pencil, mass)
-    zeros = zeros[np.isfinite(zeros) & (zeros.imag > 0.0)]
-    near = zeros[np.abs(zeros.real) <= _NEAR_AXIS * np.abs(zeros)].imag
-    frequencies = list[float]()
-    crossings = [_crossing(loop, sign, w) for w in np.unique(near).tolist()]
-    for crossing in (*_changes(loop, sign, grid), *crossings):
-        apart = [abs(crossing - other) > 1e-9 * crossing for other in frequencies]
-        if crossing and all(apart):
-            frequencies.append(crossing)
-    return frequencies
-
-
-def _changes(loop: Loop, sign: float, grid: Array) -> list[float]:
-    """Return the frequencies between those of a grid at which M(jw) + sign M(-jw) changes sign."""
-    from scipy.optimize import brentq
-
-    if not len(grid):
-        return []
-
-    def values(frequencies: Array) -> Array:
-        inner = 1j * frequencies[:, None, None] * np.eye(len(loop.F)) - loop.F
-        response = (loop.H @ np.linalg.solve(inner, loop.G))[:, 0, 0] + loop.J[0, 0]
-        chosen: Array = response.real if sign > 0.0 else response.imag
-        return chosen
-
-    signs = np.signbit(values(grid))
-    at = np.flatnonzero(signs[1:] != signs[:-1])
-    return [
-        float(
-            brentq(
-                lambda w: float(values(np.array([w]))[0]), *grid[k : k + 2], rtol=1e-13
-            )
-        )
-        for k in at
-    ]
-
-
-def _crossing(loop: Loop, sign: float, w: float) -> float:
-    """Return the frequency near w at which M(jw) + sign M(-jw) is zero, or 0 if there is none."""
-    from scipy.optimize import brentq
-
-    def value(frequency: float) -> float:
-        response = complex(loop.at(frequency)[0, 0])
-        return response.real if sign > 0.0 else response.imag
-
-    for width in _WIDTHS:
-        low, high = w * (1.0 - width), w * (1.0 + width)
-        if value(low) * value(high) < 0.0:
-            return float(brentq(value, low, high, xtol=1e-14 * w, rtol=1e-14))
-    if abs(value(w)) <= _TOUCHES:
-        return w
-    return 0.0
-
-
-def _delayed(plant: _System, delays: Array) -> _System:
+def _delayed(plant: System, delays: Array) -> System:
     """Return a continuous plant with rational approximations of delays [s] at its inputs."""
     for index in np.flatnonzero(delays):
         for section in _pade(float(delays[index])):
@@ -771,7 +645,7 @@ def _delayed(plant: _System, delays: Array) -> _System:
     return plant
 
 
-def _pade(delay: float) -> list[_System]:
+def _pade(delay: float) -> list[System]:
     """Return the diagonal Pade approximation of a delay [s] as a chain of all-pass sections.
 
     The section of a complex pair of poles p has the transfer function
@@ -786,7 +660,7 @@ def _pade(delay: float) -> list[_System]:
     for pole in poles[poles.imag > 0.0]:
         size, sum_of_pair = float(np.abs(pole)), 2.0 * float(pole.real)
         sections.append(
-            _System(
+            System(
                 np.array([[0.0, size], [-size, sum_of_pair]]),
                 np.array([[0.0], [size]]),
                 np.array([[0.0, 2.0 * sum_of_pair / size]]),
@@ -796,9 +670,9 @@ def _pade(delay: float) -> list[_System]:
     return sections
 
 
-def _after_section(plant: _System, index: int, late: _System) -> _System:
+def _after_section(plant: System, index: int, late: System) -> System:
     """Return a plant with a section before one of its inputs."""
-    A, B, C, D = plant
+    A, B, C, D, *_ = plant
     column = B[:, index : index + 1]
     through = D[:, index : index + 1]
     B, D = B.copy(), D.copy()
@@ -807,7 +681,7 @@ def _after_section(plant: _System, index: int, late: _System) -> _System:
     added = np.zeros((len(late.A), B.shape[1]))
     added[:, index : index + 1] = late.B
     corner = np.zeros((len(late.A), len(A)))
-    return _System(
+    return System(
         np.block([[A, column @ late.C], [corner, late.A]]),
         np.vstack((B, added)),
         np.hstack((C, through @ late.C)),

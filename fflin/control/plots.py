@@ -1,7 +1,7 @@
 """Figures of linear models and control loops: matrices, modes, checks, poles and margins."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,14 +22,14 @@ from fflin.base.names import input_keys, runs
 from fflin.base.tables import counted, rounding
 from fflin.base.validation import (
     Array,
-    Mask,
     Values,
     dimension,
     instance,
     number,
     refuse_masked,
 )
-from fflin.control.gain import Gain
+from fflin.control.gain import Gain, asymmetry
+from fflin.control.optimal.channel_limits import channel_limits
 from fflin.linear.check import Check
 from fflin.linear.model import LinearModel
 
@@ -40,10 +40,6 @@ _POINTS = 400
 # Vertical offset of the plotted points of each test. Without it, the points of two independent
 # computations would overlap.
 _SHIFTS = (-0.15, 0.15, 0.0, 0.0, 0.0, 0.0)
-
-# A gain factor below this counts as zero. Such factors occur because the loop gain of an integrator
-# is infinite at zero frequency.
-_NOTHING = 1e-6
 
 
 class LoopMargins(NamedTuple):
@@ -394,37 +390,12 @@ def input_loops(gain: Gain) -> tuple[Array, Values, list[LoopMargins]]:
     grid = np.geomspace(min(float(rates.min()), end) / 100.0, end, _POINTS)
     values = np.array([response(w) for w in grid])
 
-    def changes(value: Callable[[Values], Array], i: int, among: Mask) -> list[complex]:
-        """Return the gains of loop i at the frequencies where ``value(gain)`` changes sign.
-
-        `among` (k,) is True for the frequencies to search.
-        """
-        from scipy.optimize import brentq
-
-        signs = np.signbit(value(values[:, i]))
-        at = np.flatnonzero((signs[1:] != signs[:-1]) & among[1:] & among[:-1])
-        frequencies = (
-            brentq(lambda w: value(response(w)[i]), *grid[k : k + 2], xtol=1e-12)
-            for k in at
-        )
-        return [complex(response(w)[i]) for w in frequencies]
-
+    loop = asymmetry(gain)
     loops = []
-    # At frequency zero, and at the Nyquist frequency of a sampled model, the loop gain is real. Its
-    # phase may be -180 deg there, without a change of sign of the imaginary part.
-    ends = [response(0.0)]
-    if dt:
-        ends.append(values[-1])
     for i in range(len(K)):
-        crossed = changes(lambda L: np.log(np.abs(L)), i, values[:, i] != 0.0)
-        turned = changes(np.imag, i, values[:, i].real < 0.0)
-        turned += [value[i] for value in ends if value[i].real < 0.0]
-        phases = [180.0 - abs(math.degrees(np.angle(value))) for value in crossed]
-        phase = min(phases, default=math.inf)
-        factors = [1.0 / abs(value) if value else math.inf for value in turned]
-        low = max((x for x in factors if _NOTHING < x < 1.0), default=0.0)
-        high = min((x for x in factors if x > 1.0), default=math.inf)
-        loops.append(LoopMargins(phase, (low, high)))
+        limits = channel_limits(loop.channel(i), np.zeros(0))
+        phases = [crossing.phase for crossing in limits.crossings]
+        loops.append(LoopMargins(min(phases, default=math.inf), limits.gain))
     return grid, values, loops
 
 

@@ -104,19 +104,29 @@ class StateForm(NamedTuple):
     grid: Mapping[str, Array]
 
 
-class LinearLaw(NamedTuple):
-    """Law u - u0 = C z + D e about a point, where ``A z + B e`` is dz/dt, or the next z.
+class System(NamedTuple):
+    """State-space system A, B, C, D with the names of its inputs and outputs.
 
-    e contains the deviations of the measured `signals` from the point: names of states, or of
-    outputs of the robot. dt [s] is 0 in continuous time.
+    The sample time dt [s] is 0 in continuous time, -1 for a sampled system with unknown sample
+    time, and None if it is not given.
     """
 
     A: Array
     B: Array
     C: Array
     D: Array
-    dt: float
-    signals: tuple[str, ...]
+    dt: float | None = None
+    inputs: tuple[str, ...] = ()
+    outputs: tuple[str, ...] = ()
+
+
+def proportional(
+    K: Array, dt: float, states: tuple[str, ...], inputs: tuple[str, ...]
+) -> System:
+    """Return the feedback u - u0 = -K (x - x0) as a system without states."""
+    nu, nx = K.shape
+    none = np.zeros((0, 0))
+    return System(none, np.zeros((0, nx)), np.zeros((nu, 0)), -K, dt, states, inputs)
 
 
 class OutputForm(NamedTuple):
@@ -318,21 +328,16 @@ class Policy(ABC):
             return None
         return lambda model: model.A - model.B @ K
 
-    def linear_law(self) -> LinearLaw | None:
-        """Return the law as a linear system, or None if it is not linear about a point."""
+    def linear_law(self) -> System | None:
+        """Return the law from deviations of its sensors to u - u0, or None if it is not linear.
+
+        The sensors are states of `model`, or outputs if `senses_outputs` is true.
+        """
         lin = self.model
         K = self.feedback_gain
         if lin is None or K is None:
             return None
-        nu, nx = K.shape
-        return LinearLaw(
-            np.zeros((0, 0)),
-            np.zeros((0, nx)),
-            np.zeros((nu, 0)),
-            -K,
-            lin.dt,
-            lin.state_names,
-        )
+        return proportional(K, lin.dt, lin.state_names, lin.input_names)
 
     def poles_along(self) -> Array:
         """Return the poles [1/s] of the robot and of the loop along the followed trajectory."""

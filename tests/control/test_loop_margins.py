@@ -168,7 +168,7 @@ def test_disk_margins_equal_a_search_over_frequencies_and_phases(joints, how):
     K = policy.K
     kept = np.flatnonzero(K.any(axis=1))
     assert len(kept) == count
-    A, B, C, _ = plant
+    A, B, C, *_ = plant
     law = loop.law.D
     closed = A + B @ factors @ law @ C
     poles = np.linalg.eigvals(closed.astype(complex))
@@ -180,6 +180,92 @@ def test_disk_margins_equal_a_search_over_frequencies_and_phases(joints, how):
         poles = np.linalg.eigvals((A + B @ scaled @ law @ C).astype(complex))
         growth = np.abs(poles).max() - 1.0 if loop.dt else poles.real.max()
         assert (growth < 0.0) == is_stable
+
+
+def felt():
+    """Return a model whose outputs include an acceleration, and a law with a state that uses it."""
+    robot = fflin.load(
+        "planar_detumble",
+        inputs=[fflin.JointTorque("joint_1")],
+        outputs=[
+            fflin.JointPositions(("joint_1",)),
+            fflin.JointVelocities(("joint_1",)),
+            fflin.Accelerometer("base"),
+        ],
+        stiffness={"joint_*": 2.0},
+        damping={"joint_*": 0.2},
+    )
+    lin = fflin.linearize(robot)
+    ny = len(lin.output_names)
+    C = np.zeros((1, 2))
+    C[0, 1] = -0.4
+    B = np.zeros((2, ny))
+    B[0, 2:4] = 0.3, 0.2
+    B[1, 3] = 0.5
+    D = np.zeros((1, ny))
+    D[0, :2] = -12.0, -5.0
+    A = np.array([[-3.0, 0.5], [1.0, -4.0]])
+    return lin, fflin.LinearController((A, B, C, D), lin)
+
+
+@pytest.mark.parametrize("how", [{}, {"sample": 0.04}, {"sample": 0.05, "delay": 0.03}])
+def test_changes_of_measured_outputs_destabilise_at_their_margins(how):
+    """The closed loop is built here by itself, with complex factors at the outputs."""
+    lin, controller = felt()
+    assert lin.D.any()
+    margins = fflin.margins(controller, lin, at="outputs", **how)
+    assert margins.stable and len(margins.channels) > 2
+    law = controller
+    if "sample" in how:
+        law = controller.sampled(how["sample"])
+    Ac, Bc, Cc, Dc = law.system[:4]
+    A, B, C, D = lin.A, lin.B, lin.C, lin.D
+    if "sample" in how:
+        held = HeldSystem(A, B, how["sample"], np.full(1, how.get("delay", 0.0)))
+        A, B = held.sampled()
+        C, D = held.outputs(C, D)
+
+    def growth(factors):
+        """Return how far the poles are beyond the boundary; x' of u = Cc z + Dc f (C x + D u)."""
+        f = np.ones(len(lin.output_names), complex)
+        for channel, factor in factors.items():
+            f[lin.output_names.index(channel)] = factor
+        F = f[:, None] * np.hstack((C, np.zeros((len(C), len(Ac)))))
+        K = np.hstack((np.zeros((1, len(A))), Cc)) + Dc @ F
+        closed = np.block(
+            [
+                [A.astype(complex), np.zeros((len(A), len(Ac)))],
+                [np.zeros((len(Ac), len(A))), Ac],
+            ]
+        )
+        measured = F + f[:, None] * (D @ K)
+        closed = closed + np.vstack((B @ K, Bc @ measured))
+        kept = np.abs(closed).sum(axis=0) > 0.0
+        poles = np.linalg.eigvals(closed[np.ix_(kept, kept)])
+        poles = poles[np.abs(poles - (1.0 if "sample" in how else 0.0)) > 1e-6]
+        return np.abs(poles).max() - 1.0 if "sample" in how else poles.real.max()
+
+    names = [channel.name for channel in margins.channels]
+    for share, is_stable in ((0.999, True), (1.001, False)):
+        change = 2.0 * (margins.factors - 1.0) / (margins.factors + 1.0) * share
+        factors = (1.0 + 0.5 * change) / (1.0 - 0.5 * change)
+        assert (growth(dict(zip(names, factors, strict=True))) < 0.0) == is_stable
+    limited = 0
+    for channel in margins.channels:
+        for limit, beyond in zip(channel.gain, (0.999, 1.001), strict=True):
+            if 0.0 < limit < math.inf:
+                assert growth({channel.name: limit * beyond}) > 0.0
+                assert growth({channel.name: limit / beyond}) < 0.0
+                limited += 1
+        if channel.phase < 180.0:
+            both = [
+                growth({channel.name: np.exp(1j * math.radians(channel.phase * x))})
+                for x in (0.999, 1.001, -0.999, -1.001)
+            ]
+            assert both[0] < 0.0 and both[2] < 0.0
+            assert both[1] > 0.0 or both[3] > 0.0
+            limited += 1
+    assert limited
 
 
 @pytest.mark.parametrize("how", [{"sample": 0.02}, {"sample": 0.05, "delay": 0.03}])
@@ -214,7 +300,7 @@ def test_gain_margins_are_the_factors_at_which_the_sampled_loop_is_unstable(join
     margins = fflin.margins(policy, lin, sample=0.05, delay=0.03)
     loop = loop_of(policy, lin, sample=0.05, delay=0.03)
     plant = loop.with_delays(np.full(len(lin.input_names), 0.03))
-    A, B, C, _ = plant
+    A, B, C, *_ = plant
     for index, channel in enumerate(margins.channels):
 
         def growth(factor, index=index):
@@ -258,7 +344,7 @@ def test_the_bounds_of_many_channels_are_within_a_fifth():
     assert margins.disk_reached <= 1.2 * margins.disk
     factors = margins.factors
     loop = loop_of(policy, lin)
-    A, B, C, _ = loop.with_delays(np.zeros(len(lin.input_names)))
+    A, B, C, *_ = loop.with_delays(np.zeros(len(lin.input_names)))
     law = loop.law
     assert not law.D.any()
     wide = np.ones(len(lin.input_names), complex)

@@ -6,6 +6,7 @@ signals that they perturb. The perturbation is diagonal, with one complex number
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from itertools import pairwise
 from typing import NamedTuple
@@ -66,6 +67,38 @@ class Loop(NamedTuple):
     def scaled(self, d: Array) -> Loop:
         """Return the loop D M D^-1 with D = diag(d)."""
         return Loop(self.F, self.G / d, d[:, None] * self.H, d[:, None] * self.J / d)
+
+
+def as_continuous(F: Array, G: Array, H: Array, J: Array, dt: float) -> Loop:
+    """Return the loop of a stable system that is sampled at dt [s], or continuous if dt is 0.
+
+    The bilinear map s = (z - 1)/(z + 1) preserves the values of the response, at the frequencies
+    tan(w dt / 2).
+    """
+    if not dt:
+        return Loop(F, G, H, J)
+    unit = np.eye(len(F))
+    inverse = np.linalg.inv(F + unit)
+    factor = 2.0**0.5
+    return Loop(
+        inverse @ (F - unit),
+        factor * inverse @ G,
+        factor * H @ inverse,
+        J - H @ inverse @ G,
+    )
+
+
+def disk_gain(disk: float) -> tuple[float, float]:
+    """Return the gain factors in a disk."""
+    most = math.inf
+    if disk < 2.0:
+        most = (2.0 + disk) / (2.0 - disk)
+    return (2.0 - disk) / (2.0 + disk), most
+
+
+def disk_phase(disk: float) -> float:
+    """Return the phase [deg] in a disk."""
+    return math.degrees(2.0 * math.atan(disk / 2.0))
 
 
 class Peak(NamedTuple):
