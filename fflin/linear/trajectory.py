@@ -201,7 +201,8 @@ class Trajectory(Design):
 
     def _html_parts(self) -> list[str]:
         rows = svg.sampled(len(self.t))
-        robot, q = self.robot, self.q[rows]
+        robot = self.robot
+        q = self.q[rows]
         apart = np.minimum(1.0, np.abs(q[:, 3:7] @ q[0, 3:7]))
         charts = {
             "attitude from the start": (

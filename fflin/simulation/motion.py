@@ -16,7 +16,7 @@ from fflin.base.errors import FflinWarning, InputError
 from fflin.base.figures import Figure
 from fflin.base.record import Design
 from fflin.base.tables import data_frame
-from fflin.base.validation import Array, ArrayLike, Open, Vector, instance
+from fflin.base.validation import Array, Open, Vector, instance
 from fflin.base.writing import RECORDS, as_path, check_ending
 from fflin.dynamics.coordinates import frame_of
 from fflin.dynamics.impact import Impact, joint_called
@@ -28,7 +28,7 @@ from fflin.linear.trajectory import Trajectory
 from fflin.robot.joints import ROOT
 from fflin.robot.orbit import CircularOrbit
 from fflin.robot.robot import Robot
-from fflin.simulation.pointing import Pointing, pointing
+from fflin.simulation.pointing import pointing
 from fflin.simulation.report import (
     Passed,
     Saturated,
@@ -302,56 +302,7 @@ class Motion(StatesAndInputs, Design):
             return None
         return attitude_errors(self.x, self.target)
 
-    def pointing(
-        self,
-        window: float,
-        *,
-        after: float | None = None,
-        apart: float | None = None,
-        accuracy: float | None = None,
-        line_of_sight: ArrayLike | None = None,
-    ) -> Pointing:
-        """Return the pointing errors from the target, in the terms of ECSS-E-ST-60-10C.
-
-        The error is the rotation from the target to the attitude of the base, in target axes. Time
-        averages treat it as linear between rows. At most 2000 windows are evaluated, which begin at
-        rows of the motion.
-
-        Parameters
-        ----------
-        window : float
-            Length of the windows [s] of the mean and relative errors.
-        after : float, optional
-            Time [s] from which errors are counted: by default the settling time if `accuracy` is
-            given and reached, otherwise half of the run.
-        apart : float, optional
-            Time [s] between the windows of the drift; `window` by default.
-        accuracy : float, optional
-            Angle [deg] for the settling time.
-        line_of_sight : array_like (3,), optional
-            Direction in base axes whose angle from the target is judged instead of the rotation.
-
-        Returns
-        -------
-        Pointing
-
-        Raises
-        ------
-        InputError
-            If the motion has no target, or is too short for a window.
-
-        References
-        ----------
-        ECSS-E-ST-60-10C, Space engineering: control performance, 2008.
-        """
-        return pointing(
-            self,
-            window,
-            after=after,
-            apart=apart,
-            accuracy=accuracy,
-            line_of_sight=line_of_sight,
-        )
+    pointing = pointing
 
     def then(self, *later: Impact | Motion) -> Motion:
         """Join this motion and later phases into one motion.

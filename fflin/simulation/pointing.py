@@ -190,7 +190,41 @@ def pointing(
     accuracy: float | None = None,
     line_of_sight: ArrayLike | None = None,
 ) -> Pointing:
-    """Return the pointing errors of a motion, see `Motion.pointing`."""
+    """Return the pointing errors from the target, in the terms of ECSS-E-ST-60-10C.
+
+    The error is the rotation from the target to the attitude of the base, in target axes. Time
+    averages treat it as linear between rows. At most 2000 windows are evaluated, which begin at
+    rows of the motion.
+
+    Parameters
+    ----------
+    motion : Motion
+        A method of the motion: ``motion.pointing(window)``.
+    window : float
+        Length of the windows [s] of the mean and relative errors.
+    after : float, optional
+        Time [s] from which errors are counted: by default the settling time if `accuracy` is
+        given and reached, otherwise half of the run.
+    apart : float, optional
+        Time [s] between the windows of the drift; `window` by default.
+    accuracy : float, optional
+        Angle [deg] for the settling time.
+    line_of_sight : array_like (3,), optional
+        Direction in base axes whose angle from the target is judged instead of the rotation.
+
+    Returns
+    -------
+    Pointing
+
+    Raises
+    ------
+    InputError
+        If the motion has no target, or is too short for a window.
+
+    References
+    ----------
+    ECSS-E-ST-60-10C, Space engineering: control performance, 2008.
+    """
     window = positive("window", window, "s")
     if not motion.target.size:
         raise InputError(

@@ -459,7 +459,8 @@ def panel(
     predicted_errors = dict[str, tuple[str, Array]]()
     if predicted is not None:
         predicted_errors = errors(robot, predicted, compared, motion.wheels)
-    readouts, plots = list[tuple[str, str, Array]](), list[dict[str, Any]]()
+    readouts = list[tuple[str, str, Array]]()
+    plots = list[dict[str, Any]]()
     for quantity, (unit, values) in error_of.items():
         label = label_form.format(quantity)
         _, linear = predicted_errors.get(quantity, (unit, None))

@@ -22,6 +22,19 @@ function roundLevels(low, high, most) {
   return levels;
 }
 
+// Copies what is drawn to a canvas, with a line at x from the top to `bottom`; returns its context.
+function withCursor(canvas, drawn, x, bottom, ratio) {
+  const context = canvas.getContext("2d");
+  context.clearRect(0, 0, canvas.width, canvas.height);
+  context.drawImage(drawn, 0, 0);
+  Object.assign(context, { strokeStyle: getComputedStyle(document.body).getPropertyValue("--ink"), globalAlpha: 0.75, lineWidth: ratio });
+  context.beginPath();
+  context.moveTo(x, 0); context.lineTo(x, bottom);
+  context.stroke();
+  context.globalAlpha = 1;
+  return context;
+}
+
 // `curves` returns those that are shown; `large` charts have a grid at round levels.
 function makeChart(canvas, t, curves, marks, large = false) {
   const first = t[0], duration = t[t.length - 1] - first || 1;
@@ -112,14 +125,7 @@ function makeChart(canvas, t, curves, marks, large = false) {
     last = [i, time];
     if (!drawn || canvas.width !== width) draw();
     if (!drawn) return;
-    const context = canvas.getContext("2d");
-    context.clearRect(0, 0, width, height);
-    context.drawImage(drawn, 0, 0);
-    Object.assign(context, { strokeStyle: getComputedStyle(document.body).getPropertyValue("--ink"), globalAlpha: 0.75, lineWidth: ratio });
-    context.beginPath();
-    context.moveTo(x(time), 0); context.lineTo(x(time), height - foot * ratio);
-    context.stroke();
-    context.globalAlpha = 1;
+    const context = withCursor(canvas, drawn, x(time), height - foot * ratio, ratio);
     for (const { colour, values } of lines) {
       context.fillStyle = colour;
       context.beginPath();

@@ -40,15 +40,7 @@ function makeRaster(canvas, t, curves, marks, large = false) {
   const show = (i, time) => {
     if (!drawn || canvas.width !== width) draw();
     if (!drawn) return;
-    const context = canvas.getContext("2d");
-    context.clearRect(0, 0, width, height);
-    context.drawImage(drawn, 0, 0);
-    Object.assign(context, { strokeStyle: getComputedStyle(document.body).getPropertyValue("--ink"), globalAlpha: 0.75, lineWidth: ratio });
-    context.beginPath();
-    const x = ((time - first) / duration) * right();
-    context.moveTo(x, 0); context.lineTo(x, row() * lines.length);
-    context.stroke();
-    context.globalAlpha = 1;
+    withCursor(canvas, drawn, ((time - first) / duration) * right(), row() * lines.length, ratio);
   };
   const under = (event) => {
     const bounds = canvas.getBoundingClientRect();
