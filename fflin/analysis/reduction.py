@@ -345,37 +345,41 @@ def ignorable_wheels(lin: LinearModel) -> tuple[Indices, Indices]:
 
 def removed_wheels(lin: LinearModel, wheel_speeds: bool | None) -> Indices:
     """Return the indices (k,) of the wheels that a design does not regulate (9.5)."""
-    # `free` contains the wheels whose angles and speeds do not affect the other states. Some
-    # combinations of inputs change the speeds of these wheels but exert no net force on the rigid
-    # motions of the other bodies. If `wheel_speeds` is true, as many wheels are kept as these
-    # combinations can spin independently, and the others in `free` are removed. If `wheel_speeds`
-    # is false, all wheels in `free` are removed. By default, `wheel_speeds` is true if an input,
-    # such as a thruster, exerts a torque on the whole robot.
+    # The angles and speeds of the wheels in `free` do not affect the other states, so these wheels
+    # can be removed. Without `wheel_speeds`, all of them are removed. With `wheel_speeds`, a design
+    # regulates as many of them as the inputs can spin independently without a net force on the
+    # rigid motions of the other bodies. By default, `wheel_speeds` is true if an input, such as a
+    # thruster, exerts a torque on the whole robot, because it can then unload the wheels.
     if wheel_speeds is not None and not isinstance(wheel_speeds, bool | np.bool_):
         raise InputError(
             f"wheel_speeds is {wheel_speeds!r}, expected True, False or None"
         )
     _, free = ignorable_wheels(lin)
-    if len(free) and wheel_speeds is None:
-        turning = [name.startswith("q_b.") for name in lin.state_names[: len(lin.M)]]
-        wheel_speeds = bool(
-            mechanics.second_order(lin.generator or lin).S.values[turning].any()
-        )
-    if not len(free) or not wheel_speeds:
+    if not len(free):
         return free
-    forces = rigid_forces(without(lin.generator or lin, free))
+    source = lin.generator or lin
+    if wheel_speeds is None:
+        names = lin.state_names[: len(lin.M)]
+        attitude = [name.startswith("q_b.") for name in names]
+        torques_on_robot = mechanics.second_order(source).S.values[attitude]
+        wheel_speeds = bool(torques_on_robot.any())
+    if not wheel_speeds:
+        return free
+    # Combinations of inputs (nu, k) without a force on the rigid motions of the other bodies.
+    forces = rigid_forces(without(source, free))
     sizes = divisors(np.linalg.norm(forces.values, axis=0))
-    idle = null_space(forces @ np.diag(1.0 / sizes))[0]
-    motors = [
-        motor_of(lin.input_names, lin.state_names[i].removeprefix("q_m.")) for i in free
-    ]
-    # A wheel without a motor has a zero row: no combination of inputs spins it alone.
-    torques = np.zeros((len(free), idle.shape[1]))
-    for row, motor in enumerate(motors):
+    combinations, _ = null_space(forces @ np.diag(1.0 / sizes))
+    # Motor torque on each wheel in `free` for each combination; zero for a wheel without a motor.
+    torques = np.zeros((len(free), combinations.shape[1]))
+    for row, index in enumerate(free):
+        wheel = lin.state_names[index].removeprefix("q_m.")
+        motor = motor_of(lin.input_names, wheel)
         if motor is not None:
-            torques[row] = idle[motor]
-    spun = image(torques, _ROUNDING)[0]
-    return np.delete(free, echelon(spun, np.ones(len(free)))[1])
+            torques[row] = combinations[motor]
+    # The combinations can spin as many wheels independently as the torques have pivots.
+    independent, _ = image(torques, _ROUNDING)
+    _, pivots = echelon(independent, np.ones(len(free)))
+    return np.delete(free, pivots)
 
 
 def regulated_part(lin: LinearModel, wheel_speeds: bool | None = None) -> LinearModel:
@@ -479,10 +483,15 @@ def selected(
 ) -> LinearModel:
     """Return the model with the named states, inertia M, and only the outputs of these states."""
     S = selection(names, lin.state_names)
-    seen, values = outputs_of(lin, S), part_of(lin, S, S.T, M)
-    values |= {"C": seen @ lin.C @ S.T, "D": seen @ lin.D, "y0": seen @ lin.y0}
-    for key in ("output_names", "output_units"):
-        values[key] = tuple(getattr(lin, key)[i] for i in seen.argmax(axis=1))
+    # Each row of P selects an output that depends only on the named states.
+    P = outputs_of(lin, S)
+    outputs = P.argmax(axis=1)
+    values = part_of(lin, S, S.T, M)
+    values["C"] = P @ lin.C @ S.T
+    values["D"] = P @ lin.D
+    values["y0"] = P @ lin.y0
+    values["output_names"] = tuple(lin.output_names[i] for i in outputs)
+    values["output_units"] = tuple(lin.output_units[i] for i in outputs)
     return certified(LinearModel(**values), lin, make)
 
 

@@ -206,15 +206,20 @@ def _to_mat(record: Mapping[str, object], checksummed: bool) -> bytes:
     from scipy.io import savemat
 
     buffer = io.BytesIO()
-    cells = {
-        k: np.array(v, dtype=object) for k, v in record.items() if isinstance(v, list)
-    }
-    savemat(buffer, {**record, **cells}, oned_as="column")
+    variables = dict(record)
+    for name, value in record.items():
+        # An array of objects becomes a cell array.
+        if isinstance(value, list):
+            variables[name] = np.array(value, dtype=object)
+    savemat(buffer, variables, oned_as="column")
+    # MATLAB ignores the text at the start of the header. Replace the text that SciPy writes, which
+    # contains the date, so that equal records give equal files. The new text has room for a
+    # checksum of the rest of the file.
     body = buffer.getvalue()[_MAT_TEXT:]
-    head = b"MATLAB 5.0 MAT-file"
+    text = b"MATLAB 5.0 MAT-file"
     if checksummed:
-        head = _MAT_CHECKSUM + hashlib.sha256(body).hexdigest().encode()
-    return head.ljust(_MAT_TEXT) + body
+        text = _MAT_CHECKSUM + hashlib.sha256(body).hexdigest().encode()
+    return text.ljust(_MAT_TEXT) + body
 
 
 def _from_mat(content: bytes) -> tuple[Record, bool]:

@@ -4,7 +4,7 @@ import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import combinations, repeat
+from itertools import combinations
 from operator import attrgetter
 from typing import NamedTuple
 
@@ -342,29 +342,34 @@ class Dispersions:
         Only dispersed bodies are included. Each key is the index of a joint in `_model`. The
         inertias are about the centres of mass.
         """
-        robot, model = self._plant.robot, self._model
+        robot = self._plant.robot
+        model = self._model
         pieces = [*robot.pieces.values()]
+        mass = self._of("mass", drawn)
+        density = self._of("density", drawn)
+        com = self._of("com", drawn)
+        inertia = self._of("inertia", drawn)
         dispersed = set[int]()
-        mass, com, inertia, density = map(self._of, _OF_BODIES, repeat(drawn))
         for column in self.columns:
             if column.kind in _OF_BODIES:
                 dispersed.update(column.at)
-        # pseudo-inertias (N, 4, 4); at first, only their changes
-        changed = dict[int, Array]()
+        # {joint: changes (N, 4, 4) of the pseudo-inertia}; a body may consist of several pieces
+        changes = dict[int, Array]()
         for at in sorted(dispersed):
-            joint = pieces[at].joint
-            bare_joint = ROOT
-            if joint > ROOT:
-                bare_joint = model.getJointId(robot.model.names[joint])
-            changes = mass[:, at], density[:, at], com[:, at], inertia[:, at]
-            changed[bare_joint] = changed.get(bare_joint, 0.0) + varied(
-                pieces[at], *changes
+            piece = pieces[at]
+            # `_model` has no wheels and no modes, so its joints have other indices.
+            joint = ROOT
+            if piece.joint > ROOT:
+                joint = model.getJointId(robot.model.names[piece.joint])
+            change = varied(
+                piece, mass[:, at], density[:, at], com[:, at], inertia[:, at]
             )
-        for bare_joint, change in changed.items():
-            changed[bare_joint] = (
-                model.inertias[bare_joint].toPseudoInertia().toMatrix() + change
-            )
-        return dict(zip(changed, map(properties, changed.values()), strict=True))
+            changes[joint] = changes.get(joint, 0.0) + change
+        result = dict[int, tuple[Array, Array, Array]]()
+        for joint, change in changes.items():
+            nominal = model.inertias[joint].toPseudoInertia().toMatrix()
+            result[joint] = properties(nominal + change)
+        return result
 
     def _springs(self, drawn: Array) -> dict[str, Array]:
         """Return {"stiffness" or "damping": values (N, n) of all joints}.

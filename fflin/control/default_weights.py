@@ -353,27 +353,40 @@ def _definite(reach: Array, D: Array) -> Array:
 def _on_velocities(
     lin: LinearModel, S: Array, cost: Array, least: Array, damped: bool
 ) -> Callable[[float], Array]:
-    """Return a function that maps a bandwidth w to the weight (m, m) on velocities (10.8)."""
-    m, X = len(lin.M), rate_matrix(lin)
+    """Return a function that maps a bandwidth w to the weight (m, m) on velocities (10.8).
+
+    S (m, nu) contains the generalised forces of the inputs, and `cost` (nu,) the diagonal of R. The
+    effect of the inputs is measured in units of `least` (m, m), the scaled matrix D of (10.7).
+    """
+    m = len(lin.M)
+    # Root of the effect S R^-1 S' of the inputs. Weak directions are raised to a small effect.
     factor = np.linalg.cholesky(least)
     forces = np.linalg.solve(factor, S)
-    values, directions = np.linalg.eigh((forces / cost) @ forces.T)
-    root = factor @ directions * np.sqrt(values.clip(_LEAST_REACH))
+    effects, directions = np.linalg.eigh((forces / cost) @ forces.T)
+    root = factor @ directions * np.sqrt(effects.clip(_LEAST_REACH))
+    # Velocities are L p' with the coordinates p of (10.5), and p'' = F p + H p' + u'.
     L = np.linalg.solve(lin.M, root)
-    F = np.linalg.solve(L, X[m:, :m] @ X[:m, m:] @ L)
-    H = np.linalg.solve(L, X[m:, m:] @ L)
+    rate = rate_matrix(lin)
+    F = np.linalg.solve(L, rate[m:, :m] @ rate[:m, m:] @ L)
+    H = np.linalg.solve(L, rate[m:, m:] @ L)
+    damping_term = np.zeros_like(H)
+    if damped:
+        damping_term = H.T @ H
     _, stiffness, modes = np.linalg.svd(F)
-    damping_term = H.T @ H * damped
-    back = np.linalg.inv(L)
+    to_p = np.linalg.inv(L)
 
-    def at(w: float) -> Array:
-        part = 2.0 * w**2 * (1.0 - w**2 / (stiffness + np.hypot(stiffness, w**2)))
-        values, directions = np.linalg.eigh((modes.T * part) @ modes - damping_term)
-        rows = directions.T @ back
+    def velocity_weight(w: float) -> Array:
+        # Equal to 2 (w^2 + |F| - (F^2 + w^4)^(1/2)), in a form without cancellation.
+        root = np.hypot(stiffness, w**2)
+        of_modes = 2.0 * w**2 * (1.0 - w**2 / (stiffness + root))
+        V = (modes.T * of_modes) @ modes - damping_term
+        values, directions = np.linalg.eigh(V)
+        # The weight is the positive semidefinite part of V.
+        rows = directions.T @ to_p
         weight: Array = (rows.T * values.clip(0.0)) @ rows / w**4
         return 0.5 * (weight + weight.T)
 
-    return at
+    return velocity_weight
 
 
 def _rate_of_fall(lin: LinearModel) -> float:
@@ -424,16 +437,24 @@ def _fastest(
     The displacements have the magnitudes `size` (m,), and the bandwidth is 1 rad/s. T (k, m) maps
     the rates of the modes to the speeds and the wheel momenta.
     """
-    # Each mode x obeys ``mass x'' + most x' + rates^2 x = 0``. The modes are normalised with
-    # M + B / w, so `mass` (m,) is 1 without dampers, and at most 1 with dampers.
-    most = np.sqrt((1.0 - mass) ** 2 + 2.0 * mass * rates**2)
-    root = np.sqrt(most**2 - 4.0 * mass * rates**2 + 1e-12j)
-    power = 1 if (mass == 1.0).all() else 2
-    first = 0.1 / rates[-1] ** power
-    time = np.geomspace(first, 3.0, 60)[:, None]
-    fast, slow = (np.exp((x - most) * time / (2.0 * mass)) for x in (-root, root))
-    moving = (rates**2 * (slow - fast) / root).real
-    use = _largest_use(T @ (moving[..., None] * to_modes), size, lin.state_names)
+    # In closed loop, each mode x obeys ``mass x'' + damping x' + stiffness x = 0``. The modes are
+    # normalised with M + B / w, so `mass` (m,) is 1 without dampers, and at most 1 with dampers.
+    # The dampers alone have the coefficient 1 - mass.
+    stiffness = rates**2
+    damping = np.sqrt((1.0 - mass) ** 2 + 2.0 * mass * stiffness)
+    # The imaginary part avoids a division by zero if a mode is critically damped.
+    root = np.sqrt(damping**2 - 4.0 * mass * stiffness + 1e-12j)
+    # A light mode with dampers decays at up to rates^2, a mode without dampers at about `rates`.
+    fastest = rates[-1]
+    if (mass != 1.0).any():
+        fastest = rates[-1] ** 2
+    time = np.geomspace(0.1 / fastest, 3.0, 60)[:, None]
+    slow = np.exp((root - damping) * time / (2.0 * mass))
+    fast = np.exp((-root - damping) * time / (2.0 * mass))
+    # Speed -x' of each mode at each time, after a start from rest with x = 1.
+    mode_speeds = (stiffness * (slow - fast) / root).real
+    rows = T @ (mode_speeds[..., None] * to_modes)
+    use = _largest_use(rows, size, lin.state_names)
     largest: Array = use.max(axis=0)
     return largest
 

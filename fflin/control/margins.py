@@ -205,7 +205,7 @@ def margins(
     The disk margin of n channels is the inverse of the largest structured singular value of
     (S - T)/2 over frequency, where S and T are the sensitivity and the complementary sensitivity.
     Its upper bound D (S - T)/2 D^-1 with the best diagonal D for each frequency is exact for up to
-    three channels. For more, the result also contains the least destabilising change that was
+    three channels. For more, the result also contains the smallest destabilising change that was
     found.
 
     Parameters

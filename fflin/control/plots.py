@@ -405,7 +405,9 @@ def _bode(sizes: Axes, phases: Axes, w: Array, response: Values) -> None:
     sizes.loglog(w, np.abs(response), lw=1.0)
     for color, values in zip(colors, response.T, strict=True):
         angle = np.degrees(np.unwrap(np.angle(values)))
-        angle -= 360.0 * math.ceil(angle[-1] / 360.0)
+        # Shift the curve by full turns, so that it ends between -360 deg and 0.
+        turns = math.ceil(angle[-1] / 360.0)
+        angle -= 360.0 * turns
         phases.semilogx(w, angle, color=color, lw=1.0)
     sizes.axhline(1.0, color=_LINE, lw=0.8)
     phases.axhline(-180.0, color=_LINE, lw=0.8)

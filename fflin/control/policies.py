@@ -398,18 +398,20 @@ class AllocatedPolicy(BoundLaw):
     def __call__(self, t: float, q: Array, v: Array) -> Array:
         """Return the inputs (nu,) whose generalised force is nearest to the commanded force.
 
-        All inputs are within their limits.
+        All inputs are within their limits. The difference d of the two forces has the length
+        sqrt(d' M^-1 d), with the inertia M of the design.
         """
         state = self._design.state
         chart = state.unchecked_chart(q)
-        u = self._design.in_base_axes(chart, self._command(t, q, v))
-        force = self._design.columns(self._data, q) @ u
-        columns = chart.to_reference(
-            self._robot.held, self._robot.columns(self._data, q).T
-        ).T
+        command = self._design.in_base_axes(chart, self._command(t, q, v))
+        force = self._design.columns(self._data, q) @ command
+        # For inputs u in reference axes, the force is B_u R' u = (R B_u')' u.
+        B = self._robot.columns(self._data, q)
+        columns = chart.to_reference(self._robot.held, B.T).T
         M = state.project(pin.crba(state.robot.model, self._design_data, q).T)
-        factor = np.linalg.cholesky(M)
-        scaled = np.linalg.solve(factor, np.column_stack((columns, force)))
+        # With M = L L', the length of d is the Euclidean norm of L^-1 d.
+        L = np.linalg.cholesky(M)
+        scaled = np.linalg.solve(L, np.column_stack((columns, force)))
         return nearest(scaled[:, :-1], scaled[:, -1], *self._limits)
 
 

@@ -19,6 +19,7 @@ from fflin.control.policies import (
     Loop,
     OutputSensing,
     Sample,
+    Step,
 )
 from fflin.control.policy import (
     Command,
@@ -356,29 +357,28 @@ class TrajectoryOutputFeedback(OutputSensing, TrajectoryFeedback):
             )
 
     def bind(self, robot: Robot) -> Loop:
-        """Return policy(t, q, v) -> u for a robot; each call returns one with its own estimate.
+        """Return policy(t, q, v) -> u for a robot; each returned policy has its own estimate.
 
         Raises
         ------
         InputError
             If the robot has other states, inputs or outputs than the trajectory.
         """
-        origin = self.trajectory.robot
-        home = self.state_map(robot)
-        made = f"the trajectory was made for '{origin.name}'"
-        design_outputs = signals_of(StateMap(origin, frame="local"), "output")
-        require_same(made, home, "output", *design_outputs)
+        design = self.trajectory.robot
+        state = self.state_map(robot)
+        origin = f"the trajectory was made for '{design.name}'"
+        design_outputs = signals_of(StateMap(design, frame="local"), "output")
+        require_same(origin, state, "output", *design_outputs)
 
-        def expected_at(t: float) -> tuple[Measuring, Array]:
+        def terms_at(t: float) -> tuple[Step, Measuring, Array]:
+            # Positions and attitudes are measured relative to the base pose of the trajectory.
             q, v, _ = self.reference(t)
-            state = home.about(home.origin * pin.XYZQUATToSE3(q[:7]))
-            return Measuring(state, q), state.read(q, v)
+            base_pose = state.origin * pin.XYZQUATToSE3(q[:7])
+            relative = state.about(base_pose)
+            return self.terms(t).step, Measuring(relative, q), relative.read(q, v)
 
-        dt = self.filter.dt
         sizes = self.filter.L.shape[1:]
-        return Loop(
-            home, dt, sizes, lambda t: (self.terms(t).step, *expected_at(t)), self.noise
-        )
+        return Loop(state, self.filter.dt, sizes, terms_at, self.noise)
 
     @property
     def sensors(self) -> tuple[str, ...]:

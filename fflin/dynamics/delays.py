@@ -77,15 +77,16 @@ class HeldSystem:
                 of_commands[:, index] = held[:, index]
                 continue
             column = B[:, index : index + 1]
+            # The oldest command acts until the time `rest`, and the next command from then on.
             oldest = self.first[index] + samples - 1
-            _, early = held_exponential(A, column, min(rest, s))
-            left = max(s - rest, 0.0)
-            moved, late = held_exponential(A, column, left)
-            of_states[:, oldest] = (moved @ early)[:, 0]
+            _, by_oldest = held_exponential(A, column, min(rest, s))
+            time_left = max(s - rest, 0.0)
+            transition, by_next = held_exponential(A, column, time_left)
+            of_states[:, oldest] = (transition @ by_oldest)[:, 0]
             if samples == 1:
-                of_commands[:, index] = late[:, 0]
+                of_commands[:, index] = by_next[:, 0]
             else:
-                of_states[:, oldest - 1] = late[:, 0]
+                of_states[:, oldest - 1] = by_next[:, 0]
         return of_states, of_commands
 
     def sampled(self) -> tuple[Array, Array]:
@@ -112,13 +113,15 @@ class HeldSystem:
         of_states = np.zeros((nu, self.size))
         of_commands = np.zeros((nu, nu))
         for index, (samples, rest) in enumerate(self.delays):
-            ago = samples
+            # Age in samples of the command that acts. At the time `rest`, the next command arrives.
+            age = samples
             if samples and s >= rest:
-                ago = samples - 1
-            if ago:
-                of_states[index, self.first[index] + ago - 1] = 1.0
-            else:
+                age = samples - 1
+            if age == 0:
                 of_commands[index, index] = 1.0
+            else:
+                # Past commands are states, the latest first.
+                of_states[index, self.first[index] + age - 1] = 1.0
         return of_states, of_commands
 
     def outputs(self, C: Array, D: Array, s: float = 0.0) -> tuple[Array, Array]:

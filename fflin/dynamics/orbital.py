@@ -139,28 +139,38 @@ class OrbitField:
         constant, because the ABA derivatives include their change. The columns for the base
         position are zero here, because `add_turning` adds the effect of this position.
         """
-        # T = R^T `tide` R is `tide` in the axes of a body. A small rotation t of the body, in its
-        # own axes, changes T by T [t]x - [t]x T.
-        model, (R, centers) = self.robot.model, self._bodies(data)
+        # All quantities are in the axes of each body. There, `tide` is T = R^T `tide` R, and a body
+        # at the position r has the force m T r. A small rotation t of the body changes T by
+        # T [t]x - [t]x T.
+        model = self.robot.model
+        R, centers = self._bodies(data)
         joints = range(ROOT, model.njoints)
         local = pin.ReferenceFrame.LOCAL
         J = np.array(
             [pin.getJointJacobian(model, data, joint, local) for joint in joints]
         )
-        moved = J.copy()
-        moved[:, :, PIN_LINEAR] = 0.0
-        linear, turned = moved[:, PIN_LINEAR], moved[:, PIN_ANGULAR]
+        # Translations and rotations of the bodies' frames, per unit of each coordinate.
+        displacement = J.copy()
+        displacement[:, :, PIN_LINEAR] = 0.0
+        translation = displacement[:, PIN_LINEAR]
+        rotation = displacement[:, PIN_ANGULAR]
         T = R.mT @ self.tide @ R
-        center = skew((R.mT @ centers)[..., 0])
-        shift = linear + (center - self._levers) @ turned
-        pull = skew((R.mT @ self.tide @ centers)[..., 0])
-        force = self._mass[..., None] * (T @ shift + (pull - T @ center) @ turned)
-        units = skew(np.eye(3))
+        center_cross = skew((R.mT @ centers)[..., 0])
+        pull_cross = skew((R.mT @ self.tide @ centers)[..., 0])
+        # Change of r in body axes, and change of T r due to the change of T.
+        center_change = translation + (center_cross - self._levers) @ rotation
+        by_tide = (pull_cross - T @ center_cross) @ rotation
+        force = self._mass[..., None] * (T @ center_change + by_tide)
+        # The torque about the centre of mass is the vector of the antisymmetric matrix I T - T I.
+        # Its derivatives with respect to the three rotations follow from the changes of T.
+        axes = skew(np.eye(3))
         T = T[:, None]
-        turn = self._inertia[:, None] @ (T @ units - units @ T)
-        turn -= turn.mT
-        torque = turn[..., (2, 0, 1), (1, 2, 0)].mT @ turned + self._levers @ force
-        total: Array = (J.mT @ np.concatenate((force, torque), axis=1)).sum(axis=0)
+        torque_cross = self._inertia[:, None] @ (T @ axes - axes @ T)
+        torque_cross -= torque_cross.mT
+        by_rotation = torque_cross[..., (2, 0, 1), (1, 2, 0)].mT
+        torque = by_rotation @ rotation + self._levers @ force
+        wrench = np.concatenate((force, torque), axis=1)
+        total: Array = (J.mT @ wrench).sum(axis=0)
         return total
 
     def near(self, q: Array, v: Array) -> tuple[Array, Array]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from copy import copy
 from itertools import compress
-from operator import attrgetter
 
 import numpy as np
 import pinocchio as pin
@@ -113,31 +112,41 @@ class StateMap:
         # Acceleration field of the orbit, or None if the robot is not in orbit.
         self.field = OrbitField(robot, self.frame) if robot.orbit else None
         self.nx = 12 + 2 * n
-        ends = 3, 6, 6 + n, 9 + n, 12 + n, self.nx
-        self.groups = names.Groups(*map(slice, (0, *ends), ends))
-        self.names, self.units = zip(*names.state_units(robot).items(), strict=True)
+        self.groups = names.Groups(
+            q_b=slice(0, 3),
+            r_b=slice(3, 6),
+            q_m=slice(6, 6 + n),
+            omega_b=slice(6 + n, 9 + n),
+            v_b=slice(9 + n, 12 + n),
+            qdot_m=slice(12 + n, self.nx),
+        )
+        units = names.state_units(robot)
+        self.names = tuple(units)
+        self.units = tuple(units.values())
         joints = robot.joints
         # For each velocity of the state, its index in Pinocchio's v.
-        self._order = np.array(
-            [3, 4, 5, 0, 1, 2, *map(attrgetter("idx_v"), joints)], dtype=np.intp
-        )
+        idx_v = [joint.idx_v for joint in joints]
+        self._order = np.array([3, 4, 5, 0, 1, 2, *idx_v], dtype=np.intp)
         # For each entry of Pinocchio's v, the index of this velocity in nu. Mimic joints have no
         # velocity in nu, and `spread` writes their entries of v afterwards.
         self._place = np.zeros(robot.nv, dtype=np.intp)
         self._place[self._order] = np.arange(6 + n)
+        # `_flat` contains, for each entry of a matrix (6 + n, 6 + n) in state order, the index of
+        # the same entry in a flattened matrix (nv, nv) in Pinocchio's order.
         self._flat = self._order[:, None] * robot.nv + self._order
         self._flat_transposed = np.ascontiguousarray(self._flat.T)
         # Factor from each velocity of the state to Pinocchio's v. It is 1 except for the velocities
         # of modal amplitudes.
-        self._scale = np.array([1.0] * 6 + [*map(attrgetter("scale"), joints)])
+        self._scale = np.array([1.0] * 6 + [joint.scale for joint in joints])
         self._scaled = bool((self._scale != 1.0).any())
         # Matrix S of v = S nu. It is None without mimic joints and modes, because S is then only
         # the permutation `_order`.
         self.S: Array | None = None
         if robot.followers or self._scaled:
             self.S = np.column_stack([self.spread(e) for e in np.eye(6 + n)])
-        self._idx_q = np.array([*map(attrgetter("idx_q"), joints)], dtype=np.intp)
-        self.unbounded = np.flatnonzero([*map(attrgetter("unbounded"), joints)])
+        self._idx_q = np.array([joint.idx_q for joint in joints], dtype=np.intp)
+        self.unbounded = np.flatnonzero([joint.unbounded for joint in joints])
+        # In Pinocchio's q, a continuous joint has two entries: cosine and sine of its angle.
         self._cos = self._idx_q[self.unbounded]
         self._sin = self._cos + 1
         root = robot.model.jointPlacements[ROOT].rotation
@@ -146,11 +155,9 @@ class StateMap:
         # Whether gravity or the motion in orbit accelerates the base's origin relative to the
         # reference.
         self.falls = self._pulled or robot.orbit is not None
-        oMref = (
-            pin.SE3.Identity()
-            if reference is None
-            else placement("reference", reference)
-        )
+        oMref = pin.SE3.Identity()
+        if reference is not None:
+            oMref = placement("reference", reference)
         self._refer(oMref)
 
     def about(self, reference: pin.SE3) -> StateMap:

@@ -56,25 +56,29 @@ def _coriolis(work, at, w):
     """
     G = vec.get_columns(work, at + MOMENTS)
     trace = G[0][0] + G[1][1] + G[2][2]
-    moment = vec.minus(vec.times(w, trace), vec.product(G, w))
-    moment = vec.plus(
-        vec.plus(moment, moment), vec.cross(w, vec.get3(work, at + STORED))
-    )
-    force = vec.cross(w, vec.get3(work, at + MOMENTUM))
-    return moment, vec.plus(force, force)
+    p = vec.get3(work, at + MOMENTUM)
+    h = vec.get3(work, at + STORED)
+    half = vec.minus(vec.times(w, trace), vec.product(G, w))
+    moment = vec.plus(vec.plus(half, half), vec.cross(w, h))
+    half_force = vec.cross(w, p)
+    return moment, vec.plus(half_force, half_force)
 
 
 def _coriolis_transposed(work, at, along):
     """Return the moment part of 2 B^T s for the motion vector s = `along`.
 
-    B is the Coriolis matrix of a joint's subtree. The force part of 2 B^T s is zero.
+    B is the Coriolis matrix of a joint's subtree. Let w be the angular part and l the linear part
+    of s. The moment part is 2 ((tr(G) E - G^T) w + p x l) + h x w. The force part is zero.
     """
     G = vec.get_columns(work, at + MOMENTS)
     trace = G[0][0] + G[1][1] + G[2][2]
+    p = vec.get3(work, at + MOMENTUM)
+    h = vec.get3(work, at + STORED)
     w = along[0]
-    moment = vec.minus(vec.times(w, trace), vec.across(G, w))
-    moment = vec.plus(moment, vec.cross(vec.get3(work, at + MOMENTUM), along[1]))
-    return vec.plus(vec.plus(moment, moment), vec.cross(vec.get3(work, at + STORED), w))
+    linear = along[1]
+    half = vec.minus(vec.times(w, trace), vec.across(G, w))
+    half = vec.plus(half, vec.cross(p, linear))
+    return vec.plus(vec.plus(half, half), vec.cross(h, w))
 
 
 def _write_springs(work, tree, width):
@@ -182,9 +186,10 @@ def _push(work, tree, by_u):
 
 
 def _solve(work, tree, slopes):
-    """Write the derivatives of c, which are -M^-1 times the matrix that `differentiate` writes.
+    """Write the derivatives (6 + n, 12 + 2 n) of the accelerations c.
 
-    Six columns are computed at a time.
+    They are -M^-1 D, where D is the matrix that `differentiate` writes. Six columns are computed at
+    a time.
     """
     offsets = tree.offsets
     size = len(tree.row)
@@ -194,7 +199,13 @@ def _solve(work, tree, slopes):
     # because the kernel supports no orbits.
     for row in range(size):
         vec.clear(work, slopes + row * width, 6)
-    for column in range(width % 6 or 6, width, 6):
+    # The groups of six columns end at the last column. The first group may therefore begin among
+    # the zero columns.
+    first = width % 6
+    if first == 0:
+        first = 6
+    for column in range(first, width, 6):
+        # Copy six columns of D next to each other, because each row of M^-1 reads all of them.
         for k in range(size):
             entries = vec.get6(work, offsets.lower + column + k * width)
             vec.put6(work, offsets.block + k * 6, entries)

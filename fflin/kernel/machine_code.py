@@ -136,15 +136,19 @@ def _operation(
                 _: Signature,
                 values: Sequence[ir.Value],
             ) -> ir.Value:
-                given = list(values)
-                if isinstance(kinds[0], Array):
-                    given[0] = context.make_array(kinds[0])(
-                        context, builder, values[0]
-                    ).data
-                    if kinds[0].ndim == 2:
-                        given[0] = builder.bitcast(given[0], _VECTOR.as_pointer())
-                result = generate(builder, *given)
-                return context.get_dummy_value() if result is None else result
+                arguments = list(values)
+                first_kind = kinds[0]
+                if isinstance(first_kind, Array):
+                    # An array is a struct in LLVM code. Pass the address of its data instead.
+                    make_struct = context.make_array(first_kind)
+                    address = make_struct(context, builder, values[0]).data
+                    if first_kind.ndim == 2:
+                        address = builder.bitcast(address, _VECTOR.as_pointer())
+                    arguments[0] = address
+                result = generate(builder, *arguments)
+                if result is None:
+                    return context.get_dummy_value()
+                return result
 
             return typed(*kinds), generated
 

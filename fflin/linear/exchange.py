@@ -332,26 +332,29 @@ def from_tool(
 def _jacobians_at(
     robot: Robot, lin: LinearModel, tool: str
 ) -> tuple[ToolCoordinates, Jacobians, Jacobians, Array]:
-    """Return a tool's coordinates, the model's and the tool's Jacobians, and dy/dt (15.1)."""
+    """Return the tool's coordinates, the model's Jacobians, the tool's Jacobians, and dy/dt.
+
+    The Jacobians are derivatives with respect to y (15.1). All are at the operating point of `lin`.
+    """
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
     if lin.state_names != state.names:
         raise InputError(
             "lin lacks some states of the robot; use the full model of the robot"
         )
-    coordinates = ToolCoordinates(state, moving=lin.moving)
-    kind = tool_coordinates(robot, tool, moving=lin.moving)
+    model_coordinates = ToolCoordinates(state, moving=lin.moving)
+    other_coordinates = tool_coordinates(robot, tool, moving=lin.moving)
     nu = state.velocities(lin.v)
-    rates = lin.drift
-    point = lin.q, nu, coordinates.actuation.in_base_axes(state.chart(lin.q), lin.u0)
-    if rates is None:  # f0 = P dy/dt
-        rates = coordinates.jacobians(*point, 0.0 * nu).left @ lin.f0
-    rates = rates[len(nu) :]
-    return (
-        kind,
-        coordinates.jacobians(*point, rates),
-        kind.jacobians(*point, rates),
-        np.append(nu, rates),
-    )
+    u = model_coordinates.actuation.in_base_axes(state.chart(lin.q), lin.u0)
+    point = lin.q, nu, u
+    dy = lin.drift
+    if dy is None:
+        # f0 = P dy/dt, and the accelerations do not affect the left inverse of P.
+        at_rest = model_coordinates.jacobians(*point, np.zeros_like(nu))
+        dy = at_rest.left @ lin.f0
+    acceleration = dy[len(nu) :]
+    from_y = model_coordinates.jacobians(*point, acceleration)
+    to_tool = other_coordinates.jacobians(*point, acceleration)
+    return other_coordinates, from_y, to_tool, np.append(nu, acceleration)
 
 
 def transformed(

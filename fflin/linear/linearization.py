@@ -76,7 +76,8 @@ class Prepared:
                 "moving=True measures the error in the axes of the moving base, so no reference "
                 "and no frame other than 'local' can be given; leave out reference and frame"
             )
-        # In orbit, the default reference is the orbital frame instead of the base placement.
+        # If no reference is given, the reference is the base placement at the operating point. In
+        # orbit, it is the orbital frame instead.
         self.own_reference = reference is None and robot.orbit is None
         robot.require_inertia()
         self.actuation = Actuation(state)
@@ -85,13 +86,14 @@ class Prepared:
             self.sensing = Sensing(
                 state, robot.outputs, own_reference=self.own_reference
             )
-        acts = (
+        has_other_forces = (
             robot.orbit
             or any(robot.gravity)
             or robot.stored_momentum
             or np.any(robot.springs)
         )
-        self.free = self.sensing is None and not moving and not acts
+        # In this case, all matrices of a model at rest except B are known in advance.
+        self.free = self.sensing is None and not moving and not has_other_forces
         nx = state.nx
         nv = state.nx // 2
         nu = len(self.actuation.names)
@@ -125,7 +127,9 @@ class Prepared:
         if not self.own_reference:
             self.common["placement"] = frozen(pin.SE3ToXYZQUAT(state.reference))
         A = np.zeros((nx, nx))
-        A[:nv, nv:] = np.diag([0.5] * 3 + [1.0] * (nv - 3))  # N (2.1)
+        # At rest, N of (2.1) is 1/2 for the attitude chart, and 1 for the other coordinates.
+        N = np.diag([0.5] * 3 + [1.0] * (nv - 3))
+        A[:nv, nv:] = N
         self.rest: dict[str, Array] = {
             "A": frozen(A),
             "f0": frozen(np.zeros(nx)),

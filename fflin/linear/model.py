@@ -555,6 +555,8 @@ class LinearModel(ModelHeader, StateSpace):
 
         values, certificate = read_model(as_path(path), Certificate)
         lin = LinearModel(**values, _certify=partial(given, certificate))
+        # Record the fingerprint of the values in the file. If A, B or f0 is changed later, the
+        # certificate of the file is then refused.
         return replace(lin, _source=(lin.fingerprint, lin))
 
 

@@ -72,14 +72,16 @@ class Reference(NamedTuple):
 
 
 def spread_over(rows: Blocks, x: Array, row_units: Array) -> Array:
-    """Return, for each entry of x, the largest magnitude of the column in the same block of rows.
+    """Replace each entry of x by the largest magnitude of its column in the same block of rows.
 
-    `row_units` (k,) are the units in which the entries of a row are compared with other rows.
+    Rows of a block may have different units. Magnitudes are therefore divided by `row_units` (k,)
+    before they are compared, and the result is converted to the unit of each row.
     """
     largest = np.zeros_like(x)
-    for at in rows.values():
-        unit = row_units[at][:, None]
-        largest[at] = unit * (np.abs(x[at]) / unit).max(axis=0, initial=0.0)
+    for block in rows.values():
+        unit = row_units[block][:, None]
+        ratios = np.abs(x[block]) / unit
+        largest[block] = unit * ratios.max(axis=0, initial=0.0)
     return largest
 
 

@@ -274,58 +274,101 @@ class ToolCoordinates:
         `q` is in Pinocchio's order. `nu`, `u` and `rates` are in base axes. `rates` (6 + n,) is the
         time derivative of `nu`.
         """
-        n = self.state.robot.n
-        nv = 6 + len(self.joints)
-        X = self._X
-        kind = self.convention
-        quaternion_now, R_now = self._attitude(q)
-        # Take a complex step along the motion. If the reference moves with the robot, the attitude
-        # error and the tangent vector of the pose stay zero, so they take no step.
-        twist: Any = X @ nu[:6] + _STEP * (X @ rates[:6])
-        pose_step = 0j if self._moving else _STEP
-        error_is_still = self._moving and kind.attitude == "q_b"
-        attitude_step = 0j if error_is_still else _STEP
-        moved = pose_step * twist.real
+        quaternion, R = self._attitude(q)
+        # Take a complex step along the motion. The real part of P is then P at the point, and the
+        # imaginary part is the step times the time derivative of P.
+        twist: Any = self._X @ nu[:6] + _STEP * (self._X @ rates[:6])
         spin = np.append(twist.real[ANGULAR], 0.0)
-        turns = 0.5 * product_matrix(quaternion_now) @ spin
-        quaternion = quaternion_now + attitude_step * turns
-        R = rotation_matrix(quaternion)
-        w = quaternion[3]
-        vec = quaternion[:3]
-        by_turn = -self._rotated(R) @ self._held(twist)
-        attitude: Any = np.eye(3) + 0.5 * skew(moved[ANGULAR])
-        if kind.attitude == "euler":
-            attitude, bends = _of_angles(_angles(R), twist[ANGULAR])
-            by_turn[ANGULAR] = kind.rates * bends @ attitude
-        elif not self.tangent:
-            attitude = 0.5 * (w * np.eye(3) + skew(vec))
-            if kind.attitude == "wxyz":
-                attitude = np.vstack((-0.5 * vec, attitude))
-        k = len(attitude) + 3
-        base = np.zeros((k + 6, 12), dtype=complex)  # columns: theta, p, omega, v
-        base[: k - 3, :3], base[k - 3 : k, 3:6] = attitude, R
-        if kind.attitude == "pose":
-            base[k - 3 : k, :6] = np.hstack((0.5 * skew(moved[LINEAR]), attitude))
-        base[k:, :3] = by_turn
-        base[k:, 6:] = self._rotated(R, rates=kind.rates)
-        base[:k] = np.roll(base[:k], self._roll, 0)
-        base[k:] = np.roll(base[k:], self._roll, 0)
-        first = k + nv - 6
-        P = np.zeros((first + nv, 12 + 2 * n), dtype=complex)
-        rows = [*range(k), *range(first, first + 6)]
-        columns = [*range(6), *range(6 + n, 12 + n)]
-        P[np.ix_(rows, columns)] = base @ np.kron(np.eye(2), X)
-        of_joints = (self.state.spread(np.eye(6 + n))[6:, self._idx_v] / self._scales).T
-        P[k:first, 6 : 6 + n] = P[first + 6 :, 12 + n :] = of_joints
+        quaternion_rate = 0.5 * product_matrix(quaternion) @ spin
+        # If the reference moves with the robot, the attitude error and the tangent vector of the
+        # pose stay zero, so they take no step.
+        pose_step = 0j if self._moving else _STEP
+        error_is_still = self._moving and self.convention.attitude == "q_b"
+        attitude_step = 0j if error_is_still else _STEP
+        pose, base_twist = self._base_jacobians(
+            quaternion + attitude_step * quaternion_rate,
+            twist,
+            pose_step * twist.real,
+        )
+        P = self._with_joints(pose, base_twist)
         extra = np.zeros((len(P), len(P)))
-        if k == 7:
-            extra[:4, :4] = np.outer(np.roll(turns, 1), np.roll(quaternion_now, 1))
-        # Invert P block by block, so that its exact zeros remain exact.
-        poses, twists = _left(P.real[:first, : 6 + n]), _left(P.real[first:, 6 + n :])
-        below = -twists @ P.real[first:, : 6 + n] @ poses
-        left = np.block([[poses, np.zeros((6 + n, nv))], [below, twists]])
-        V, H = self._input_jacobians(R_now, u)
+        if self.convention.attitude == "wxyz":
+            # from x, y, z, w to w, x, y, z
+            rate_wxyz = np.roll(quaternion_rate, 1)
+            extra[:4, :4] = np.outer(rate_wxyz, np.roll(quaternion, 1))
+        left = self._left_inverse(P.real)
+        V, H = self._input_jacobians(R, u)
         return Jacobians(P.real, P.imag / _STEP.imag, left, V, H, extra)
+
+    def _base_jacobians(
+        self, quaternion: Array, twist: Array, displacement: Array
+    ) -> tuple[Array, Array]:
+        """Return the derivatives (k, 12) of the base pose and (6, 12) of the base twist in x'.
+
+        The columns are a rotation theta, a translation p, omega and v of the tool's base, all in
+        base axes. `displacement` (6,) is the complex step of theta and p. `quaternion` (4,) and
+        `twist` (6,) include the complex step.
+        """
+        kind = self.convention
+        R = rotation_matrix(quaternion)
+        scalar = quaternion[3]
+        vector_part = quaternion[:3]
+        # derivatives of the attitude and of the twist with respect to theta
+        by_theta = -self._rotated(R) @ self._held(twist)
+        attitude: Any = np.eye(3) + 0.5 * skew(displacement[ANGULAR])
+        if kind.attitude == "euler":
+            G, derivative = _of_angles(_angles(R), twist[ANGULAR])
+            attitude = G
+            by_theta[ANGULAR] = kind.rates * derivative @ G
+        elif not self.tangent:
+            attitude = 0.5 * (scalar * np.eye(3) + skew(vector_part))
+            if kind.attitude == "wxyz":
+                attitude = np.vstack((-0.5 * vector_part, attitude))
+        k = len(attitude) + 3
+        pose = np.zeros((k, 12), dtype=complex)
+        pose[: k - 3, :3] = attitude
+        if kind.attitude == "pose":
+            # The tangent vector of the pose is in the axes of the base, and its translation
+            # also depends on theta.
+            pose[k - 3 :, :3] = 0.5 * skew(displacement[LINEAR])
+            pose[k - 3 :, 3:6] = attitude
+        else:
+            pose[k - 3 :, 3:6] = R
+        base_twist = np.zeros((6, 12), dtype=complex)
+        base_twist[:, :3] = by_theta
+        base_twist[:, 6:] = self._rotated(R, rates=kind.rates)
+        return np.roll(pose, self._roll, 0), np.roll(base_twist, self._roll, 0)
+
+    def _with_joints(self, pose: Array, base_twist: Array) -> Array:
+        """Return P (15.2) from its base rows `pose` (k, 12) and `base_twist` (6, 12).
+
+        The rows of P are the base pose, the joint positions, the base twist and the joint rates.
+        """
+        n = self.state.robot.n
+        k = len(pose)
+        nq = k + len(self.joints)
+        P = np.zeros((nq + 6 + len(self.joints), 12 + 2 * n), dtype=complex)
+        # The columns of base coordinates and base velocities are in the axes of the root link.
+        base_columns = [*range(6), *range(6 + n, 12 + n)]
+        X_twice = np.kron(np.eye(2), self._X)
+        P[:k, base_columns] = pose @ X_twice
+        P[nq : nq + 6, base_columns] = base_twist @ X_twice
+        velocities = self.state.spread(np.eye(6 + n))[6:, self._idx_v]
+        of_joints = (velocities / self._scales).T
+        P[k:nq, 6 : 6 + n] = of_joints
+        P[nq + 6 :, 12 + n :] = of_joints
+        return P
+
+    def _left_inverse(self, P: Array) -> Array:
+        """Return the left inverse of P, computed block by block so that exact zeros stay exact."""
+        nv = 6 + len(self.joints)
+        nq = len(P) - nv
+        coordinates = 6 + self.state.robot.n
+        positions = _left(P[:nq, :coordinates])
+        velocities = _left(P[nq:, coordinates:])
+        below = -velocities @ P[nq:, :coordinates] @ positions
+        zeros = np.zeros((coordinates, nv))
+        return np.block([[positions, zeros], [below, velocities]])
 
     def _input_jacobians(self, R: Array, u: Array) -> tuple[Array, Array]:
         """Return V and H of the `Jacobians` under the inputs u; R is the tool's base attitude."""

@@ -203,19 +203,22 @@ class Trajectory(Design):
         rows = svg.sampled(len(self.t))
         robot = self.robot
         q = self.q[rows]
-        apart = np.minimum(1.0, np.abs(q[:, 3:7] @ q[0, 3:7]))
-        charts = {
-            "attitude from the start": (
-                "deg",
-                {"base": 2.0 * np.degrees(np.arccos(apart))},
-            )
+        # The product of two unit quaternions is the cosine of half the angle between them.
+        cosine = np.minimum(1.0, np.abs(q[:, 3:7] @ q[0, 3:7]))
+        angle = 2.0 * np.degrees(np.arccos(cosine))
+        revolute = dict[str, Array]()
+        prismatic = dict[str, Array]()
+        for joint in robot.joints:
+            if joint.mode:
+                continue
+            curves = prismatic if joint.prismatic else revolute
+            curves[joint.name] = np.array([joint.value(row) for row in q])
+        # title of each picture: unit and curves
+        charts: dict[str, tuple[str, dict[str, Array]]] = {
+            "attitude from the start": ("deg", {"base": angle}),
+            "joints": ("rad", revolute),
+            "prismatic joints": ("m", prismatic),
         }
-        for title, prismatic in (("joints", False), ("prismatic joints", True)):
-            joints = [
-                x for x in robot.joints if x.prismatic == prismatic and not x.mode
-            ]
-            curves = {x.name: np.array([x.value(row) for row in q]) for x in joints}
-            charts[title] = ("m" if prismatic else "rad", curves)
         pictures = [
             svg.figure(title, svg.curves(self.t[rows], curves, unit))
             for title, (unit, curves) in charts.items()

@@ -346,21 +346,23 @@ def _flexible_part(
 
     `mode_joints` maps the joints of these modes to their indices in v, in ascending order.
     """
-    # The body without its balls may have negative moments of inertia, so only the sum is judged.
+    # The body without its balls may have negative moments of inertia, so only the inertia matrix of
+    # body and balls together is tested for motions without kinetic energy.
     modes = [*mode_joints.values()]
     placements = {body: pin.SE3.Identity()}
-    columns = {body: np.zeros((6, len(modes)))}
-    for at, index in enumerate(mode_joints):
-        parent = model.parents[index]
-        joint_data = model.joints[index].createData()
-        model.joints[index].calc(joint_data, pin.neutral(model))
-        placements[index] = placements[parent] * model.jointPlacements[index]
-        columns[index] = columns[parent].copy()
-        columns[index][:, at] = placements[index].toActionMatrix() @ np.ravel(
-            joint_data.S
-        )
+    # Jacobians (6, k) from the rates of the modes to the twist of each ball.
+    jacobians = {body: np.zeros((6, len(modes)))}
+    for column, joint in enumerate(mode_joints):
+        parent = model.parents[joint]
+        placements[joint] = placements[parent] * model.jointPlacements[joint]
+        jacobians[joint] = jacobians[parent].copy()
+        joint_data = model.joints[joint].createData()
+        model.joints[joint].calc(joint_data, pin.neutral(model))
+        axis = np.ravel(joint_data.S)
+        jacobians[joint][:, column] = placements[joint].toActionMatrix() @ axis
     inertias = {
-        index: at.act(model.inertias[index]) for index, at in placements.items()
+        joint: placement.act(model.inertias[joint])
+        for joint, placement in placements.items()
     }
     mass = sum(inertia.mass for inertia in inertias.values())
     moment = sum(inertia.mass * inertia.lever for inertia in inertias.values())
@@ -368,17 +370,24 @@ def _flexible_part(
     if mass > 0.0:
         center = moment / mass
     to_center = pin.SE3(np.eye(3), -center)
-    M = np.diag([*[0.0] * 6, *model.armature[modes]])
-    for index, inertia in inertias.items():
-        V = np.hstack((np.eye(6), to_center.toActionMatrix() @ columns[index]))
+    # Inertia matrix for the twist of the body about `center` and for the mode rates.
+    M = np.zeros((6 + len(modes), 6 + len(modes)))
+    M[6:, 6:] = np.diag(model.armature[modes])
+    for joint, inertia in inertias.items():
+        by_modes = to_center.toActionMatrix() @ jacobians[joint]
+        V = np.hstack((np.eye(6), by_modes))
         M += V.T @ to_center.act(inertia).matrix() @ V
     # Scale M to a matrix with entries of at most 1, so that its rounding errors are known.
     sizes = M.diagonal().copy()
     sizes[:3] = mass
     sizes[3:6] = np.linalg.eigvalsh(M[3:6, 3:6])[-1]
     scale = np.sqrt(np.where(sizes > 0.0, sizes, 1.0))
-    values, axes = np.linalg.eigh(M / np.outer(scale, scale))
-    rows = axes[:, values > _NO_MOMENT].T * scale / scale[0]
+    energies, motions = np.linalg.eigh(M / np.outer(scale, scale))
+    # Twice the kinetic energy of a velocity v is the sum of energies * (motions' (scale v))^2.
+    # Therefore it depends only on these rows. Without division by scale[0], the square root of the
+    # mass, the rows would depend on the unit of mass.
+    with_energy = motions[:, energies > _NO_MOMENT].T
+    rows = with_energy * scale / scale[0]
     return _Part(body, center, modes, rows)
 
 

@@ -173,8 +173,12 @@ def _is_symmetric(robot: RobotData, index: int) -> bool:
     if not axis.any():  # a joint that translates
         return False
     body = robot.model.inertias[index]
-    turn = skew(axis)
-    uneven = float(np.abs(turn @ body.inertia - body.inertia @ turn).max())
+    axis_cross = skew(axis)
+    # Derivative of the inertia with respect to a rotation about the axis; zero if symmetric.
+    change = axis_cross @ body.inertia - body.inertia @ axis_cross
+    uneven = float(np.abs(change).max())
     largest = float(np.abs(body.inertia).max())
-    offset = body.mass * float(np.square(turn @ body.lever).sum())
+    # Moment of inertia m d^2 due to the distance d of the centre of mass from the axis. The
+    # tolerance applies to d, so m d^2 is compared with the square of the tolerance.
+    offset = body.mass * float(np.square(axis_cross @ body.lever).sum())
     return uneven <= _ASYMMETRY * largest and offset <= _ASYMMETRY**2 * largest

@@ -254,7 +254,9 @@ class LaneLoop:
         steps = times.steps
         count = len(next(iter(out.values()))) if out else 1
         of_lane = np.minimum(np.arange(self.lanes), count - 1)
-        sense = self._begin(runs or {}, of_lane)
+        runs = runs or {}
+        self._write_initial_values(runs, of_lane)
+        write_noise = self._sensor_errors(runs, of_lane)
         statistics.reset()
         row_size = 8 * self.lanes * self.width  # [bytes]
         most = max(1, min(-(-steps // every), _MEMORY // row_size))
@@ -271,7 +273,7 @@ class LaneLoop:
             while self.done < steps and going.any():
                 first = self.done
                 last = min(steps, (first // span + 1) * span)
-                sense(first, last)
+                write_noise(first, last)
                 self._advance(self._words, clock, last, every, space, self._work)
                 self.done = done = int(clock[0])
                 if kept := -(-done // every) - -(-first // every):
@@ -303,49 +305,63 @@ class LaneLoop:
             bar.close()
         return messages
 
-    def _begin(self, runs: Runs, of_lane: Indices) -> Callable[[int, int], None]:
-        """Write the initial values of all runs; return a function that writes sensor noise.
+    def _write_initial_values(self, runs: Runs, of_lane: Indices) -> None:
+        """Write the initial values of all runs.
 
-        `of_lane` (lanes,) contains the index of the run in each lane. The returned function must be
-        called before each slice of steps. Its arguments are the first step of the slice and the
-        step after the last one.
+        `of_lane` (lanes,) contains the index of the run in each lane.
         """
         for array, initial in self._fresh:
             array[:] = initial
         for name, values in runs.items():
             if name in self._of_run:
                 self._of_run[name][:] = values[of_lane].T
-        robot, kept = self.parts.robot, self.parts.reference
+        robot = self.parts.robot
+        # Each body has ten parameters, of which the mass is the first.
         mass = robot.tree.bodies[::10].sum(axis=0)
-        kept.per_mass[0], kept.weight[:] = 1.0 / mass, mass * robot.gravity[:, None]
-        kept.start[9:] = self.parts.point.q[:3]
+        reference = self.parts.reference
+        reference.per_mass[0] = 1.0 / mass
+        reference.weight[:] = mass * robot.gravity[:, None]
+        # The moments of the momentum balance are about the initial base position.
+        reference.start[9:] = self.parts.point.q[:3]
         self.done = 0
+
+    def _sensor_errors(
+        self, runs: Runs, of_lane: Indices
+    ) -> Callable[[int, int], None]:
+        """Write the sensor biases of all runs; return a function that writes sensor noise.
+
+        `of_lane` (lanes,) contains the index of the run in each lane. The returned function must be
+        called before each slice of steps. Its arguments are the first step of the slice and the
+        step after the last one.
+        """
         law = self.parts.law
-        size = len(self.parts.law.y)
-        rows = law.added.reshape(len(law.added) // max(size, 1), size, self.lanes)
-        nothing = np.zeros((self.lanes, size))
-        bias, deviation = (
-            runs.get(key, nothing)[of_lane].T for key in ("sensed", "noise")
-        )
-        rows[:] = bias
-        draws = []
+        size = len(law.y)
+        # Row k % SLOTS contains the errors (ny, lanes) of the measurement at sample k.
+        slots = len(law.added) // max(size, 1)
+        errors = law.added.reshape(slots, size, self.lanes)
+        zero = np.zeros((self.lanes, size))
+        bias = runs.get("sensed", zero)[of_lane].T
+        deviation = runs.get("noise", zero)[of_lane].T
+        errors[:] = bias
+        generators = list[np.random.Generator]()
         if "seed" in runs:
-            draws = [noise_generator(seed) for seed in runs["seed"][of_lane]]
-        drawn = 0
+            generators = [noise_generator(seed) for seed in runs["seed"][of_lane]]
+        drawn_until = 0
 
-        def sense(step: int, last: int) -> None:
-            nonlocal drawn
+        def write_noise(step: int, last: int) -> None:
+            nonlocal drawn_until
             # If the end of a run interrupted this slice, the noise of the slice is already drawn.
-            if not self._noisy or drawn == last:
+            if not self._noisy or drawn_until == last:
                 return
-            drawn = last
-            k, values = noises(self._plan, size, step, last)
-            rows[k % SLOTS] = values[..., None] + bias
-            for lane, normal in enumerate(draws):
-                random = normal.standard_normal(values.shape)
-                rows[k % SLOTS, :, lane] += deviation[:, lane] * random
+            drawn_until = last
+            samples, noise = noises(self._plan, size, step, last)
+            rows = samples % SLOTS
+            errors[rows] = noise[..., None] + bias
+            for lane, generator in enumerate(generators):
+                normal = generator.standard_normal(noise.shape)
+                errors[rows, :, lane] += deviation[:, lane] * normal
 
-        return sense
+        return write_noise
 
     def _end(
         self, statistics: Statistics, ending: Mask, stop: Array, out: Runs

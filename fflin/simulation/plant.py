@@ -55,7 +55,7 @@ class Plant(Aba):
         robot.require_inertia()
         super().__init__(state)
         self.disturbance = disturbance
-        # whether a warning of the order of a disturbance was given
+        # Whether the warning about a disturbance given as an array was already issued.
         self._warned = False
         nu = len(self.actuation.names)
         groups = self.actuation.groups

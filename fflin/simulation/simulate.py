@@ -556,10 +556,11 @@ def predict(plan: Plan, foresees: Predictor, x: Array, steps: int) -> Array:
 
 def _affine_motion(A: Array, f0: Array, e: Array, steps: int, every: int) -> Array:
     """Return e before every `every`-th of the steps e -> A e + f0, and e after the last step."""
-    # In a block of steps, the first rows times a power of the step are the next rows, so the number
-    # of rows doubles each time. All steps are made whatever `every` is, so that the rows of a
-    # thinned run are rows of the full run bit for bit.
+    # A block of steps is filled by doubling: the first 2^k rows times the 2^k-th power of the step
+    # matrix are the next 2^k rows. All steps are computed for every value of `every`, so the rows
+    # of a thinned run equal rows of the full run bit for bit.
     size = len(e)
+    # Matrix of one step of the vector (e, 1).
     step = np.zeros((size + 1, size + 1))
     step[:size, :size] = A
     step[:size, size] = f0
@@ -577,9 +578,13 @@ def _affine_motion(A: Array, f0: Array, e: Array, steps: int, every: int) -> Arr
             filled = 2**doubling
             rows[filled : 2 * filled] = rows[:filled] @ powers[doubling].T
         first = powers[-1] @ rows[0]
+        # Row i of the block is e after begin + i steps. Keep the multiples of `every` before the
+        # last step.
         end = min(block, steps - begin)
-        kept.append(rows[-begin % every : end : every].copy())
-        if steps < begin + block:
+        first_multiple = -begin % every
+        kept.append(rows[first_multiple:end:every].copy())
+        last_step_in_block = steps < begin + block
+        if last_step_in_block:
             kept.append(rows[end : end + 1].copy())
     return np.concatenate(kept)[:, :size]
 

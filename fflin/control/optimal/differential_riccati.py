@@ -109,23 +109,28 @@ _Interval = tuple[float, float, Array, Array]
 
 def _intervals(at: Callable[[Array], Array], knots: Array) -> list[_Interval]:
     """Return the k intervals between knots (k + 1,), with transitions and coefficients."""
-    a = knots[:-1]
-    b = knots[1:]
-    count = len(knots) - 1
-    middle = 0.5 * (a + b)
-    start = np.concatenate((a, a, middle))
-    h = np.concatenate((b, middle, b)) - start
-    coefficients = at(
-        np.concatenate((start + GAUSS[0] * h, start + GAUSS[1] * h, knots))
-    )
-    early, late, ends = np.split(coefficients, (3 * count, 6 * count), axis=1)
-    maps = (
-        transitions(early, late, h)
-        .reshape(3, 3, count, *coefficients.shape[2:])
-        .swapaxes(0, 2)
-    )
-    times, ends = knots.tolist(), ends.swapaxes(0, 1)
-    return [(times[k], times[k + 1], maps[k], ends[k : k + 2]) for k in range(count)]
+    start = knots[:-1]
+    end = knots[1:]
+    middle = 0.5 * (start + end)
+    count = len(start)
+    # Steps: all whole intervals, then all first halves, then all second halves.
+    step_starts = np.concatenate((start, start, middle))
+    step_ends = np.concatenate((end, middle, end))
+    h = step_ends - step_starts
+    early_times = step_starts + GAUSS[0] * h
+    late_times = step_starts + GAUSS[1] * h
+    coefficients = at(np.concatenate((early_times, late_times, knots)))
+    early, late, at_knots = np.split(coefficients, (3 * count, 6 * count), axis=1)
+    maps = transitions(early, late, h)
+    # from the axes (T, G or W; step) to (T, G or W; whole, first or second half; interval)
+    maps = maps.reshape(3, 3, count, *coefficients.shape[2:])
+    of_interval = maps.swapaxes(0, 2)
+    at_knots = at_knots.swapaxes(0, 1)
+    times = knots.tolist()
+    return [
+        (times[k], times[k + 1], of_interval[k], at_knots[k : k + 2])
+        for k in range(count)
+    ]
 
 
 def solve_back(

@@ -421,7 +421,7 @@ def _columns(
 def _smooth_step(x: float) -> float:
     """Return the factor sigma of (16.6): 0 for x <= _TURNS, and 1 for x >= _MOVES.
 
-    In between, s is a smooth function of log(x).
+    In between, sigma is a smooth function of log(x).
     """
     if x <= _TURNS:
         return 0.0
