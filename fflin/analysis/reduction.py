@@ -332,15 +332,14 @@ def ignorable_wheels(lin: LinearModel) -> tuple[Indices, Indices]:
     # A wheel speed affects other states if the link that carries the wheel rotates at the operating
     # point, or if the wheel has friction.
     nv = len(lin.M)
-    wanted = {f"q_m.{name}" for name in lin.wheels}
-    at = np.flatnonzero([name in wanted for name in lin.state_names[:nv]])
-    if not len(at):
-        return at, at
+    angles = {f"q_m.{name}" for name in lin.wheels}
+    wheels = np.flatnonzero([name in angles for name in lin.state_names[:nv]])
+    if not len(wheels):
+        return wheels, wheels
     system = mechanics.second_order(lin.generator or lin)
-    angle, speed = (
-        ~matrix.values[:, at].any(axis=0) for matrix in (system.K, system.D)
-    )
-    return at[angle], at[angle & speed]
+    angle_is_free = ~system.K.values[:, wheels].any(axis=0)
+    speed_is_free = ~system.D.values[:, wheels].any(axis=0)
+    return wheels[angle_is_free], wheels[angle_is_free & speed_is_free]
 
 
 def removed_wheels(lin: LinearModel, wheel_speeds: bool | None) -> Indices:

@@ -125,11 +125,11 @@ class OrbitField:
         force = self._mass * (back @ (self.tide @ center))[..., 0]
         # With the inertia I of a body and `tide` in body axes, the matrix I `tide` - `tide` I is
         # [t]x of the torque t = 3 n^2 r x (I r).
-        turn = self._inertia @ (back @ self.tide @ R)
-        turn -= turn.swapaxes(1, 2)
-        torque = (
-            turn[:, (2, 0, 1), (1, 2, 0)] + (self._levers @ force[..., None])[..., 0]
-        )
+        torque_cross = self._inertia @ (back @ self.tide @ R)
+        torque_cross -= torque_cross.swapaxes(1, 2)
+        torque_about_center = torque_cross[:, (2, 0, 1), (1, 2, 0)]
+        moment_of_force = (self._levers @ force[..., None])[..., 0]
+        torque = torque_about_center + moment_of_force
         return [self._none, *map(pin.Force, force, torque)]
 
     def slopes(self, data: pin.Data) -> Array:

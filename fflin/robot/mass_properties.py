@@ -319,11 +319,15 @@ class _Part(NamedTuple):
 def _rigid_part(model: pin.Model, index: int) -> _Part:
     """Return the body of a joint, which carries no modes."""
     body = model.inertias[index]
-    values, axes = np.linalg.eigh(body.inertia)
-    turning = axes[:, values > _NO_MOMENT * values[2]].T
-    moving = np.eye(3) if body.mass > 0.0 else np.zeros((0, 3))
-    rows = np.zeros((len(moving) + len(turning), 6))
-    rows[: len(moving), :3], rows[len(moving) :, 3:] = moving, turning
+    moments, axes = np.linalg.eigh(body.inertia)
+    rotations = axes[:, moments > _NO_MOMENT * moments[2]].T
+    translations = np.zeros((0, 3))
+    if body.mass > 0.0:
+        translations = np.eye(3)
+    count = len(translations)
+    rows = np.zeros((count + len(rotations), 6))
+    rows[:count, :3] = translations
+    rows[count:, 3:] = rotations
     return _Part(index, body.lever, [], rows)
 
 
