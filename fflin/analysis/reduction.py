@@ -357,10 +357,10 @@ def removed_wheels(lin: LinearModel, wheel_speeds: bool | None) -> Indices:
         )
     _, free = ignorable_wheels(lin)
     if len(free) and wheel_speeds is None:
-        turning = [name.startswith("q_b.") for name in lin.state_names[: len(lin.M)]]
-        wheel_speeds = bool(
-            mechanics.second_order(lin.generator or lin).S.values[turning].any()
-        )
+        # S contains the generalised forces of the inputs. Its rows q_b are torques on the robot.
+        S = mechanics.second_order(lin.generator or lin).S.values
+        is_torque = [name.startswith("q_b.") for name in lin.state_names[: len(lin.M)]]
+        wheel_speeds = bool(S[is_torque].any())
     if not len(free) or not wheel_speeds:
         return free
     forces = rigid_forces(without(lin.generator or lin, free))

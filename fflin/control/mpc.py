@@ -323,9 +323,13 @@ def _stageless_horizon(
 def _about(lin: LinearModel, horizon: Horizon, cost: Cost) -> Mpc:
     """Design the controller about a point; its horizon has no stages yet."""
     lin = at_fixed_point(lin)
-    (Q, R, Qf, weights), sampled = cost, lin.discretize(horizon.dt)
-    given = (Q, R) if Q is None or R is None else sampled_cost(lin, horizon.dt, Q, R)
-    gain = regulator(sampled, *given, weights=weights)
+    Q, R, Qf, weights = cost
+    dt = horizon.dt
+    sampled = lin.discretize(dt)
+    if Q is None or R is None:
+        gain = regulator(sampled, Q, R, weights=weights)
+    else:
+        gain = regulator(sampled, *sampled_cost(lin, dt, Q, R), weights=weights)
     StateFeedback(sampled, gain.K)  # refuses a moving reference
     total = np.block([[gain.Q, gain.N], [gain.N.T, gain.R]])
     end = gain.P if asks_steady(Qf) else weight("Qf", Qf, lin.state_names)
@@ -336,18 +340,21 @@ def _about(lin: LinearModel, horizon: Horizon, cost: Cost) -> Mpc:
         horizon.stage(total, whole, *gain_and_cost, lin, lin.u0, lin.x0)
         for gain_and_cost in zip(K, P, strict=False)
     ]
-    far = np.maximum(stages[0].low, -stages[0].high) > 1e-9
-    if far.any():
+    # The limits are relative to the point, so 0 must be within them.
+    first = stages[0]
+    exceeded = np.maximum(first.low, -first.high) > 1e-9
+    if exceeded.any():
         raise InputError(
-            f"the point exceeds the limits of {listed(compress(horizon.limited, far))}; give wider "
-            "limits, or linearise about another point"
+            f"the point exceeds the limits of {listed(compress(horizon.limited, exceeded))}; "
+            "give wider limits, or linearise about another point"
         )
     return Mpc(sampled, gain, replace(horizon, stages=tuple(stages[::-1])))
 
 
 def _along(traj: LinearTrajectory, horizon: Horizon, cost: Cost) -> TrajectoryMpc:
     """Design the controller along a trajectory; its horizon has no stages yet."""
-    (Q, R, Qf, weights), dt = cost, horizon.dt
+    Q, R, Qf, weights = cost
+    dt = horizon.dt
     schedule = tvlqr(traj, Q, R, Qf, dt, weights=weights)
     follows = TrajectoryFeedback(traj, schedule)
     state = StateMap(traj.robot, frame="local")

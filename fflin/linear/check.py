@@ -362,20 +362,22 @@ class References:
         steps = self._steps(lin, joints=2e-4, modes=1e-2)
         is_curved = np.zeros(len(steps), dtype=bool)
         is_curved[g.q_b] = is_curved[g.q_m] = True
-        slopes, again = jacobians(model.rates, self._point, steps, is_curved)
+        jacobian, repetitions = jacobians(model.rates, self._point, steps, is_curved)
         # The rounding error of a difference is the rounding error of f, divided by the step. The
         # rounding error of f contains the rounding error of x.
-        still = np.abs(slopes) @ np.abs(self._point)
-        size = np.tile((still + route.rate_terms(np.zeros(nv)))[:, None], len(steps))
-        size[:, nv:nx] = (still + route.rate_terms(steps[nv:nx]))[:, None]
+        of_x = np.abs(jacobian) @ np.abs(self._point)
+        of_f = of_x + route.rate_terms(np.zeros(nv))
+        of_f_with_velocity_steps = of_x + route.rate_terms(steps[nv:nx])
+        size = np.tile(of_f[:, None], len(steps))
+        size[:, nv:nx] = of_f_with_velocity_steps[:, None]
         size = size / steps + np.hstack((route.sums_A, route.sums_B))
         rounding = ULPS * EPS * size
-        rounding += sampled(g._asdict(), slopes, again, route.units)
+        rounding += sampled(g._asdict(), jacobian, repetitions, route.units)
         # Differences may be exactly zero where M^-1, and so the model, has rounding errors.
         rounding = np.maximum(rounding, np.hstack((route.A.rounding, route.B.rounding)))
         return (
-            Reference(slopes[:, :nx], route.A.scale, rounding[:, :nx]),
-            Reference(slopes[:, nx:], route.B.scale, rounding[:, nx:]),
+            Reference(jacobian[:, :nx], route.A.scale, rounding[:, :nx]),
+            Reference(jacobian[:, nx:], route.B.scale, rounding[:, nx:]),
         )
 
     def _rates(self) -> Reference:

@@ -178,16 +178,17 @@ def outputs(
     instance("robot", robot, Robot, "a fflin.Robot")
     state = StateMap(robot, reference=about_point(lin).reference, frame=lin.frame)
     require_fit(lin, robot, state, sensed=True)
-    at = robot.checked_configuration(q)
-    moving = np.zeros(robot.nv) if v is None else robot.checked_velocity(v)
+    q = robot.checked_configuration(q)
+    v = np.zeros(robot.nv) if v is None else robot.checked_velocity(v)
     u = lin.u0 if u is None else vector("u", u, len(lin.u0), "one for each input")
     a: Array = np.zeros(robot.nv)
     if any(output.FEELS_ACCELERATION for output in robot.outputs):
         aba = Aba(state)
-        in_base = aba.actuation.in_base_axes(state.unchecked_chart(at), u)
-        a = aba.acceleration(at, moving, in_base)
-    x = state.read(at, moving, near=state.read(lin.q, lin.v))
-    return Measuring(state, lin.q)(x, at, moving, a)
+        u_in_base_axes = aba.actuation.in_base_axes(state.unchecked_chart(q), u)
+        a = aba.acceleration(q, v, u_in_base_axes)
+    x = state.read(q, v, near=state.read(lin.q, lin.v))
+    measure = Measuring(state, lin.q)
+    return measure(x, q, v, a)
 
 
 def line_up(gain: Gain | GainBatch, lin: LinearModel) -> Array:

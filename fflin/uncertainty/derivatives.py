@@ -173,20 +173,20 @@ class ModelDerivatives:
         point = (lin.q, lin.v, self._nu, self._u)
 
         def g(
-            parameter: Parameter, derivatives: Sequence[Array], change: float
+            parameter: Parameter, by_parameter: Sequence[Array], change: float
         ) -> Array:
             """Return g of (12.2a), the mass times [C, D, y0], after a change of a parameter.
 
-            The accelerations are changed linearly, by their `derivatives`. So g is a quadratic
-            function of the change, and (12.2a) is exact for any step.
+            `by_parameter` contains the derivatives of the accelerations. The accelerations are
+            extrapolated linearly. So g is a quadratic function of the change, and (12.2a) is exact
+            for any step.
             """
             change_bodies(model, self.robot.model, parameter, change)
-            accelerations = AccelerationDerivatives(
-                *(
-                    value + change * derivative
-                    for value, derivative in zip(self._rates, derivatives, strict=True)
-                )
-            )
+            extrapolated = [
+                value + change * derivative
+                for value, derivative in zip(self._rates, by_parameter, strict=True)
+            ]
+            accelerations = AccelerationDerivatives(*extrapolated)
             equations = output_equations(
                 sensing, actuation, data, self._chart, accelerations, lin.x0, point
             )
@@ -210,7 +210,7 @@ class ModelDerivatives:
             g_2h = g(parameter, by_parameter, 2.0 * h)
             g_p = (4.0 * g_h - g_2h - 3.0 * g_0) / (2.0 * h)
             m_p = sum(change[0] for change in parameter.bodies.values())
-            # With y = g_0 / m, this is the quotient rule for the derivative of g / m.
+            # (12.2a) is the quotient rule for y = g / m.
             derivatives[index, rows] = (g_p - m_p * g_0 / m) / m
         return derivatives
 
@@ -224,9 +224,10 @@ class ModelDerivatives:
         lin = self.lin
         step = _STEP / self.fraction(one.bodies)
 
-        def at(times: float) -> tuple[Array, Array]:
+        def matrices(steps: float) -> tuple[Array, Array]:
+            """Return A and B for the parameter changed by a number of steps."""
             model = self.robot.model.copy()
-            change_bodies(model, self.robot.model, one, times * step)
+            change_bodies(model, self.robot.model, one, steps * step)
             changed = replace(self.robot, model=model)
             state = StateMap(changed, reference=lin.reference, frame=lin.frame)
             route = aba_route(Aba(state), lin.q, lin.v, lin.u0, moving=lin.moving)
@@ -234,12 +235,20 @@ class ModelDerivatives:
                 return held_exponential(*route[:2], lin.dt)
             return route[:2]
 
-        (dA, dB, *_), worst = self.over([one]), 0.0
-        values = zip(*map(at, (-2.0, -1.0, 1.0, 2.0, 0.0)), (dA[0], dB[0]), strict=True)
-        for far, near, nearer, farther, now, exact in values:
-            by_steps = (far - 8.0 * near + 8.0 * nearer - farther) / (12.0 * step)
-            size = max(np.abs(by_steps).max(), _LEAST * np.abs(now).max() / step)
-            worst = max(worst, float(np.abs(by_steps - exact).max() / size))
+        dA, dB, *_ = self.over([one])
+        two_before = matrices(-2.0)
+        one_before = matrices(-1.0)
+        nominal = matrices(0.0)
+        one_after = matrices(1.0)
+        two_after = matrices(2.0)
+        worst = 0.0
+        for i, exact in enumerate((dA[0], dB[0])):
+            difference = (
+                two_before[i] - 8.0 * one_before[i] + 8.0 * one_after[i] - two_after[i]
+            ) / (12.0 * step)
+            least = _LEAST * np.abs(nominal[i]).max() / step
+            size = max(np.abs(difference).max(), least)
+            worst = max(worst, float(np.abs(difference - exact).max() / size))
         return worst
 
     @cached_property
