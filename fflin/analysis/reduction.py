@@ -329,17 +329,18 @@ def ignorable_wheels(lin: LinearModel) -> tuple[Indices, Indices]:
     The first array contains all such wheels. The second array contains those of them whose speeds
     do not affect the other states either.
     """
-    # A wheel speed affects other states if the link that carries the wheel rotates at the operating
-    # point, or if the wheel has friction.
     nv = len(lin.M)
-    angles = {f"q_m.{name}" for name in lin.wheels}
-    wheels = np.flatnonzero([name in angles for name in lin.state_names[:nv]])
+    angle_names = {f"q_m.{name}" for name in lin.wheels}
+    wheels = np.flatnonzero([name in angle_names for name in lin.state_names[:nv]])
     if not len(wheels):
         return wheels, wheels
+    # In the second-order form, an angle has no effect if its column of K is zero. A speed has no
+    # effect if its column of D is zero. A wheel speed has an effect if the link that carries the
+    # wheel rotates at the operating point, or if the wheel has friction.
     system = mechanics.second_order(lin.generator or lin)
-    angle_is_free = ~system.K.values[:, wheels].any(axis=0)
-    speed_is_free = ~system.D.values[:, wheels].any(axis=0)
-    return wheels[angle_is_free], wheels[angle_is_free & speed_is_free]
+    angle_is_ignorable = ~system.K.values[:, wheels].any(axis=0)
+    speed_is_ignorable = ~system.D.values[:, wheels].any(axis=0)
+    return wheels[angle_is_ignorable], wheels[angle_is_ignorable & speed_is_ignorable]
 
 
 def removed_wheels(lin: LinearModel, wheel_speeds: bool | None) -> Indices:

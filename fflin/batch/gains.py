@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -96,15 +97,17 @@ class GainBatch(Design):
         )
 
     def _between(self, joints: Array) -> Array:
-        point = [
-            min(max(joints[self.joint_names.index(name)], values[0]), values[-1])
-            for name, values in self._axes.items()
-        ]
+        """Return K at joint positions (n,), which are clamped to the range of the grid."""
+        point = []
+        for name, values in self._axes.items():
+            position = joints[self.joint_names.index(name)]
+            point.append(min(max(position, values[0]), values[-1]))
         K: Array = self._interpolator(point)[0]
         return K
 
     @cached_property
     def _axes(self) -> dict[str, Array]:
+        """Axes of the grid, see `grid`; raise `InputError` if the points are not a full grid."""
         columns = dict(zip(self.joint_names, self.joint_positions.T, strict=True))
         axes = {
             name: np.unique(column)
@@ -116,12 +119,10 @@ class GainBatch(Design):
                 "all points of the batch are the same, expected a grid; make the points with "
                 "fflin.grid"
             )
-        points = np.unique(self.joint_positions, axis=0)
-        if (
-            not len(points)
-            == len(self)
-            == np.prod([len(values) for values in axes.values()])
-        ):
+        # On a full grid, each combination of the axis values occurs exactly once.
+        different_points = len(np.unique(self.joint_positions, axis=0))
+        grid_points = math.prod(len(values) for values in axes.values())
+        if different_points < len(self) or len(self) != grid_points:
             raise InputError(
                 f"interpolation needs all points of a grid over {', '.join(axes)}, but the "
                 f"{len(self)} points of the batch are not a full grid; make the points with "

@@ -371,9 +371,10 @@ class Campaign(FrozenArrays):
         The default figure is `about`. Runs that were stopped early come first, the earliest stop
         before the others.
         """
-        order = np.lexsort(
-            (-self.values(name or self.about), np.where(self.stopped, self.end, np.inf))
-        )
+        figure = self.values(name or self.about)
+        stop_times = np.where(self.stopped, self.end, np.inf)
+        # `lexsort` sorts by its last key first: by stop time, and then by decreasing figure.
+        order = np.lexsort((-figure, stop_times))
         return [int(run) for run in order[: whole("k", k, 1)]]
 
     def sensitivity(self, name: str | None = None) -> dict[str, float]:

@@ -332,28 +332,35 @@ class CampaignJob:
         return self.outcome(_recorded(plan, every=1))
 
     def seconds(self, first: Array, count: int) -> float:
-        """Estimate the time [s] in which one core computes `count` runs, from a few steps."""
-        few = copy(self)
+        """Estimate the time [s] in which one core computes `count` runs, from a few steps.
+
+        `first` (N, k) contains the drawn values of the first runs.
+        """
         plan = self.plan
+        trial = copy(self)
         drawn = first[: self.lanes]
-        times = list[float]()
-        steps = plan.times.steps
         out = {
             key: np.empty((len(drawn), *shape)) for key, shape in self.shapes.items()
         }
-        short, long = (min(trial, steps) for trial in (_FEW_STEPS, _SOME_STEPS))
-        # the run of one step compiles the loop if needed
-        for trial_steps in (1, short, long):
-            few.plan = plan.replace(times=plan.times._replace(steps=trial_steps))
+
+        def seconds_of(steps: int) -> float:
+            """Return the time [s] of one group of parallel runs with the given steps."""
+            trial.plan = plan.replace(times=plan.times._replace(steps=steps))
+            timed = partial(trial.run, {"drawn": drawn}, 0, out)
             # Other programs can slow down a trial, so the fastest of three trials counts.
-            timed = partial(few.run, {"drawn": drawn}, 0, out)
-            times.append(min(repeat(timed, timer=perf_counter, repeat=3, number=1)))
-        step = 0.0
-        if long > short:
-            step = (times[2] - times[1]) / (long - short)
-        return (times[1] + max(step, 0.0) * (steps - short)) * math.ceil(
-            count / self.lanes
-        )
+            return min(repeat(timed, timer=perf_counter, repeat=3, number=1))
+
+        steps = plan.times.steps
+        few = min(_FEW_STEPS, steps)
+        more = min(_SOME_STEPS, steps)
+        seconds_of(1)  # compiles the loop if needed
+        few_seconds = seconds_of(few)
+        more_seconds = seconds_of(more)
+        per_step = 0.0
+        if more > few:
+            per_step = max((more_seconds - few_seconds) / (more - few), 0.0)
+        per_group = few_seconds + per_step * (steps - few)
+        return per_group * math.ceil(count / self.lanes)
 
     def replay(self, drawn: Array) -> Motion:
         """Repeat the run with the drawn values (k,), by the same engine, and return its motion."""

@@ -175,16 +175,20 @@ def mpc(
             raise InputError("sample is missing; give the sampling time [s]")
         sample = lin.dt
     dt = number("sample", sample)
+    # The design starts from the continuous model or trajectory. If lin is sampled, its sampling
+    # time must be the same as the controller's.
     source = lin if isinstance(lin, LinearTrajectory) else lin.generator
-    if source is None or source.dt or dt != (lin.dt or dt):
+    has_other_dt = lin.dt > 0.0 and lin.dt != dt
+    if source is None or source.dt or has_other_dt:
         raise InputError(
             "lin is sampled with another dt, or the model before sampling is not known; give the "
             "continuous model and sample="
         )
-    ahead = _unplanned(source, limits, samples, dt)
+    cost = (Q, R, Qf, weights)
+    stageless = _stageless_horizon(source, limits, samples, dt)
     if isinstance(source, LinearTrajectory):
-        return _along(source, ahead, (Q, R, Qf, weights))
-    return _about(source, ahead, (Q, R, Qf, weights))
+        return _along(source, stageless, cost)
+    return _about(source, stageless, cost)
 
 
 # Largest number of rows of the table on the card of a notebook.
@@ -270,7 +274,7 @@ class TrajectoryMpc(_Predictive, TrajectoryFeedback):
     horizon: Horizon
 
 
-def _unplanned(
+def _stageless_horizon(
     model: LinearModel | LinearTrajectory, limits: object, samples: int, dt: float
 ) -> Horizon:
     """Return a horizon with the limits of a model's signals, but no stages."""
@@ -316,34 +320,41 @@ def _unplanned(
     return Horizon((), samples, dt, inputs, robot.name, limited, at, low[at], high[at])
 
 
-def _about(lin: LinearModel, ahead: Horizon, cost: Cost) -> Mpc:
-    """Design the controller about a point; `ahead` is its horizon, which has no stages yet."""
+def _about(lin: LinearModel, horizon: Horizon, cost: Cost) -> Mpc:
+    """Design the controller about a point; its horizon has no stages yet."""
     lin = at_fixed_point(lin)
-    (Q, R, Qf, weights), sampled = cost, lin.discretize(ahead.dt)
-    given = (Q, R) if Q is None or R is None else sampled_cost(lin, ahead.dt, Q, R)
-    gain = regulator(sampled, *given, weights=weights)
+    Q, R, Qf, weights = cost
+    dt = horizon.dt
+    sampled = lin.discretize(dt)
+    if Q is None or R is None:
+        gain = regulator(sampled, Q, R, weights=weights)
+    else:
+        gain = regulator(sampled, *sampled_cost(lin, dt, Q, R), weights=weights)
     StateFeedback(sampled, gain.K)  # refuses a moving reference
     total = np.block([[gain.Q, gain.N], [gain.N.T, gain.R]])
     end = gain.P if asks_steady(Qf) else weight("Qf", Qf, lin.state_names)
     whole = np.hstack((sampled.A, sampled.B))
     with bounded_by("a smaller Qf"):
-        K, P, _ = samples_back([(total, whole)] * ahead.samples, end)
+        K, P, _ = samples_back([(total, whole)] * horizon.samples, end)
     stages = [
-        ahead.stage(total, whole, *gain_and_cost, lin, lin.u0, lin.x0)
+        horizon.stage(total, whole, *gain_and_cost, lin, lin.u0, lin.x0)
         for gain_and_cost in zip(K, P, strict=False)
     ]
-    far = np.maximum(stages[0].low, -stages[0].high) > 1e-9
-    if far.any():
+    # The limits are relative to the point, so 0 must be within them.
+    first = stages[0]
+    exceeded = np.maximum(first.low, -first.high) > 1e-9
+    if exceeded.any():
         raise InputError(
-            f"the point exceeds the limits of {listed(compress(ahead.limited, far))}; give wider "
-            "limits, or linearise about another point"
+            f"the point exceeds the limits of {listed(compress(horizon.limited, exceeded))}; "
+            "give wider limits, or linearise about another point"
         )
-    return Mpc(sampled, gain, replace(ahead, stages=tuple(stages[::-1])))
+    return Mpc(sampled, gain, replace(horizon, stages=tuple(stages[::-1])))
 
 
-def _along(traj: LinearTrajectory, ahead: Horizon, cost: Cost) -> TrajectoryMpc:
-    """Design the controller along a trajectory; `ahead` is its horizon, which has no stages yet."""
-    (Q, R, Qf, weights), dt = cost, ahead.dt
+def _along(traj: LinearTrajectory, horizon: Horizon, cost: Cost) -> TrajectoryMpc:
+    """Design the controller along a trajectory; its horizon has no stages yet."""
+    Q, R, Qf, weights = cost
+    dt = horizon.dt
     schedule = tvlqr(traj, Q, R, Qf, dt, weights=weights)
     follows = TrajectoryFeedback(traj, schedule)
     state = StateMap(traj.robot, frame="local")
@@ -372,9 +383,9 @@ def _along(traj: LinearTrajectory, ahead: Horizon, cost: Cost) -> TrajectoryMpc:
         x = np.concatenate(
             (np.zeros(6), state.joint_positions(model.q), state.velocities(v))
         )
-        stages.append(ahead.stage(total, step, K, P, model, u, x))
-    stages += stages[-1:] * (ahead.samples - 1)
-    return TrajectoryMpc(traj, schedule, replace(ahead, stages=tuple(stages)))
+        stages.append(horizon.stage(total, step, K, P, model, u, x))
+    stages += stages[-1:] * (horizon.samples - 1)
+    return TrajectoryMpc(traj, schedule, replace(horizon, stages=tuple(stages)))
 
 
 class Stage(NamedTuple):

@@ -203,9 +203,11 @@ class Chart:
         Each slice in `parts` selects three rows of x: the components of k vectors. The given array
         is not changed.
         """
-        if self.standing or not parts:
+        if self.standing or not parts:  # R is the identity, or no rows are selected
             return x
-        return _turn(self.R, parts, x.copy("K"))
+        # Keep the memory layout of x, which may be a transposed view.
+        copied = x.copy("K")
+        return _turn(self.R, parts, copied)
 
     def to_base(self, parts: tuple[slice, ...], x: Array) -> Array:
         """Return x (.., m, k) with some rows converted from reference axes to base axes.
@@ -213,9 +215,11 @@ class Chart:
         Each slice in `parts` selects three rows of x: the components of k vectors. The given array
         is not changed.
         """
-        if self.standing or not parts:
+        if self.standing or not parts:  # R is the identity, or no rows are selected
             return x
-        return _turn(self.R.mT, parts, x.copy("K"))
+        # Keep the memory layout of x, which may be a transposed view.
+        copied = x.copy("K")
+        return _turn(self.R.mT, parts, copied)
 
 
 class Standing(Chart):
@@ -233,6 +237,7 @@ def times(matrices: Array, vectors: Array) -> Array:
 
 
 def _turn(R: Array, parts: tuple[slice, ...], x: Array) -> Array:
+    """Multiply the selected blocks of three rows of x by R from the left, in place; return x."""
     for rows in parts:
         x[..., rows, :] = product(R, x[..., rows, :])
     return x

@@ -73,10 +73,20 @@ def measured(world: StateMap, q: Array, v: Array) -> Array:
 
     `world` is a state map of the robot whose reference is the world. q and v are not checked.
     """
+    # The C code takes the angular velocity of the base in base axes, but the velocity of its origin
+    # in world axes. `velocities` returns both in base axes.
     attitude = quaternion_product(world.origin_quaternion, q[3:7])
-    nu = world.velocities(v)
-    pose = attitude, world.positions(q), world.joint_positions(q)
-    return np.concatenate((*pose, nu[:3], world.rotation(q) @ nu[3:6], nu[6:]))
+    omega_b, v_b, joint_rates = np.split(world.velocities(v), (3, 6))
+    return np.concatenate(
+        (
+            attitude,
+            world.positions(q),
+            world.joint_positions(q),
+            omega_b,
+            world.rotation(q) @ v_b,
+            joint_rates,
+        )
+    )
 
 
 def law_of(given: object, robot: object, limits: object) -> Law:

@@ -341,19 +341,22 @@ class RowAccelerations:
     def _derive(
         self, points: tuple[Array, ...], c: Array, A: Array, by_u: Array
     ) -> Mask:
-        judged = np.empty((len(by_u), 1))
+        """Call the kernel `derive`, which writes to c, A and by_u; return the mask of `write`."""
+        couplings = np.empty((len(by_u), 1))
         kernel("derivatives", "derive")(
             self._tree,
             # Copy read-only arrays, because numba would compile a second function for such arrays.
             tuple(np.require(rows, np.float64, ("C", "W")) for rows in points),
-            (c, A, by_u.reshape(len(by_u), -1), judged),
+            (c, A, by_u.reshape(len(by_u), -1), couplings),
             Packed(*map(work_space, self._sizes)),
             work_space(self._work),
         )
-        # `judged` is the sum of the couplings. If a pivot of M is zero, the sum is NaN, and both
-        # comparisons are false.
-        good = (self._least_coupling < judged) & (judged < WARNING_COUPLING)
+        # If a pivot of M is zero, the sum of the couplings is NaN, and both comparisons are false.
+        total = couplings[:, 0]
+        accurate = (self._least_coupling < total) & (total < WARNING_COUPLING)
+        # The sine and cosine of very large angles are inaccurate. Such angles are rare, so compare
+        # single numbers first, which is faster than a comparison of all entries.
         q_m = points[0][:, 7:]
         if q_m.max(initial=0.0) < _FARTHEST and q_m.min(initial=0.0) > -_FARTHEST:
-            return good[:, 0]
-        return good[:, 0] & (np.abs(q_m) < _FARTHEST).all(axis=1)
+            return accurate
+        return accurate & (np.abs(q_m) < _FARTHEST).all(axis=1)

@@ -155,7 +155,9 @@ def push(work, tree, pushing):
 def accelerate(work, robot, point, rates, to):
     """Write d(nu)/dt into `rates` from the index `to` on.
 
-    `configure` must be called before this function. The factorisation of M overwrites M.
+    First, the equation of motion (3.1) is solved for the accelerations c: M c is the force of the
+    inputs, minus the bias, minus the force of springs and dampers. `configure` must be called
+    before this function. The factorisation of M overwrites M.
     """
     tree, nu = robot.tree, point.nu
     force = tree.offsets.c
@@ -175,11 +177,13 @@ def accelerate(work, robot, point, rates, to):
             pull = pull + load(tree.damping, joint) * load(nu, 6 + joint)
             vec.add(work, force + 6 + joint, -pull)
     bodies.factorise(work, tree)
+    # `solve` replaces the force M c by the accelerations c.
     bodies.solve(work, tree, force)
     vec.copy(work, force, rates, to, size)
     # By (3.2), dv_b/dt is the linear part of c plus gravity, minus omega_b x v_b.
-    fall = vec.across(vec.axes_of(point.q), vec.get3(robot.gravity, 0))
-    fall = vec.minus(fall, vec.cross(vec.get3(nu, 0), vec.get3(nu, 3)))
+    gravity = vec.across(vec.axes_of(point.q), vec.get3(robot.gravity, 0))
+    transport = vec.cross(vec.get3(nu, 0), vec.get3(nu, 3))
+    fall = vec.minus(gravity, transport)
     vec.put3(rates, to + 3, vec.plus(vec.get3(rates, to + 3), fall))
 
 

@@ -200,19 +200,24 @@ def _chosen(
     builder: ir.IRBuilder,
     left: ir.Value,
     right: ir.Value,
-    less: ir.Value,
-    other: ir.Value,
+    if_less: ir.Value,
+    otherwise: ir.Value,
 ) -> ir.Value:
-    return builder.select(builder.fcmp_ordered("<", left, right), less, other)
+    """Generate the code of `vectors.chosen`; an ordered comparison with NaN is false."""
+    is_less = builder.fcmp_ordered("<", left, right)
+    return builder.select(is_less, if_less, otherwise)
 
 
 @_operation(uncompiled.below, lambda *kinds: boolean(*_alike(*kinds).args))
 def _below(builder: ir.IRBuilder, value: ir.Value, bound: ir.Value) -> ir.Value:
-    less = builder.fcmp_ordered("<", value, bound)
+    """Generate the code of `vectors.below`, which is true if all lanes are below the bound."""
+    is_less = builder.fcmp_ordered("<", value, bound)
     if value.type != _VECTOR:
-        return less
+        return is_less
+    # The comparison returns one bit per lane. As an integer, -1 has all bits set.
     bits = ir.IntType(LANES)
-    return builder.icmp_signed("==", builder.bitcast(less, bits), ir.Constant(bits, -1))
+    lanes_as_bits = builder.bitcast(is_less, bits)
+    return builder.icmp_signed("==", lanes_as_bits, ir.Constant(bits, -1))
 
 
 @_operation(uncompiled.angle, _alike)
@@ -385,18 +390,26 @@ def _field(
 
 
 def opener(kind: Struct[NamedTuple]) -> Callable[..., object]:
-    """Return the numba function that interprets an array of words as a struct."""
+    """Return the numba function that interprets an array of words as a struct.
 
-    def opened(_: TypingContext, words: Array) -> tuple[Signature, Generator]:
+    In compiled code, a struct is the address of its first word.
+    """
+
+    def opened(_: TypingContext, words_type: Array) -> tuple[Signature, Generator]:
+        """Return the signature of the function, and the generator of its LLVM code."""
+
         def generate(
             context: BaseContext,
             builder: ir.IRBuilder,
             _: Signature,
-            values: Sequence[ir.Value],
+            arguments: Sequence[ir.Value],
         ) -> ir.Value:
-            return context.make_array(words)(context, builder, values[0]).data
+            open_array = context.make_array(words_type)
+            words = open_array(context, builder, arguments[0])
+            return words.data  # address of the first word
 
-        return _StructType(kind)(words), generate
+        signature = _StructType(kind)(words_type)
+        return signature, generate
 
     return extending.intrinsic(opened)
 

@@ -95,16 +95,19 @@ class Struct(Generic[T_co]):
         self.name = f"Struct({made.__name__})"
 
     def with_one_lane(self) -> Struct[T_co]:
-        """Return the same struct, but with a single lane in every array with lanes."""
+        """Return the struct for a single lane, which is the same struct if no array has lanes."""
         kinds: dict[str, Kind | Struct[NamedTuple]] = {}
         for field, kind in self.kinds.items():
             if isinstance(kind, Struct):
                 kinds[field] = kind.with_one_lane()
+            elif kind == LANED:
+                kinds[field] = ONE_LANE
             else:
-                kinds[field] = ONE_LANE if kind == LANED else kind
+                kinds[field] = kind
         if kinds == self.kinds:
             return self
-        struct = Struct(self.made, REALS, None, **kinds)
+        struct = Struct(self.made, **kinds)
+        # numba compares types by name, so the name must differ from the name of `self`.
         struct.name = f"Struct({self.made.__name__}, one lane)"
         return struct
 
@@ -120,12 +123,11 @@ def empty(kind: Struct[T]) -> T:
     for field_kind in kind.kinds.values():
         if isinstance(field_kind, Struct):
             parts.append(empty(field_kind))
+        elif field_kind.axes:
+            no_entries = (0,) * field_kind.axes
+            parts.append(np.zeros(no_entries, field_kind.dtype))
         else:
-            parts.append(
-                np.zeros((0,) * field_kind.axes, field_kind.dtype)
-                if field_kind.axes
-                else 0
-            )
+            parts.append(0)
     return kind.made._make(parts)
 
 

@@ -69,9 +69,12 @@ def store(array: Entries, index: int, value: Number) -> None:
     array[index] = value
 
 
-def chosen(left: Number, right: Number, less: Number, other: Number) -> Number:
-    """Return `less` if left < right, else `other`, lane by lane; a comparison with NaN is false."""
-    return less if left < right else other
+def chosen(left: Number, right: Number, if_less: Number, otherwise: Number) -> Number:
+    """Return `if_less` if left < right, else `otherwise`, lane by lane.
+
+    A comparison with NaN is false.
+    """
+    return if_less if left < right else otherwise
 
 
 def below(value: Number, bound: Number) -> bool:

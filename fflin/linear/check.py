@@ -323,15 +323,14 @@ class References:
         route, g = self.route, self.route.state.groups
         nx = route.state.nx
         nu = len(lin.u0)
-        # A unit of the amplitude of a mode moves its body by `scale` [rad or m]. A body that hardly
-        # rotates also translates. Because the modal mass is 1, it translates by at least 1 /
-        # sqrt(mass) [m] per unit of the amplitude.
+        # `per_unit` is the change of q_m per rad or m of displacement: 1 / `scale`. For a modal
+        # amplitude, `scale` can be almost zero, and 1 / `scale` would then be too large a step. But
+        # such a body translates by at least 1 / sqrt(robot's mass) [m] per unit of the amplitude,
+        # because the modal mass is 1. So sqrt(robot's mass) bounds the step.
         robot = route.state.robot
-        bodies = robot.joints
-        widest = math.sqrt(robot.mass)
-        per_unit = np.array([1.0 / body.scale for body in bodies])
-        is_mode = np.array([body.mode for body in bodies], dtype=bool)
-        per_unit[is_mode] = np.minimum(per_unit[is_mode], widest)
+        per_unit = np.array([1.0 / joint.scale for joint in robot.joints])
+        is_mode = np.array([joint.mode for joint in robot.joints], dtype=bool)
+        per_unit[is_mode] = np.minimum(per_unit[is_mode], math.sqrt(robot.mass))
         steps = np.zeros(nx + nu)
         steps[g.q_m] = np.where(is_mode, modes, joints) * per_unit
         # Keep the points of the differences well inside the chart, because f is steep near the
@@ -346,10 +345,9 @@ class References:
         steps[g.omega_b] = 0.1 * fastest
         steps[g.qdot_m] = 0.1 * fastest * per_unit
         steps[g.v_b] = 0.1 * max(1.0, _largest(speed[LINEAR]))
-        steps[nx:] = (
-            max(1.0, _largest(route.accelerations.rates / route.base_mobility))
-            / route.input_mobility
-        )
+        # The inputs change the accelerations by about their size at the operating point.
+        acceleration = _largest(route.accelerations.rates / route.base_mobility)
+        steps[nx:] = max(1.0, acceleration) / route.input_mobility
         return steps
 
     def _by_differences(self, lin: LinearModel) -> tuple[Reference, Reference]:
@@ -364,20 +362,22 @@ class References:
         steps = self._steps(lin, joints=2e-4, modes=1e-2)
         is_curved = np.zeros(len(steps), dtype=bool)
         is_curved[g.q_b] = is_curved[g.q_m] = True
-        slopes, again = jacobians(model.rates, self._point, steps, is_curved)
+        jacobian, repetitions = jacobians(model.rates, self._point, steps, is_curved)
         # The rounding error of a difference is the rounding error of f, divided by the step. The
         # rounding error of f contains the rounding error of x.
-        still = np.abs(slopes) @ np.abs(self._point)
-        size = np.tile((still + route.rate_terms(np.zeros(nv)))[:, None], len(steps))
-        size[:, nv:nx] = (still + route.rate_terms(steps[nv:nx]))[:, None]
+        of_x = np.abs(jacobian) @ np.abs(self._point)
+        of_f = of_x + route.rate_terms(np.zeros(nv))
+        of_f_with_velocity_steps = of_x + route.rate_terms(steps[nv:nx])
+        size = np.tile(of_f[:, None], len(steps))
+        size[:, nv:nx] = of_f_with_velocity_steps[:, None]
         size = size / steps + np.hstack((route.sums_A, route.sums_B))
         rounding = ULPS * EPS * size
-        rounding += sampled(g._asdict(), slopes, again, route.units)
+        rounding += sampled(g._asdict(), jacobian, repetitions, route.units)
         # Differences may be exactly zero where M^-1, and so the model, has rounding errors.
         rounding = np.maximum(rounding, np.hstack((route.A.rounding, route.B.rounding)))
         return (
-            Reference(slopes[:, :nx], route.A.scale, rounding[:, :nx]),
-            Reference(slopes[:, nx:], route.B.scale, rounding[:, nx:]),
+            Reference(jacobian[:, :nx], route.A.scale, rounding[:, :nx]),
+            Reference(jacobian[:, nx:], route.B.scale, rounding[:, nx:]),
         )
 
     def _rates(self) -> Reference:

@@ -249,28 +249,31 @@ def write_table(path: Path, names: Sequence[str], rows: Array) -> None:
 def read(
     source: Path, robot: Robot, hold: str | None, frame: str | None
 ) -> dict[str, Any]:
-    """Read the arguments of `Trajectory` from a file; see `Trajectory.load`."""
+    """Read the arguments of `Trajectory` from a file; see `Trajectory.load`.
+
+    If `hold` or `frame` is given, the file's value is ignored.
+    """
     check_ending(source, FORMATS)
+    is_table = source.suffix == ".csv"
     with reading(source, "trajectory"):
-        table = source.suffix == ".csv"
-        if table:
+        if is_table:
             state = StateMap(robot)
-            entries, verified = _columns(
-                source, {*state.names, *Actuation(state).names}
-            )
+            signal_names = {*state.names, *Actuation(state).names}
+            entries, verified = _columns(source, signal_names)
         else:
             entries, verified = read_record(source)
-        if len(entries) == 1 and isinstance(
-            struct := next(iter(entries.values())), dict
-        ):
-            entries = struct  # a MATLAB struct
+        # A .mat file may contain a single struct, whose fields are the entries.
+        if len(entries) == 1:
+            (entry,) = entries.values()
+            if isinstance(entry, dict):
+                entries = entry
     with located(str(source)):
-        if table:
+        if is_table:
             entries = _entries(entries, robot)
         if not hold:
             hold = text(entries["hold"]) if "hold" in entries else None
         if not frame:
-            frame = text(entries["frame"]) if "frame" in entries else "local"
+            frame = text(entries.get("frame", "local"))
         return arguments(entries, robot, hold, frame, verified)
 
 

@@ -66,6 +66,12 @@ def signals_of(state: StateMap, kind: str) -> Signals:
     return source.names, source.units
 
 
+def _counted(kind: str, names: list[str]) -> str:
+    """Return the names of signals after a singular or plural noun, such as "states x, y"."""
+    noun = kind if len(names) == 1 else f"{kind}s"
+    return f"{noun} {listed(names)}"
+
+
 def require_same(
     made: str,
     state: StateMap,
@@ -82,22 +88,23 @@ def require_same(
     the robot may have further signals.
     """
     robot = state.robot
-    others = dict(zip(*signals_of(state, kind), strict=True))
-    if part and names != tuple(others):
-        others = {name: others[name] for name in names if name in others}
-    if names == tuple(others) and units in (None, tuple(others.values())):
+    # {name: unit} of the robot's signals, and of the expected signals
+    actual = dict(zip(*signals_of(state, kind), strict=True))
+    if part and names != tuple(actual):
+        actual = {name: actual[name] for name in names if name in actual}
+    if names == tuple(actual) and units in (None, tuple(actual.values())):
         return
-    mine = dict(zip(names, units or map(others.get, names), strict=True))
-    lacking = [n for n in mine if n not in others] or [
-        n for n in others if n not in mine
-    ]
-    changed = [name for name in mine if mine[name] != others.get(name)]
-    if lacking:
-        verb = "lacks" if lacking[0] in mine else "also has"
-        noun = kind if len(lacking) == 1 else f"{kind}s"
-        difference = f"{verb} the {noun} {listed(lacking)}"
+    expected = dict(zip(names, units or map(actual.get, names), strict=True))
+    missing = [name for name in expected if name not in actual]
+    extra = [name for name in actual if name not in expected]
+    changed = [name for name in expected if expected[name] != actual.get(name)]
+    if missing:
+        difference = f"lacks the {_counted(kind, missing)}"
+    elif extra:
+        difference = f"also has the {_counted(kind, extra)}"
     elif changed:
-        difference = f"has its {kind} {changed[0]} in {others[changed[0]]}, not {mine[changed[0]]}"
+        name = changed[0]
+        difference = f"has its {kind} {name} in {actual[name]}, not {expected[name]}"
     else:
         difference = f"has its {kind}s in another order"
     subject = made.partition(" was ")[0]
@@ -171,16 +178,17 @@ def outputs(
     instance("robot", robot, Robot, "a fflin.Robot")
     state = StateMap(robot, reference=about_point(lin).reference, frame=lin.frame)
     require_fit(lin, robot, state, sensed=True)
-    at = robot.checked_configuration(q)
-    moving = np.zeros(robot.nv) if v is None else robot.checked_velocity(v)
+    q = robot.checked_configuration(q)
+    v = np.zeros(robot.nv) if v is None else robot.checked_velocity(v)
     u = lin.u0 if u is None else vector("u", u, len(lin.u0), "one for each input")
     a: Array = np.zeros(robot.nv)
     if any(output.FEELS_ACCELERATION for output in robot.outputs):
         aba = Aba(state)
-        in_base = aba.actuation.in_base_axes(state.unchecked_chart(at), u)
-        a = aba.acceleration(at, moving, in_base)
-    x = state.read(at, moving, near=state.read(lin.q, lin.v))
-    return Measuring(state, lin.q)(x, at, moving, a)
+        u_in_base_axes = aba.actuation.in_base_axes(state.unchecked_chart(q), u)
+        a = aba.acceleration(q, v, u_in_base_axes)
+    x = state.read(q, v, near=state.read(lin.q, lin.v))
+    measure = Measuring(state, lin.q)
+    return measure(x, q, v, a)
 
 
 def line_up(gain: Gain | GainBatch, lin: LinearModel) -> Array:

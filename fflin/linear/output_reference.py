@@ -118,17 +118,25 @@ class OutputReference:
         steady = np.zeros_like(self._a)
         unaccelerated = self._evaluate(x[None], steady)[0]
 
-        def differences(part: slice, a: Array) -> Array:
-            def outputs(values: Array) -> Array:
+        def differentiate(varied: slice, a: Array) -> Array:
+            """Return dh/dx for the states `varied` at the acceleration a, and repetitions of it.
+
+            The first axis of the result is for the repetitions; see `jacobians`.
+            """
+
+            def h_of(values: Array) -> Array:
+                """Return h (N, ..) for values (N, k) of the varied states."""
                 points = np.tile(x, (len(values), 1))
-                points[:, part] = values
+                points[:, varied] = values
                 return self._evaluate(points, a)
 
-            first, again = jacobians(outputs, x[part], steps[part], is_curved[part])
-            return np.array([first, *again])
+            derivative, repetitions = jacobians(
+                h_of, x[varied], steps[varied], is_curved[varied]
+            )
+            return np.array([derivative, *repetitions])
 
-        by_positions = differences(slice(nv), self._a)
-        by_velocities = differences(slice(nv, None), steady)
+        by_positions = differentiate(slice(nv), self._a)
+        by_velocities = differentiate(slice(nv, None), steady)
         by_x, *again = np.concatenate((by_positions, by_velocities), axis=2)
 
         parts = {k: np.arange(k, k + 3) for k in range(ny, len(h), 3)}

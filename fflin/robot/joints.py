@@ -222,19 +222,17 @@ class Coordinates:
         from 1 by at most 1e-5. Mimic joints that deviate by at most 1e-5 are corrected to the
         positions that follow from their leaders.
         """
-        near = self._sized("q", q, self.nq, "a configuration in Pinocchio's order")
-        if not pin.isNormalized(self.model, near, ROUND_OFF):
-            parts = {(3, 7): "the base quaternion (x, y, z, w) q[3:7]"}
+        corrected = self._sized("q", q, self.nq, "a configuration in Pinocchio's order")
+        if not pin.isNormalized(self.model, corrected, ROUND_OFF):
+            # `normalised` only checks the lengths here. `pin.normalize` scales all parts at once.
+            normalised("the base quaternion (x, y, z, w) q[3:7]", corrected[3:7])
             for at, name in self.unbounded.items():
-                parts[at, at + 2] = (
-                    f"(cos, sin) of continuous joint '{name}', q[{at}:{at + 2}],"
-                )
-            for (first, last), label in parts.items():
-                normalised(label, near[first:last])
-            near = pin.normalize(self.model, near)
+                label = f"(cos, sin) of continuous joint '{name}', q[{at}:{at + 2}],"
+                normalised(label, corrected[at : at + 2])
+            corrected = pin.normalize(self.model, corrected)
         if self.followers:
-            near = self._followed(near)
-        return near
+            corrected = self._followed(corrected)
+        return corrected
 
     def checked_velocity(self, v: ArrayLike) -> Array:
         """Return a velocity v (nv,) unchanged if it is valid, or raise `InputError`."""

@@ -204,16 +204,19 @@ class LaneLoop:
         runs = runs or {}
         self.lanes = lanes
         if "delay" in runs:  # provide space for the largest delay
-            plan = plan.replace(
-                times=plan.times._replace(delay=int(runs["delay"].max()))
-            )
+            largest_delay = int(runs["delay"].max())
+            plan = plan.replace(times=plan.times._replace(delay=largest_delay))
         stop = stop_conditions(plan)
-        if runs:  # at the start of dispersed runs, q0 of `StopConditions` is positive
+        if runs:
+            # `stop.sign` is the sign of q0 at the start of the plan, or 0 if q0 is not checked. The
+            # initial quaternions of dispersed runs have a positive q0.
             stop = stop._replace(sign=[abs(stop.sign[0])])
         parts = packed(plan, stop, noisy="seed" in runs)
         self._plan = plan
         self._state = plan.plant.state
         self._ending = ending_of(plan, stop)
+        # With noise, `added` contains the noise of SLOTS samples. Without noise, it contains the
+        # constant errors of a single sample, so that it is as long as y.
         self._noisy = len(parts.law.added) > len(parts.law.y)
         # `_fresh` contains a pair for each array with lanes: the array, and the column of initial
         # values that is copied to all lanes.
@@ -226,11 +229,21 @@ class LaneLoop:
         self._work = self._space(self.parts.robot.tree.offsets.size)
         self._advance = kernel("loop", name)
         robot, point = self.parts.robot, self.parts.point
-        self.ends = np.cumsum([len(point.q), len(point.nu), len(point.u), 6, 3])
+        momentum_size = 6
+        center_size = 3
+        self.ends = np.cumsum(
+            [len(point.q), len(point.nu), len(point.u), momentum_size, center_size]
+        )
         self.width = int(self.ends[-1])
         self.done = 0
-        self._of_run = {"q": point.q, "nu": point.nu, "delay": self.parts.channel.delay}
-        self._of_run |= robot.tree._asdict() | robot.faults._asdict()
+        # Arrays of the loop that may differ between the runs, by their names in `Runs`.
+        self._dispersed = {
+            "q": point.q,
+            "nu": point.nu,
+            "delay": self.parts.channel.delay,
+            **robot.tree._asdict(),
+            **robot.faults._asdict(),
+        }
 
     def _space(self, size: int) -> Array:
         """Return work space for the compiled code, which sees one lane as one axis."""
@@ -313,8 +326,8 @@ class LaneLoop:
         for array, initial in self._fresh:
             array[:] = initial
         for name, values in runs.items():
-            if name in self._of_run:
-                self._of_run[name][:] = values[of_lane].T
+            if name in self._dispersed:
+                self._dispersed[name][:] = values[of_lane].T
         robot = self.parts.robot
         # Each body has ten parameters, of which the mass is the first.
         mass = robot.tree.bodies[::10].sum(axis=0)

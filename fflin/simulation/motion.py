@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -336,7 +337,7 @@ class Motion(StatesAndInputs, Design):
                 "impact"
             )
         parts = (*(self._phases or (self,)), *later)
-        if not all(getattr(part, "_robot", part) for part in parts):
+        if any(isinstance(part, Motion) and part._robot is None for part in parts):
             raise InputError(
                 "a motion that was read from a file lacks its robot; join motions returned by "
                 "simulate"
@@ -345,41 +346,25 @@ class Motion(StatesAndInputs, Design):
         whole: Motion = replace(
             first, phases=(first.robot,), starts=first.t[:1], _phases=parts
         )
+        # robot, q and v at the end of the phases that are already joined
         robot = whole._robot
         q = whole.q[-1]
         v = whole.v[-1]
-        event = ""
+        event = ""  # impact directly before the next motion, which names its phase
         for part in parts[1:]:
             if isinstance(part, Impact):
-                name, (other, *first_row) = part.event, part._before
+                _require_start(part.event, *part._before, (robot, q, v))
+                robot = part.robot
+                q = part.q
+                v = part.v
+                event = part.event
+                note = f"{whole.t[-1]:g} s: {part.told}"
+                whole = replace(whole, notes=(*whole.notes, note))
             else:
                 instance("a phase", part, Motion, "a Motion, or an Impact before one")
                 name = event or part.robot
-                other = part._robot
-                first_row = [part.q[0], part.v[0]]
-            first_q, first_v = first_row
-            seen, rates = _seen(robot, other, q, first_q[None], first_v[None])
-            apart = np.abs([pin.difference(robot.model, q, seen[0]), rates[0] - v]).max(
-                axis=0
-            )
-            if apart.max() > _MET * max(1.0, np.abs(v).max()):
-                at = max(
-                    i
-                    for i, start in enumerate(robot.model.idx_vs)
-                    if start <= apart.argmax()
-                )
-                raise InputError(
-                    f"'{name}' does not begin where the motion before it ended: "
-                    f"'{robot.model.names[at]}' differs by {apart.max():.2g} in position or rate; "
-                    "start from q and v in the last row of that motion"
-                )
-            if isinstance(part, Impact):
-                robot, q, v, event = part.robot, part.q, part.v, part.event
-                whole = replace(
-                    whole, notes=(*whole.notes, f"{whole.t[-1]:g} s: {part.told}")
-                )
-            else:
-                robot = other
+                _require_start(name, part._robot, part.q[0], part.v[0], (robot, q, v))
+                robot = part._robot
                 q = part.q[-1]
                 v = part.v[-1]
                 event = ""
@@ -490,7 +475,34 @@ def require_motion(motion: object) -> Motion:
     return instance("motion", motion, Motion, "a Motion, as fflin.simulate returns it")
 
 
-def _seen(
+def _require_start(
+    name: str, robot: Robot, q: Array, v: Array, end: tuple[Robot, Array, Array]
+) -> None:
+    """Raise `InputError` if a phase does not begin where the phase before it ended.
+
+    `name` is the name of the phase, whose robot begins at q (nq,) and v (nv,). `end` contains the
+    robot, q and v at the end of the phase before it.
+    """
+    end_robot, end_q, end_v = end
+    starts = _in_coordinates_of(end_robot, robot, end_q, q[None], v[None])
+    start_q, start_v = (rows[0] for rows in starts)
+    model = end_robot.model
+    apart = np.maximum(
+        np.abs(pin.difference(model, end_q, start_q)), np.abs(start_v - end_v)
+    )
+    if apart.max() > _MET * max(1.0, np.abs(end_v).max()):
+        # The joint whose entries of v contain the entry that differs most: its first entry is the
+        # last first entry that is not after it.
+        worst = int(apart.argmax())
+        joint = int(np.searchsorted(model.idx_vs, worst, side="right")) - 1
+        raise InputError(
+            f"'{name}' does not begin where the motion before it ended: "
+            f"'{model.names[joint]}' differs by {apart.max():.2g} in position or rate; "
+            "start from q and v in the last row of that motion"
+        )
+
+
+def _in_coordinates_of(
     robot: Robot, other: Robot, last: Array, q: Array, v: Array
 ) -> tuple[Array, Array]:
     """Convert rows q (N, nq) and v (N, nv) of the robot `other` to the coordinates of `robot`.
@@ -498,17 +510,18 @@ def _seen(
     Joints that `other` lacks are at rest, at their positions in `last` (nq,), a configuration of
     `robot`.
     """
-    own_q, own_v = np.tile(last, (len(q), 1)), np.zeros((len(q), robot.nv))
+    new_q = np.tile(last, (len(q), 1))
+    new_v = np.zeros((len(q), robot.nv))
     for name in list(robot.model.names)[ROOT:]:
-        if other.model.existJointName(name):
-            joint, other_joint = joint_called(robot, name), joint_called(other, name)
-            own_q[:, joint.idx_q :][:, : joint.nq] = q[:, other_joint.idx_q :][
-                :, : joint.nq
-            ]
-            own_v[:, joint.idx_v :][:, : joint.nv] = v[:, other_joint.idx_v :][
-                :, : joint.nv
-            ]
-    return own_q, own_v
+        if not other.model.existJointName(name):
+            continue
+        to = joint_called(robot, name)
+        source = joint_called(other, name)
+        q_of_joint = q[:, source.idx_q : source.idx_q + source.nq]
+        v_of_joint = v[:, source.idx_v : source.idx_v + source.nv]
+        new_q[:, to.idx_q : to.idx_q + to.nq] = q_of_joint
+        new_v[:, to.idx_v : to.idx_v + to.nv] = v_of_joint
+    return new_q, new_v
 
 
 def _named_frame(motion: Motion) -> str:
@@ -541,13 +554,12 @@ def _longer(whole: Motion, motion: Motion, name: str) -> Motion:
     last = whole.q[-1]
     near = whole.x[-1]
     t = motion.t - motion.t[0] + whole.t[-1]
-    q, v = _seen(state.robot, other_state.robot, last, motion.q, motion.v)
+    convert = partial(_in_coordinates_of, state.robot, other_state.robot, last)
+    q, v = convert(motion.q, motion.v)
     target = np.zeros(0)
     if whole.target.size and motion.target.size:
-        points = other_state.points(np.atleast_2d(motion.target))[1:]
-        goals = state_history(
-            state, *_seen(state.robot, other_state.robot, last, *points), near
-        )
+        _, target_q, target_v = other_state.points(np.atleast_2d(motion.target))
+        goals = state_history(state, *convert(target_q, target_v), near)
         both = (whole.target, len(whole.t)), (goals, len(t))
         target = np.vstack([np.broadcast_to(x, (n, state.nx)) for x, n in both])
     u = np.zeros((len(t), len(whole.input_names)))  # missing inputs are zero

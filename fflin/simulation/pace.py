@@ -150,14 +150,15 @@ class Poles:
         """Return the name of the state with the largest participation in the mode of a pole."""
         if self.A is None:
             return ""
-        poles, right = np.linalg.eig(self.A)
-        k = int(np.abs(poles - pole).argmin())
-        poles, left = np.linalg.eig(self.A.T)
-        participation = np.abs(
-            left[:, int(np.abs(poles - pole).argmin())] * right[:, k]
-        )
-        index = int(participation[: len(self.state_names)].argmax())
-        return self.state_names[index]
+        # The two calls of `eig` may return the poles in different orders.
+        right_poles, right_vectors = np.linalg.eig(self.A)
+        left_poles, left_vectors = np.linalg.eig(self.A.T)
+        right = right_vectors[:, np.abs(right_poles - pole).argmin()]
+        left = left_vectors[:, np.abs(left_poles - pole).argmin()]
+        participation = np.abs(left * right)
+        # A loop may have further states without names, such as the states of its controller.
+        named = participation[: len(self.state_names)]
+        return self.state_names[int(named.argmax())]
 
 
 def rotation(rate: float) -> Poles:

@@ -582,29 +582,31 @@ def time_to_settle(robot: Robot, policy: Feedback, q: Array, v: Array | None) ->
     Three errors are considered: attitude, position and the largest joint error. Each of them has
     settled when it stays below 1 % of its own maximum. States that the policy does not feed back,
     and wheel angles, are ignored. The time is rounded up to a multiple of 10 s and is at least
-    SHORTEST. If the loop does not settle before LONGEST, return SHORTEST.
+    SHORTEST. If an error has not settled in 99 % of LONGEST, return SHORTEST.
     """
     lin = policy.lin
     closed = policy.closed_loop()
-    v = np.zeros(robot.nv) if v is None else v
-    _, start = policy.deviation(robot)(0.0, q, v)
     assert closed is not None
-    loop, dt = closed
+    A, dt = closed
     step = dt or _LOOK
     if not dt:
-        loop = held_exponential(loop, np.zeros((len(loop), 0)), step)[0]
-    history = np.zeros((math.ceil(LONGEST / step) + 1, len(loop)))
-    history[0, : len(start)] = start
-    for row, after in pairwise(history):
-        after[:] = loop @ row
-    away = np.zeros(len(history), dtype=bool)
+        no_inputs = np.zeros((len(A), 0))
+        A, _ = held_exponential(A, no_inputs, step)
+    v = np.zeros(robot.nv) if v is None else v
+    _, initial_error = policy.deviation(robot)(0.0, q, v)
+    history = np.zeros((math.ceil(LONGEST / step) + 1, len(A)))
+    # After the errors of the model, the loop may have controller states, which are zero at first.
+    history[0, : len(initial_error)] = initial_error
+    for state, next_state in pairwise(history):
+        next_state[:] = A @ state
+    unsettled = np.zeros(len(history), dtype=bool)
     wheels = {f"q_m.{name}" for name in lin.wheels}
     for group in ("q_b", "r_b", "q_m"):
         judged = {name for name in policy.fed_back if group_of(name) == group} - wheels
         indices = [i for i, name in enumerate(lin.state_names) if name in judged]
         error = np.abs(history[:, indices]).max(axis=1, initial=0.0)
-        away |= error > 0.01 * error.max()
-    last = float(np.flatnonzero(away).max(initial=0)) * step
-    if last < 0.99 * LONGEST:
-        return max(SHORTEST, 10.0 * math.ceil(last / 10.0))
-    return SHORTEST
+        unsettled |= error > 0.01 * error.max()
+    last_unsettled = float(np.flatnonzero(unsettled).max(initial=0)) * step
+    if last_unsettled >= 0.99 * LONGEST:
+        return SHORTEST
+    return max(SHORTEST, 10.0 * math.ceil(last_unsettled / 10.0))

@@ -258,11 +258,11 @@ def pointing(
     t, errors = motion.t[counted], errors[counted]
     columns = len(axes)
     means, starts = _means(t, errors, window)
-    later = _drifts(t, errors, window, apart)
+    drifts = _drifts(t, errors, window, apart)
     drift = None
-    if later is not None:
-        differences, of_starts = later
-        drift = _statistics(differences, _durations(of_starts), columns)
+    if drifts is not None:
+        differences, earlier_starts = drifts
+        drift = _statistics(differences, _durations(earlier_starts), columns)
     speeds, torques = _wheels(motion)
     return Pointing(
         axes=axes,
@@ -311,7 +311,10 @@ def _sight_errors(errors: Array, sight: Array) -> Array:
 
 
 def _settled(t: Array, inside: Mask, window: float) -> float | None:
-    """Return the time after which a condition holds to the end, and at least for a window."""
+    """Return the time from which a condition is true until the end of the motion.
+
+    Return None if the condition is not true for at least `window` [s] before the end.
+    """
     outside = np.flatnonzero(~inside)
     first = outside[-1] + 1 if len(outside) else 0
     if first == len(t) or t[-1] - t[first] < window * (1.0 - 1e-9):
@@ -359,15 +362,18 @@ def _means(t: Array, errors: Array, window: float) -> tuple[Array, Array]:
 def _drifts(
     t: Array, errors: Array, window: float, apart: float
 ) -> tuple[Array, Array] | None:
-    """Return the differences (m, k) of the means of two windows, and when the first begin.
+    """Return how much the mean over a window differs from the mean over an earlier window.
 
-    Return None if the motion is too short.
+    The later window begins `apart` [s] after the earlier one. The first result contains the
+    differences (m, k) for m pairs of windows. The second result contains the times (m,) at which
+    the earlier windows begin. Return None if the motion is too short for a pair.
     """
     if t[-1] - t[0] < (window + apart) * (1.0 - 1e-9):
         return None
     starts = _starts(t, window + apart)
-    later = _window_means(t, errors, starts + apart, window)
-    return later - _window_means(t, errors, starts, window), starts
+    earlier_means = _window_means(t, errors, starts, window)
+    later_means = _window_means(t, errors, starts + apart, window)
+    return later_means - earlier_means, starts
 
 
 def _relative(
@@ -393,7 +399,7 @@ def _relative(
 
 
 def _durations(t: Array) -> Array:
-    """Return the time (N,) for which each of the times (N,) stands."""
+    """Return the weights (N,) [s] of rows at the times t (N,), by the trapezoidal rule."""
     if len(t) < 2 or t[-1] <= t[0]:
         return np.ones(len(t))
     steps = np.diff(t)
@@ -406,7 +412,8 @@ def _durations(t: Array) -> Array:
 def _statistics(errors: Array, durations: Array, columns: int) -> PointingError:
     """Return the statistics of errors (m, k), each of which lasts for a duration (m,).
 
-    With one column, they are those of the whole angle alone; otherwise it is the last column.
+    The statistics have one column for each axis, and a last column for the norm of the error. If
+    `columns` is 1, they have only the last column.
     """
     sizes = np.column_stack((np.abs(errors), np.linalg.norm(errors, axis=1)))
     sizes = sizes[:, -columns:]

@@ -131,7 +131,7 @@ class ModelDerivatives:
             if not one.bodies:
                 for part, of_force in zip(rates, self._over_force(one), strict=True):
                     part[row] = of_force
-        seen = self._seen(parameters, rates)
+        of_outputs = self._output_derivatives(parameters, rates)
         nu, u = (np.broadcast_to(x, (count, len(x))) for x in (self._nu, self._u))
         f0 = assemble(
             ready.actuation, self._chart, nu, u, rates, A, moving=ready.moving
@@ -142,61 +142,76 @@ class ModelDerivatives:
             given = np.concatenate((B, f0[..., None]), axis=2)
             A[:], held = held_derivatives(self._source.A, driven, self.lin.dt, A, given)
             B[:], f0[:] = held[..., :-1], held[..., -1]
-        C, D, y0 = np.split(seen, (state.nx, -1), axis=2)
+        C, D, y0 = np.split(of_outputs, (state.nx, -1), axis=2)
         return A, B, C, D, f0, y0[..., 0]
 
-    def _seen(
+    def _output_derivatives(
         self, parameters: Sequence[Parameter], rates: AccelerationDerivatives
     ) -> Array:
-        """Return the matrix [dC, dD, dy0] of each parameter (P, ny, ..).
+        """Return the matrix [dC, dD, dy0] of each parameter (P, ny, ..), by (12.2a).
 
+        Row i of `rates` contains the derivatives of the accelerations with respect to parameter i.
         Only outputs that depend on masses or accelerations have nonzero rows.
         """
-        # `weighed` returns [C, D, y0] for these outputs, multiplied by the robot's mass. The result
-        # is a quadratic function of the parameter, because `weighed` changes the accelerations
-        # linearly. So three values at any step size give the exact derivative, see (12.2a).
-        lin, now = self.lin, self._rates
-        derivatives = np.zeros(
-            (len(parameters), len(lin.C), lin.C.shape[1] + lin.D.shape[1] + 1)
-        )
-        outputs = (
-            o for o in self.robot.outputs if o.FEELS_ACCELERATION or type(o) in WEIGH
-        )
-        rows = [lin.output_names.index(name) for o in outputs for name, _ in o.signals]
+        lin = self.lin
+        width = lin.C.shape[1] + lin.D.shape[1] + 1
+        derivatives = np.zeros((len(parameters), len(lin.C), width))
+        rows = [
+            lin.output_names.index(name)
+            for output in self.robot.outputs
+            if output.FEELS_ACCELERATION or type(output) in WEIGH
+            for name, _ in output.signals
+        ]
         if not rows:
             return derivatives
-        other = replace(self.robot, model=self.robot.model.copy())
-        ready = self._prepare(other)
+        model = self.robot.model.copy()
+        changed_robot = replace(self.robot, model=model)
+        ready = self._prepare(changed_robot)
         sensing, actuation = ready.sensing, ready.actuation
         assert sensing is not None
-        data = other.create_data()
+        data = changed_robot.create_data()
         point = (lin.q, lin.v, self._nu, self._u)
 
-        def weighed(one: Parameter, slopes: Sequence[Array], size: float) -> Array:
-            change_bodies(other.model, self.robot.model, one, size)
-            changed = [a + size * b for a, b in zip(now, slopes, strict=True)]
-            moved = AccelerationDerivatives(*changed)
-            made = output_equations(
-                sensing, actuation, data, self._chart, moved, lin.x0, point
-            )
-            seen: Array = np.column_stack((made["C"], made["D"], made["y0"]))[rows]
-            total: float = pin.computeTotalMass(other.model)
-            for joint in one.bodies:
-                other.model.inertias[joint] = self.robot.model.inertias[joint]
-            return total * seen
+        def g(
+            parameter: Parameter, by_parameter: Sequence[Array], change: float
+        ) -> Array:
+            """Return g of (12.2a), the mass times [C, D, y0], after a change of a parameter.
 
-        total = pin.computeTotalMass(self.robot.model)
-        for row, one in enumerate(parameters):
-            step = 1.0
-            if one.bodies:
-                step = 1.0 / (self.fraction(one.bodies) or 1.0)
-            mass = sum(change[0] for change in one.bodies.values())
-            values = [
-                weighed(one, [part[row] for part in rates], k * step)
-                for k in (0.0, 1.0, 2.0)
+            `by_parameter` contains the derivatives of the accelerations. The accelerations are
+            extrapolated linearly. So g is a quadratic function of the change, and (12.2a) is exact
+            for any step.
+            """
+            change_bodies(model, self.robot.model, parameter, change)
+            extrapolated = [
+                value + change * derivative
+                for value, derivative in zip(self._rates, by_parameter, strict=True)
             ]
-            derivative = (4.0 * values[1] - values[2] - 3.0 * values[0]) / (2.0 * step)
-            derivatives[row, rows] = (derivative - mass * values[0] / total) / total
+            accelerations = AccelerationDerivatives(*extrapolated)
+            equations = output_equations(
+                sensing, actuation, data, self._chart, accelerations, lin.x0, point
+            )
+            matrix: Array = np.column_stack(
+                (equations["C"], equations["D"], equations["y0"])
+            )
+            mass: float = pin.computeTotalMass(model)
+            # Restore the bodies, because the next parameter may belong to other bodies.
+            for joint in parameter.bodies:
+                model.inertias[joint] = self.robot.model.inertias[joint]
+            return mass * matrix[rows]
+
+        m = pin.computeTotalMass(self.robot.model)
+        for index, parameter in enumerate(parameters):
+            by_parameter = [part[index] for part in rates]
+            h = 1.0
+            if parameter.bodies:
+                h = 1.0 / (self.fraction(parameter.bodies) or 1.0)
+            g_0 = g(parameter, by_parameter, 0.0)
+            g_h = g(parameter, by_parameter, h)
+            g_2h = g(parameter, by_parameter, 2.0 * h)
+            g_p = (4.0 * g_h - g_2h - 3.0 * g_0) / (2.0 * h)
+            m_p = sum(change[0] for change in parameter.bodies.values())
+            # (12.2a) is the quotient rule for y = g / m.
+            derivatives[index, rows] = (g_p - m_p * g_0 / m) / m
         return derivatives
 
     def difference(self, one: Parameter) -> float:
@@ -209,9 +224,10 @@ class ModelDerivatives:
         lin = self.lin
         step = _STEP / self.fraction(one.bodies)
 
-        def at(times: float) -> tuple[Array, Array]:
+        def matrices(steps: float) -> tuple[Array, Array]:
+            """Return A and B for the parameter changed by a number of steps."""
             model = self.robot.model.copy()
-            change_bodies(model, self.robot.model, one, times * step)
+            change_bodies(model, self.robot.model, one, steps * step)
             changed = replace(self.robot, model=model)
             state = StateMap(changed, reference=lin.reference, frame=lin.frame)
             route = aba_route(Aba(state), lin.q, lin.v, lin.u0, moving=lin.moving)
@@ -219,12 +235,20 @@ class ModelDerivatives:
                 return held_exponential(*route[:2], lin.dt)
             return route[:2]
 
-        (dA, dB, *_), worst = self.over([one]), 0.0
-        values = zip(*map(at, (-2.0, -1.0, 1.0, 2.0, 0.0)), (dA[0], dB[0]), strict=True)
-        for far, near, nearer, farther, now, exact in values:
-            by_steps = (far - 8.0 * near + 8.0 * nearer - farther) / (12.0 * step)
-            size = max(np.abs(by_steps).max(), _LEAST * np.abs(now).max() / step)
-            worst = max(worst, float(np.abs(by_steps - exact).max() / size))
+        dA, dB, *_ = self.over([one])
+        two_before = matrices(-2.0)
+        one_before = matrices(-1.0)
+        nominal = matrices(0.0)
+        one_after = matrices(1.0)
+        two_after = matrices(2.0)
+        worst = 0.0
+        for i, exact in enumerate((dA[0], dB[0])):
+            difference = (
+                two_before[i] - 8.0 * one_before[i] + 8.0 * one_after[i] - two_after[i]
+            ) / (12.0 * step)
+            least = _LEAST * np.abs(nominal[i]).max() / step
+            size = max(np.abs(difference).max(), least)
+            worst = max(worst, float(np.abs(difference - exact).max() / size))
         return worst
 
     @cached_property
@@ -396,5 +420,6 @@ def change_bodies(
         model.inertias[joint] = pin.Inertia.FromDynamicParameters(changed)
         # a wheel without mass, for which Pinocchio would divide 0 by 0
         if not changed[0]:
-            about = changed[4:][[[0, 1, 3], [1, 2, 4], [3, 4, 5]]]
-            model.inertias[joint] = pin.Inertia(0.0, np.zeros(3), about)
+            # The last six parameters are Ixx, Ixy, Iyy, Ixz, Iyz, Izz.
+            inertia = changed[4:][[[0, 1, 3], [1, 2, 4], [3, 4, 5]]]
+            model.inertias[joint] = pin.Inertia(0.0, np.zeros(3), inertia)

@@ -402,28 +402,33 @@ class _Form:
         M, the spring and damper forces, and the input forces contain no product of this parameter
         and another one. So the effect of this parameter can be added independently of the others.
         """
-        one = self.ranges[at].parameter
-        if one.joint >= 0:
-            rate = self.x[[self.state.groups.qdot_m.start + one.joint]]
-            signal = one.by_stiffness * self.x[[6 + one.joint]] + one.by_damping * rate
-            self.force[6 + one.joint] += self.times(at, signal)[0]
-        elif one.wrench:
-            joint, column, wrench = one.wrench
-            given = self.jacobians[joint].T @ wrench
-            self.force -= np.outer(given, self.times(at, self.u[[column]])[0])
+        # In `force`, inertial, spring and damper forces are positive, and input forces negative.
+        parameter = self.ranges[at].parameter
+        if parameter.joint >= 0:
+            index = 6 + parameter.joint
+            position = self.x[[index]]
+            rate = self.x[[self.state.groups.qdot_m.start + parameter.joint]]
+            signal = parameter.by_stiffness * position + parameter.by_damping * rate
+            self.force[index] += self.times(at, signal)[0]
+        elif parameter.wrench:
+            joint, column, wrench = parameter.wrench
+            force_per_input = self.jacobians[joint].T @ wrench
+            signal = self.times(at, self.u[[column]])[0]
+            self.force -= np.outer(force_per_input, signal)
         else:
-            change = sum(
+            M_p = sum(
                 self.jacobians[joint].T
-                @ np.tensordot(parameters, UNITS, 1)
+                @ np.tensordot(changes, UNITS, 1)
                 @ self.jacobians[joint]
-                for joint, parameters in one.bodies.items()
+                for joint, changes in parameter.bodies.items()
             )
-            values, vectors = np.linalg.eigh(change)
             # The inertia of a wheel is added to the wheel, and subtracted from the body that
-            # carries the wheel. So the change of M has rank 2.
-            most = np.argsort(-np.abs(values))[:2]
-            L = vectors[:, most]
-            self.force += L @ self.times(at, (values[most, None] * L.T) @ self.a)
+            # carries the wheel. So M_p has rank 2, and two of its eigenvectors represent it.
+            values, vectors = np.linalg.eigh(M_p)
+            largest = np.argsort(-np.abs(values))[:2]
+            L = vectors[:, largest]
+            signals = (values[largest, None] * L.T) @ self.a
+            self.force += L @ self.times(at, signals)
 
     def add_mode(self, index: int, parts: Mapping[str, int]) -> None:
         """Replace the spring and damper force of a mode by omega I (omega x + 2 zeta dx/dt).

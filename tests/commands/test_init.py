@@ -101,7 +101,9 @@ def test_all_that_init_suggests_can_be_taken(tmp_path):
     # The wheel takes the place of its joint, which no other line may then speak of.
     assert says(text, 'To use this wheel, lock joint "spin" above.')
     (tmp_path / "free.toml").write_text(taken.replace('lock = ["spin"]', ""))
-    with pytest.raises(fflin.InputError, match="lock 'spin' if it is the wheel's"):
+    with pytest.raises(
+        fflin.InputError, match="if joint 'spin' turns the wheel itself, lock it"
+    ):
         fflin.load(tmp_path / "free.toml")
     taken = re.sub(r'(?m)^"\w+\.spin".*\n', "", taken)
     (tmp_path / "all.toml").write_text(taken)

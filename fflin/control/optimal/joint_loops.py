@@ -234,17 +234,19 @@ class Loops:
         least = np.inf
         circles = 1
         while circles <= most_circles and least > near:
-            every = MOST_CIRCLES // circles
-            coarse = replace(self, t=self.t[::every], path=self.path[::every])
+            # Optimise on a coarser grid with STEPS steps per circle, which is faster. The results
+            # are judged on the whole grid.
+            stride = MOST_CIRCLES // circles
+            coarse = replace(self, t=self.t[::stride], path=self.path[::stride])
             least_effort = np.inf
             for coefficients in coarse.improved(circles, postures):
                 basis = self.basis(circles)
                 joints = self.joints(basis, coefficients)
-                error = float(
-                    np.linalg.norm(self.error(joints)) + self.beyond(joints).max()
-                )
+                attitude_error = np.linalg.norm(self.error(joints))
+                error = float(attitude_error + self.beyond(joints).max())
                 effort = float(np.square(self.torques(basis, coefficients)).sum())
-                # Prefer a small error; if several errors are small, prefer a small effort.
+                # Prefer a small error. Errors below `near` count as equal; then prefer a small
+                # effort.
                 if (max(error, near), effort) < (max(least, near), least_effort):
                     best, least, least_effort = joints, error, effort
             circles *= 2

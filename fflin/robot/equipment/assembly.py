@@ -181,30 +181,33 @@ def mounted_wheels(
         if not wheel.inertia:
             continue
         joint, axis = carrier(model, wheel)
-        spinning = pin.Inertia(0.0, np.zeros(3), wheel.inertia * np.outer(axis, axis))
-        rest = bodies[joint] - spinning
-        moments = np.linalg.eigvalsh(rest.inertia).tolist()
-        about = float(axis @ bodies[joint].inertia @ axis)
+        rotor_in_carrier = pin.Inertia(
+            0.0, np.zeros(3), wheel.inertia * np.outer(axis, axis)
+        )
+        carrier_alone = bodies[joint] - rotor_in_carrier
+        moments = np.linalg.eigvalsh(carrier_alone.inertia).tolist()
+        about_axis = float(axis @ bodies[joint].inertia @ axis)
         # Also refuse a wheel whose inertia is, up to rounding errors, the whole inertia of the link
         # about the wheel's axis. Such a link is the wheel itself.
-        if is_impossible(rest.mass, moments) or wheel.inertia > (1.0 - 1e-9) * about:
+        is_whole_link = wheel.inertia > (1.0 - 1e-9) * about_axis
+        if is_impossible(carrier_alone.mass, moments) or is_whole_link:
             lock = ""
             if joint != ROOT:
-                lock = f", or lock '{model.names[joint]}' if it is the wheel's"
+                joint_name = model.names[joint]
+                lock = f"; if joint '{joint_name}' turns the wheel itself, lock it"
             raise InputError(
                 f"wheel '{name}' of {wheel.inertia:g} kg m^2 must have less inertia than the "
-                f"link that carries it, but {_carrier_name(model, joint)} has {about:.3g} kg m^2 "
-                "about the axis of the wheel; the inertia in the URDF must include the wheels, so "
-                f"correct the URDF or the wheel{lock}"
+                f"link that carries it, but {_carrier_name(model, joint)} has "
+                f"{about_axis:.3g} kg m^2 about the axis of the wheel; the inertia in the URDF "
+                f"must include the wheels, so correct the URDF or the wheel{lock}"
             )
-        bodies[joint] = rest
+        bodies[joint] = carrier_alone
+        # The rotor turns about z of its own frame: RUBZ is an unbounded revolute joint about z.
         placement = pin.SE3(turned_to(axis), np.zeros(3))
-        rotor_inertia = pin.Inertia(
-            0.0, np.zeros(3), np.diag([0.0, 0.0, wheel.inertia])
-        )
-        turning = Joint(name, unbounded=True)
+        rotor = pin.Inertia(0.0, np.zeros(3), np.diag([0.0, 0.0, wheel.inertia]))
+        rotor_joint = Joint(name, unbounded=True)
         parts.append(
-            Mounted(turning, joint, placement, pin.JointModelRUBZ(), rotor_inertia)
+            Mounted(rotor_joint, joint, placement, pin.JointModelRUBZ(), rotor)
         )
     return parts
 

@@ -304,15 +304,23 @@ def read_tree(root: Element) -> tuple[dict[str, Link], dict[str, JointElement]]:
     if root.tag != "robot":
         raise root.error(f"the root element is <{root.tag[:60]}>; expected <robot>")
     root.refuse_near_miss("link", "joint")
-    # Find robots, links and joints that are in the wrong place. Recognise them by their children,
-    # because extensions of URDF may use the same tags for elements with other children.
-    marks = {"robot": {"link"}, "link": {"inertial"}, "joint": {"parent", "child"}}
+    # Refuse robots, links and joints in the wrong place. Recognise them by their children, because
+    # extensions of URDF may use the same tags for elements with other children.
+    typical_children = {
+        "robot": {"link"},
+        "link": {"inertial"},
+        "joint": {"parent", "child"},
+    }
     for child in root.children:
-        for inner in (child, *child.iterate()):
-            nested = inner.tag == "robot" or inner is not child
-            if nested and marks.get(inner.tag, {""}) <= {
-                part.tag for part in inner.children
-            }:
+        candidates = list(child.iterate())
+        # A <link> or <joint> directly in the root is in the right place, but a <robot> is not.
+        if child.tag == "robot":
+            candidates.insert(0, child)
+        for inner in candidates:
+            if inner.tag not in typical_children:
+                continue
+            inner_tags = {part.tag for part in inner.children}
+            if typical_children[inner.tag].issubset(inner_tags):
                 raise inner.error(
                     f"a <{inner.tag}> is inside a <{child.tag}>, where URDF ignores it; put "
                     f"{quoted(inner.attributes.get('name', ''))} directly into <robot>"
