@@ -98,14 +98,14 @@ class Models(NamedTuple):
     # interval, part and state of the other rows
     within: tuple[Indices, Indices, Indices]
 
-    def room(self, trial: Trial) -> Array:
-        """Return the lower and upper limits (2, m) of the rows about a trial."""
-        knot, limit = self.at_knots
-        k, part, state = self.within
-        room: Array = np.hstack(
-            (trial.knots[:, knot, limit], trial.inside[:, k, part, state])
-        )
-        return room
+    def distances(self, trial: Trial) -> Array:
+        """Return how far the limited states may move down and up (2, m), in the order of `rows`."""
+        knot, state = self.at_knots
+        at_knots = trial.knots[:, knot, state]
+        interval, part, state = self.within
+        inside = trial.inside[:, interval, part, state]
+        distances: Array = np.hstack((at_knots, inside))
+        return distances
 
 
 class Step(NamedTuple):
@@ -313,7 +313,7 @@ class Search(NamedTuple):
                 break
             gap = end.gap
             missed = missed + end.missed
-            room = models.room(end) + step.moved
+            room = models.distances(end) + step.moved
             again = self._step(trial, models, near, effort, missed, room)
             if again is None:
                 break
@@ -395,7 +395,7 @@ class Search(NamedTuple):
         ends = models.ends
         rows = models.rows
         missed = trial.missed if missed is None else missed
-        room = models.room(trial) if room is None else room
+        room = models.distances(trial) if room is None else room
         prices, of_x = np.full(room.shape[1], self.price), np.zeros((len(u), nx))
         cost, g = np.hstack((of_x + near, self.cost)), np.hstack((of_x, effort))
         scale = np.concatenate((np.ones(nx), self.cost.sum(axis=0) ** -0.5))

@@ -1,6 +1,6 @@
 """Multiple shooting: initial guess, motions of the intervals, gaps between them, Jacobians."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from functools import partial
 
 import numpy as np
@@ -164,38 +164,47 @@ class Shooting:
         at the next knot. The second array (N, parts - 1, nx, nx + 2 nu) contains the Jacobians of
         the points that divide each interval into equal parts.
         """
-        # Integrate dZ/dt = A Z + `driven` along the motions by Runge-Kutta steps. Z contains the
-        # Jacobians of all intervals, and `driven` contains B for the inputs at both knots. The
-        # stages of these steps are at the beginning, the middle and the end of the step, where the
-        # linear models are computed.
+        # Integrate dZ/dt = A Z + G along the motions by Runge-Kutta steps. Z contains the Jacobians
+        # of all intervals, and G = [0, (1 - s) B, s B], because the input is (1 - s) times the
+        # input at the first knot plus s times the input at the next knot. A and B are computed at
+        # the stages of these steps: the beginning, the middle and the end of each step.
         N = len(self.h)
         nx = len(self._size)
         nu = u.shape[1]
         steps = min(self.steps // 4, _MOST_OF_JACOBIANS)
-        motions = self.motions(q, v, u, 4 * steps)
-        late = np.arange(2 * steps + 1) / (2.0 * steps)
+        stages = 2 * steps + 1  # of an interval; neighbouring steps share a stage
+        s = np.arange(stages) / (2.0 * steps)
         if self.held:
-            late = np.zeros_like(late)
-        q, v = (motion[:, ::2] for motion in motions)
-        inputs = u[:-1, None] + late[:, None] * np.diff(u, axis=0)[:, None]
+            s = np.zeros(stages)  # the input of the first knot is held
+        q, v = self.motions(q, v, u, 4 * steps)
+        q = q[:, ::2]
+        v = v[:, ::2]
+        inputs = u[:-1, None] + s[:, None] * np.diff(u, axis=0)[:, None]
         points = (rows.reshape(-1, rows.shape[-1]) for rows in (q, v, inputs))
         models = self._linearizer.along(*points)
-        A, B = (models[name].reshape(N, len(late), nx, -1) for name in "AB")
-        late = late[:, None, None]
+        A = models["A"].reshape(N, stages, nx, nx)
+        B = models["B"].reshape(N, stages, nx, nu)
         A = self._size[:, None] * A / self._size
-        driven = np.concatenate((np.zeros_like(A), (1.0 - late) * B, late * B), axis=3)
+        s = s[:, None, None]
+        G = np.concatenate((np.zeros_like(A), (1.0 - s) * B, s * B), axis=3)
+
         h = self.h[0] / steps
         Z: Array = np.tile(np.eye(nx, nx + 2 * nu), (N, 1, 1))
-        fractions = np.arange(1, parts) / parts * steps
+        # Points within the interval, in steps from its beginning. The Jacobians at these points are
+        # interpolated by a cubic polynomial over each step.
+        inner_points = np.arange(1, parts) / parts * steps
         inside = list[Array]()
         for step in range(steps):
-            F = [(A[:, k], driven[:, k]) for k in range(2 * step, 2 * step + 3)]
+            first = 2 * step
+            last = first + 2
+            rate = partial(_rate, A[:, first : last + 1], G[:, first : last + 1])
             before = Z
-            Z = CommutatorFree4.vector_step(partial(_rate, F), h, Z)
-            begin, end = (h * (f[0] @ z + f[1]) for f, z in ((F[0], before), (F[2], Z)))
-            coefficients = cubic(before, Z, begin, end)
-            within = (fractions >= step) & (fractions < step + 1)
-            powers = (fractions[within] - step)[:, None] ** np.arange(4)
+            Z = CommutatorFree4.vector_step(rate, h, Z)
+            begin_rate = h * (A[:, first] @ before + G[:, first])
+            end_rate = h * (A[:, last] @ Z + G[:, last])
+            coefficients = cubic(before, Z, begin_rate, end_rate)
+            in_step = (inner_points >= step) & (inner_points < step + 1)
+            powers = (inner_points[in_step] - step)[:, None] ** np.arange(4)
             inside.append(np.einsum("ij,kjlm->kilm", powers, coefficients))
         return Z, np.concatenate(inside, axis=1)
 
@@ -248,10 +257,11 @@ class Shooting:
         return inputs
 
 
-def _rate(F: Sequence[tuple[Array, Array]], node: float, Z: Array) -> Array:
-    """Return A Z + `driven` at the fraction `node` of a step.
+def _rate(A: Array, G: Array, node: float, Z: Array) -> Array:
+    """Return A Z + G at the fraction `node` of a step: 0, 1/2 or 1.
 
-    F contains A and `driven` at the beginning, the middle and the end of the step.
+    The second axis of A and G is the beginning, the middle and the end of the step.
     """
-    A, driven = F[round(2.0 * node)]
-    return A @ Z + driven
+    stage = round(2.0 * node)
+    rate: Array = A[:, stage] @ Z + G[:, stage]
+    return rate
