@@ -436,12 +436,12 @@ def _clearly_pushed(lin: LinearModel, positions: list[int]) -> bool:
     """
     B_rates = lin.B[len(lin.M) :]
     forces = lin.M @ B_rates  # generalised force (nv, nu) of a unit of each input
-    # A force is small if it is small compared with the forces of the same input on all coordinates,
-    # in units of equal size.
+    # A force may be a rounding error if it is small compared with the forces of the same input on
+    # all coordinates, in units of equal size.
     size = np.sqrt(lin.M.diagonal())
     of_input = np.linalg.norm(forces / size[:, None], axis=0)
     scale_of_input = np.outer(size[positions], of_input)
-    # It is also small if the terms of its sum cancel.
+    # It may also be a rounding error if it is a sum of terms that almost cancel.
     scale_of_terms = np.abs(lin.M[positions]) @ np.abs(B_rates)
     scale = np.maximum(scale_of_input, scale_of_terms)
     is_clear = np.abs(forces[positions]) > _CLEAR * scale

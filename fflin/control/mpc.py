@@ -319,7 +319,8 @@ def _unplanned(
 def _about(lin: LinearModel, ahead: Horizon, cost: Cost) -> Mpc:
     """Design the controller about a point; `ahead` is its horizon, which has no stages yet."""
     lin = at_fixed_point(lin)
-    (Q, R, Qf, weights), sampled = cost, lin.discretize(ahead.dt)
+    sampled = lin.discretize(ahead.dt)
+    Q, R, Qf, weights = cost
     given = (Q, R) if Q is None or R is None else sampled_cost(lin, ahead.dt, Q, R)
     gain = regulator(sampled, *given, weights=weights)
     StateFeedback(sampled, gain.K)  # refuses a moving reference

@@ -442,7 +442,7 @@ def _nearest_to_limits(
     low, high = limits
     values = np.hstack((shooting.limited_values(made.q, made.v), made.u))
     limit = np.abs(np.where(values > 0.0, high, low))
-    # A limit of zero, which the plan keeps exactly, does not count as near.
+    # Fractions of the limits; 0 if the limit is zero.
     fractions = np.abs(values) / np.where(limit > 0.0, limit, np.inf)
 
     nearest: dict[tuple[str, bool], tuple[float, str]] = {}

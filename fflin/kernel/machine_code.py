@@ -369,9 +369,8 @@ def _field(
     if isinstance(field_kind, _StructType):
         return pointer(0)
     if field_kind == float64:
-        return builder.bitcast(
-            word(0), _DOUBLE
-        )  # the word contains the bits of a double
+        # The word contains the bits of the double.
+        return builder.bitcast(word(0), _DOUBLE)
     if field_kind == boolean:
         return builder.trunc(word(0), ir.IntType(1))
     if not isinstance(field_kind, Array):

@@ -466,10 +466,10 @@ def _references(kind: str, content: bytes) -> list[str]:
 
 def _require_no_cycle(content: bytes) -> None:
     """Raise ValueError if a node of a COLLADA file contains itself, directly or through others."""
-    children: dict[str, list[str]] = {}  # {node: nodes in it}; "" is the document
-    open_nodes: list[
-        str
-    ] = []  # the nodes around the parser's position, outermost first
+    # {node: nodes in it}; the document is the node "".
+    children: dict[str, list[str]] = {}
+    # Nodes around the parser's position, outermost first.
+    open_nodes: list[str] = []
 
     def begin(tag: str, attributes: dict[str, str]) -> None:
         name = tag.rpartition(":")[2]  # without the XML namespace

@@ -363,18 +363,21 @@ class Search(NamedTuple):
             return None
         # Soft limits apply to states at knots and to states within intervals. The latter depend on
         # x[k], u[k] and u[k + 1].
-        (knots, nu), nx = trial.u.shape, self.shooting.state.nx
-        nw = nx + nu
-        knot, limit = np.nonzero(np.isfinite(trial.knots).any(axis=0))
-        at_knots = sp.eye_array(knots * nw, format="csr")[knot * nw + limit]
-        k, part, state = np.nonzero(limited)
+        knots, nu = trial.u.shape
+        nx = self.shooting.state.nx
+        nw = nx + nu  # variables (x, u) of a knot
+        knot, state = np.nonzero(np.isfinite(trial.knots).any(axis=0))
+        at_knots = sp.eye_array(knots * nw, format="csr")[knot * nw + state]
+        k, part, inner_state = np.nonzero(limited)
+        # A row of the compressed sparse matrix has nx + 2 nu entries.
+        entries = inside[k, part, inner_state]
         columns = k[:, None] * nw + np.r_[:nw, nw + nx : 2 * nw]
-        starts = np.arange(len(k) + 1) * columns.shape[1]
-        entries = inside[k, part, state].ravel(), columns.ravel(), starts
-        rows = sp.vstack(
-            (at_knots, sp.csr_array(entries, (len(k), knots * nw))), format="csr"
+        starts = np.arange(len(k) + 1) * (nx + 2 * nu)
+        within = sp.csr_array(
+            (entries.ravel(), columns.ravel(), starts), (len(k), knots * nw)
         )
-        return Models(ends, rows, (knot, limit), (k, part, state))
+        rows = sp.vstack((at_knots, within), format="csr")
+        return Models(ends, rows, (knot, state), (k, part, inner_state))
 
     def _step(
         self,

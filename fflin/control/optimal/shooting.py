@@ -75,10 +75,11 @@ class Shooting:
 
     def moved(self, q: Array, v: Array, z: Array) -> Point:
         """Return the knots q, v after steps z (N + 1, nx), one for each knot."""
-        model, (difference, rates) = self.state.robot.model, np.split(z, 2, axis=1)
-        return integrate_rows(
-            model, q, self.state.spread(difference)
-        ), v + self.state.spread(rates)
+        difference, rates = np.split(z, 2, axis=1)
+        moved_q = integrate_rows(
+            self.state.robot.model, q, self.state.spread(difference)
+        )
+        return moved_q, v + self.state.spread(rates)
 
     def motions(self, q: Array, v: Array, u: Array, steps: int = 0) -> Motions:
         """Integrate each interval from its first knot; q, v and the inputs u have N + 1 rows each.
@@ -216,8 +217,10 @@ class Shooting:
         rates = np.array((T * start[1], T * end[1]))
         turned = rotation_matrices(np.array((start[0][3:7], end[0][3:7])))
         rates[:, PIN_LINEAR] = (turned @ rates[:, PIN_LINEAR, None])[..., 0]
-        difference, mean = pin.difference(model, start[0], end[0]), rates.mean(axis=0)
+        mean = rates.mean(axis=0)
+        difference = pin.difference(model, start[0], end[0])
         difference[PIN_LINEAR] = end[0][:3] - start[0][:3]
+        # Add full turns, so that the rotation fits the mean angular velocity.
         turn = pin.log3(turned[0].T @ turned[1])
         axis = turn if turn.any() else mean[PIN_ANGULAR]
         axis = axis / (np.linalg.norm(axis) or 1.0)
@@ -229,10 +232,12 @@ class Shooting:
         rates[1, PIN_ANGULAR] = np.linalg.lstsq(
             jacobian, rates[1, PIN_ANGULAR], rcond=1e-6
         )[0]
-        late = 3 * difference - 2 * rates[0] - rates[1]
-        bend = rates.sum(axis=0) - 2 * difference
-        displacements = s * (rates[0] + s * (late + s * bend))
-        v = (rates[0] + s * (2 * late + 3 * s * bend)) / T
+        # The displacement from the start is the cubic polynomial c1 s + c2 s^2 + c3 s^3.
+        c1 = rates[0]
+        c2 = 3 * difference - 2 * rates[0] - rates[1]
+        c3 = rates.sum(axis=0) - 2 * difference
+        displacements = s * (c1 + s * (c2 + s * c3))
+        v = (c1 + s * (2 * c2 + 3 * s * c3)) / T
         q = np.array([pin.integrate(model, start[0], step) for step in displacements])
         q[:, :3] = start[0][:3] + displacements[:, PIN_LINEAR]
         for turn, rate in zip(
