@@ -216,7 +216,7 @@ def unobservable(
     # Such a motion is unobservable if C_s v = 0 and C_s s + C_v v = 0. With C_s = S^T and C_v = 0,
     # this function also finds the motions that the input matrix S does not control, because M, D
     # and K are symmetric.
-    if not system.symmetric:
+    if not system.is_symmetric_and_semidefinite:
         return None
     starts, margin = system.poles
     # Sampling may map two poles to one, or a vibration to the pole z = 1.

@@ -110,17 +110,20 @@ class SecondOrder:
         return bool(self.K.values.any() or self.D.values.any())
 
     @cached_property
-    def symmetric(self) -> bool:
+    def is_symmetric_and_semidefinite(self) -> bool:
         """Whether K and D are symmetric, and D is positive or negative semidefinite."""
         units = np.outer(self.size, self.size)
-        for matrix in (self.K.values / units, self.D.values / units):
-            if (
-                np.abs(matrix - matrix.T).max(initial=0.0)
-                > _SYMMETRIC * np.abs(matrix).max()
-            ):
+        K = self.K.values / units
+        D = self.D.values / units
+        for matrix in (K, D):
+            asymmetry = np.abs(matrix - matrix.T).max(initial=0.0)
+            if asymmetry > _SYMMETRIC * np.abs(matrix).max():
                 return False
-        drag = np.linalg.eigvalsh(self.D.values / units)
-        return bool(min(-drag.min(), drag.max()) <= _SYMMETRIC * np.abs(drag).max())
+        eigenvalues = np.linalg.eigvalsh(D)
+        rounding = _SYMMETRIC * np.abs(eigenvalues).max()
+        is_positive = eigenvalues.min() >= -rounding
+        is_negative = eigenvalues.max() <= rounding
+        return bool(is_positive or is_negative)
 
     @cached_property
     def poles(self) -> tuple[Values, ranks.Margin]:

@@ -209,18 +209,25 @@ def _in_motion(lin: LinearModel) -> Observability:
 
 
 def _along(traj: LinearTrajectory) -> Observability:
-    """Determine which errors at the start of a trajectory its outputs determine."""
+    """Determine which errors at the start of a trajectory can be computed from its outputs."""
     first, _ = along_motion.ends(traj)
-    known = moving_points.unobserved(first, np.abs(traj.C).max(axis=0))
-    split = along_motion.seen(traj, known)
-    motions = np.hstack((known, split.to_x @ split.rest))
-    nx = len(motions)
-    dimension = nx - motions.shape[1]
+    # Motions that are unobservable by symmetry, such as a displacement of the whole robot. The
+    # largest entries of C along the trajectory show on which states the outputs depend.
+    largest_C = np.abs(traj.C).max(axis=0)
+    by_symmetry = moving_points.unobserved(first, largest_C)
+    # Motions outside the image of the observability Gramian.
+    split = along_motion.seen(traj, by_symmetry)
+    by_gramian = split.to_x @ split.rest
+    motions = np.hstack((by_symmetry, by_gramian))
+    nx, unobservable_count = motions.shape
+    dimension = nx - unobservable_count
     fixed = FixedPoles(margin=split.margin)
+    # Motions that are unobservable by symmetry never decay. The Gramian does not show whether the
+    # other unobservable motions decay.
     detectable: bool | None = True
-    if motions.shape[1]:
+    if by_gramian.size:
         detectable = None
-    if known.shape[1]:
+    if by_symmetry.size:
         detectable = False
     return _result(
         first,

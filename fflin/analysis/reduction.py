@@ -433,18 +433,23 @@ def unpushed_positions(lin: LinearModel) -> Indices:
 
 
 def _clearly_pushed(lin: LinearModel, positions: list[int]) -> bool:
-    """Return whether inputs push all these positions, without doubt about rounding errors.
+    """Return whether inputs push all these positions, with forces far above rounding errors.
 
-    It is a quick test for most models, which need no second-order form then.
+    If this quick test succeeds, as for most models, the exact test is not needed. The exact test
+    computes the second-order form.
     """
-    inputs = lin.B[len(lin.M) :]
-    forces = lin.M @ inputs
+    B_rates = lin.B[len(lin.M) :]
+    forces = lin.M @ B_rates  # generalised force (nv, nu) of a unit of each input
+    # A force may be a rounding error if it is small compared with the forces of the same input on
+    # all coordinates, in units of equal size.
     size = np.sqrt(lin.M.diagonal())
-    columns = np.linalg.norm(forces / size[:, None], axis=0)
-    terms = np.abs(lin.M[positions]) @ np.abs(inputs)
-    scale = np.maximum(np.outer(size[positions], columns), terms)
-    clear = np.abs(forces[positions]) > _CLEAR * scale
-    return bool(clear.any(axis=1).all())
+    of_input = np.linalg.norm(forces / size[:, None], axis=0)
+    scale_of_input = np.outer(size[positions], of_input)
+    # It may also be a rounding error if it is a sum of terms that almost cancel.
+    scale_of_terms = np.abs(lin.M[positions]) @ np.abs(B_rates)
+    scale = np.maximum(scale_of_input, scale_of_terms)
+    is_clear = np.abs(forces[positions]) > _CLEAR * scale
+    return bool(is_clear.any(axis=1).all())
 
 
 def rigid_forces(body: LinearModel) -> Noisy:

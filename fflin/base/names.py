@@ -26,9 +26,10 @@ def group_of(name: str) -> str:
 
 
 def input_keys(model: Any) -> tuple[str, ...]:
-    """Return the names GROUP.ENTRY of inputs.
+    """Return the names GROUP.ENTRY of the inputs of a model.
 
-    The object `of` has the attributes `input_names` and `input_units`.
+    The model is any object with the attributes `input_names` and `input_units`. An input without a
+    known group gets the group "thrust" or "wheel" of its unit, or the group "input".
     """
     keys = []
     for name, unit in zip(model.input_names, model.input_units, strict=True):

@@ -216,42 +216,63 @@ def sampled(count: int) -> Indices:
 def curves(t: Array, values: Mapping[str, Array], unit: str) -> str:
     """Return a plot of curves {name: values (N,)} over the times t (N,) [s].
 
-    Of many curves, only the largest are drawn.
+    If there are more than _CURVES curves, only the largest are drawn.
     """
-    width, height, left = 280.0, 110.0, 44.0
-    ranked = sorted(values.items(), key=lambda item: -float(np.abs(item[1]).max()))
-    drawn = {name for name, _ in ranked[:_CURVES]}
-    chosen = {name: value for name, value in values.items() if name in drawn}
+    width = 280.0
+    height = 110.0
+    left = 44.0  # margin for the labels of the vertical axis
+    drawn = _largest_curves(values)
     rows = sampled(len(t))
-    ends = [float(end(x[rows])) for x in chosen.values() for end in (np.min, np.max)]
-    low, high = min([0.0, *ends]), max([0.0, *ends])
+
+    # The vertical range includes zero.
+    low = high = 0.0
+    for curve in drawn.values():
+        low = min(low, float(curve[rows].min()))
+        high = max(high, float(curve[rows].max()))
     if not high > low:
-        low, high = -1.0, 1.0
+        low = -1.0
+        high = 1.0
+
     x = width * (t[rows] - t[0]) / (t[-1] - t[0])
     parts = [f'<rect class="plot" x="0" y="0" width="{width:g}" height="{height:g}"/>']
-    zero = height * high / (high - low)
+    zero = height * high / (high - low)  # y points down
     parts.append(_line(0.0, zero, width, zero))
-    for color, (name, value) in zip(COLORS, chosen.items(), strict=False):
-        y = height * (high - value[rows]) / (high - low)
+    for color, (name, curve) in zip(COLORS, drawn.items(), strict=False):
+        y = height * (high - curve[rows]) / (high - low)
         points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x, y, strict=True))
+        # The second, invisible line is wide, so that a pointer finds the curve more easily.
         parts.append(
             f'<g><polyline class="curve" stroke="{_ink(color)}" points="{points}"/>'
-            f'<polyline class="near" points="{points}"/>'  # easier to point at
+            f'<polyline class="near" points="{points}"/>'
             f"<title>{escape(name)}</title></g>"
         )
-    for value_at, y_at in ((high, 8.0), (low, height)):
-        parts.append(
-            f'<text x="-4" y="{y_at:g}" text-anchor="end">{value_at:.3g}</text>'
-        )
-    parts.append(f'<text x="0" y="{height + 12:g}">{t[0]:g}</text>')
-    parts.append(
-        f'<text x="{width:g}" y="{height + 12:g}" text-anchor="end">{t[-1]:g} s</text>'
-    )
-    shown_unit = "" if unit == "1" else f"[{unit}]"
-    parts.append(
-        f'<text x="-4" y="{height / 2:g}" text-anchor="end">{shown_unit}</text>'
-    )
+    # Labels: the limits and the unit of the vertical axis on the left, the time range below.
+    below = height + 12.0
+    unit_label = "" if unit == "1" else f"[{unit}]"
+    parts += [
+        _text(-4.0, 8.0, f"{high:.3g}", at_end=True),
+        _text(-4.0, height, f"{low:.3g}", at_end=True),
+        _text(0.0, below, f"{t[0]:g}"),
+        _text(width, below, f"{t[-1]:g} s", at_end=True),
+        _text(-4.0, height / 2, unit_label, at_end=True),
+    ]
     return picture(-left, -4.0, left + width + 8.0, height + 22.0, "".join(parts))
+
+
+def _largest_curves(values: Mapping[str, Array]) -> dict[str, Array]:
+    """Return the _CURVES curves with the largest absolute values, in their original order."""
+
+    def size(name: str) -> float:
+        return float(np.abs(values[name]).max())
+
+    largest = sorted(values, key=size, reverse=True)[:_CURVES]
+    return {name: curve for name, curve in values.items() if name in largest}
+
+
+def _text(x: float, y: float, text: str, *, at_end: bool = False) -> str:
+    """Return a text that begins at x, or that ends there if `at_end` is true."""
+    anchor = ' text-anchor="end"' if at_end else ""
+    return f'<text x="{x:g}" y="{y:g}"{anchor}>{text}</text>'
 
 
 def _ink(color: str) -> str:

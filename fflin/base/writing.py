@@ -68,20 +68,22 @@ def read_file(
 def require_regular(
     path: Path, kind: str, limit: int | None = None, *, replaceable: bool = False
 ) -> None:
-    """Register an input file that another package reads, or raise `FileError`.
+    """Raise `FileError` if an input file is not a regular file of at most `limit` bytes.
 
-    If `replaceable`, the file is only checked.
+    Other files are not opened: a pipe would block until another process writes into it, and a
+    device may have no end.
 
-    The file must be a regular file of at most `limit` bytes. Other files are not opened: a pipe
-    would block until another process writes into it, and a device may have no end.
+    The file is also registered as an input, so that the command cannot overwrite it. If
+    `replaceable` is true, it is not registered.
     """
     with failing(path, "read"):
         status = path.stat()
-        if not stat.S_ISREG(status.st_mode):
-            actual_kind = (
-                "a folder" if stat.S_ISDIR(status.st_mode) else "not a regular file"
-            )
-            raise FileError(f"{path}: is {actual_kind}; give the path of a {kind} file")
+    if stat.S_ISDIR(status.st_mode):
+        raise FileError(f"{path}: is a folder; give the path of a {kind} file")
+    if not stat.S_ISREG(status.st_mode):
+        raise FileError(
+            f"{path}: is not a regular file; give the path of a {kind} file"
+        )
     if limit is not None and status.st_size > limit:
         size = f"{limit >> 20} MiB" if limit >> 20 else f"{limit >> 10} KiB"
         raise FileError(f"{path}: is larger than {size}, too large for a {kind} file")

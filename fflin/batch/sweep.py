@@ -23,7 +23,7 @@ from fflin.batch.configurations import Configurations, checked_points, checked_r
 from fflin.batch.files import FileStore, MemoryStore, is_constant, output_path
 from fflin.batch.linear_batch import AT_ROOT, TEXTS, LinearBatch
 from fflin.batch.run import Execution, Progress, Rows, run_chunks
-from fflin.dynamics.coordinates import SMALLEST_Q0, Chart, Standing
+from fflin.dynamics.coordinates import SMALLEST_Q0, Chart, ReferenceChart
 from fflin.dynamics.rnea import AccelerationDerivatives
 from fflin.kernel.compiled import compiles
 from fflin.kernel.limits import Task, reason_against
@@ -303,7 +303,7 @@ class ChunkJob:
         chart: Chart
         r_b: Array
         if own_reference:
-            chart = Standing(count)
+            chart = ReferenceChart(count)
             r_b = np.zeros((count, 3))
         else:
             chart = state.charts(q)

@@ -189,18 +189,21 @@ def point_of(
 ) -> tuple[Array, Array | None, pin.SE3 | None]:
     """Return q (nq,), v (nv,) and the reference of the operating point.
 
-    With the prefix ``target_``, return the q, v and reference of the target. With
+    The options override the operating point of the robot's file. With the prefix ``target_``,
+    return the q, v and reference of the target, which may differ from the operating point. With
     --relative-equilibrium, the pose of this equilibrium is both the base pose and the reference.
     """
-    number = getattr(arguments, "relative_equilibrium", None)
-    if number:
+    equilibrium = getattr(arguments, "relative_equilibrium", None)  # 1 to 24, or None
+    if equilibrium:
         names = (f"{prefix}rpy", f"{prefix}position")
         refuse(arguments, names, "--relative-equilibrium already sets the base pose")
-    states = (robot.point, robot.target) if prefix else (robot.point,)
+    states = [robot.point]
+    if prefix:
+        states.append(robot.target)  # overrides entries of the operating point
     q, v = state_of(robot, arguments, *states, prefix=prefix)
-    if not number:
-        return q, v, reference_of(arguments)
-    q, reference = attitude(robot, q, number, arguments.frame)
+    reference = reference_of(arguments)
+    if equilibrium:
+        q, reference = attitude(robot, q, equilibrium, arguments.frame)
     return q, v, reference
 
 
@@ -594,10 +597,18 @@ def check_pictures(robot: fflin.Robot, arguments: Namespace) -> None:
 def pictures(
     robot: fflin.Robot, motion: Callable[[], fflin.Motion], arguments: Namespace
 ) -> dict[Path | None, Callable[[Path], object]]:
-    """Return {path: function that writes the file} for a web page and pictures of a motion."""
-    how = {name: getattr(arguments, name) for name in ("times", "fps", "speed", *SHOWN)}
+    """Return {path: function that writes the file} for a web page and pictures of a motion.
 
-    def show(path: Path) -> None:
-        fflin.visualize(robot, motion(), **how | {path.suffix.removeprefix("."): path})
+    The path of a file that is not asked for is None. `motion` is called when a file is written.
+    """
+    options = {
+        name: getattr(arguments, name) for name in ("times", "fps", "speed", *SHOWN)
+    }
 
-    return {getattr(arguments, name): show for name in _FILES}
+    def write(path: Path) -> None:
+        # `visualize` takes the path as html=, png= or gif=, like the ending of the file.
+        kind = path.suffix.removeprefix(".")
+        output: dict[str, Any] = {kind: path}
+        fflin.visualize(robot, motion(), **options, **output)
+
+    return {getattr(arguments, name): write for name in _FILES}

@@ -118,22 +118,31 @@ def default_weights(
 
 
 def _damping(lin: LinearModel) -> Array:
-    """Return the viscous damping matrix B (m, m), which is zero for a sampled model."""
+    """Return the viscous damping matrix (m, m): the positive semidefinite part of D.
+
+    The matrix is zero for a model without damping, and for a sampled model.
+    """
+    undamped = np.zeros_like(lin.M)
     m = len(lin.M)
-    # In the matrix A of a sampled model, springs look like damping. B is therefore set to zero.
+    # In the matrix A of a sampled model, springs look like damping, so damping is ignored.
     if lin.dt or not lin.A[m:, m:].any():
-        return np.zeros_like(lin.M)
+        return undamped
     D = second_order(lin).D.values
+    # The generalised eigenvalues of the symmetric part are damping rates [1/s].
     rates, modes = eigh(0.5 * (D + D.T), lin.M)
     # Gyroscopic coupling and orbital motion may add damping rates of both signs. These rates sum to
     # zero, because conservative motion preserves volumes in phase space. If the rates of a model
-    # sum to zero, the model counts as undamped.
+    # sum to zero, apart from rounding, the model counts as undamped.
     size = np.sqrt(lin.M.diagonal())
-    whole = max(np.abs(rates).sum(), np.abs(D / np.outer(size, size)).max())
-    damped = bool(rates.sum() > 1e-9 * whole)
-    forces = lin.M @ modes
-    B: Array = (forces * rates.clip(0.0)) @ forces.T * damped
-    return B
+    largest_entry = np.abs(D / np.outer(size, size)).max()
+    scale = max(np.abs(rates).sum(), largest_entry)
+    if not rates.sum() > 1e-9 * scale:
+        return undamped
+    # With the modes V, V^T M V = E. So the symmetric part is (M V) diag(rates) (M V)^T. Negative
+    # rates are omitted.
+    momenta = lin.M @ modes
+    damping: Array = (momenta * rates.clip(0.0)) @ momenta.T
+    return damping
 
 
 def _of_inertia(

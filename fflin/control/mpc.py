@@ -356,35 +356,44 @@ def _along(traj: LinearTrajectory, horizon: Horizon, cost: Cost) -> TrajectoryMp
     Q, R, Qf, weights = cost
     dt = horizon.dt
     schedule = tvlqr(traj, Q, R, Qf, dt, weights=weights)
-    follows = TrajectoryFeedback(traj, schedule)
+    Q, R = schedule.Q, schedule.R  # with default weights, if none are given
     state = StateMap(traj.robot, frame="local")
-    models, stages = along(traj.resampled(dt)), list[Stage]()
+
+    def limited_state(lin: LinearModel, v: Array) -> Array:
+        """Return the state (nx,) to which limits are relative, at the configuration of a model."""
+        # The base pose is zero, because limits of the base pose apply to the error relative to the
+        # trajectory.
+        pose = np.zeros(6)
+        return np.concatenate((pose, state.joint_positions(lin.q), state.velocities(v)))
+
+    stages = list[Stage]()
+    # Along the trajectory: sample k ends at knot k + 1.
+    follows = TrajectoryFeedback(traj, schedule)
+    models = along(traj.resampled(dt))
+    for k, (total, transition) in enumerate(held_stages(traj, dt, Q, R)):
+        K = schedule.K[k]
+        P = schedule.P[k + 1]
+        lin = models[k + 1]
+        _, _, u = follows.commanded(k * dt)
+        x = limited_state(lin, models.v[k + 1])
+        stages.append(horizon.stage(total, transition, K, P, lin, u, x))
+
+    # After the trajectory: the steady motion at its end.
     rest = rest_or_fall(traj)
     end = rest.of_trajectory(traj.robot)
-    held = sampled_cost(end, dt, rest.map.T @ schedule.Q @ rest.map, schedule.R)
     sampled = end.discretize(dt)
-    P, K = steady_regulator(rest, schedule.Q, schedule.R, dt)
-    total = np.block([[held.Q, held.N], [held.N.T, held.R]])
-    last = total, np.hstack((sampled.A, sampled.B)), K, P, end, end.u0, rest.v
-    designs = [
-        (
-            *sample,
-            schedule.K[k],
-            schedule.P[k + 1],
-            models[k + 1],
-            follows.commanded(k * dt)[2],
-            models.v[k + 1],
-        )
-        for k, sample in enumerate(held_stages(traj, dt, schedule.Q, schedule.R))
-    ]
-    for total, step, K, P, model, u, v in (*designs, last):
-        # The base pose in x is zero, because limits of the base pose apply to the error relative to
-        # the trajectory.
-        x = np.concatenate(
-            (np.zeros(6), state.joint_positions(model.q), state.velocities(v))
-        )
-        stages.append(horizon.stage(total, step, K, P, model, u, x))
-    stages += stages[-1:] * (horizon.samples - 1)
+    weight_of_sample = sampled_cost(end, dt, rest.map.T @ Q @ rest.map, R)
+    total = np.block(
+        [
+            [weight_of_sample.Q, weight_of_sample.N],
+            [weight_of_sample.N.T, weight_of_sample.R],
+        ]
+    )
+    transition = np.hstack((sampled.A, sampled.B))
+    P, K = steady_regulator(rest, Q, R, dt)
+    x = limited_state(end, rest.v)
+    last = horizon.stage(total, transition, K, P, end, end.u0, x)
+    stages += [last] * horizon.samples
     return TrajectoryMpc(traj, schedule, replace(horizon, stages=tuple(stages)))
 
 

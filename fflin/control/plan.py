@@ -204,7 +204,9 @@ def plan(
         for text in _faults(made, note):
             warnings.warn(text, FflinWarning, stacklevel=2)
         note += f"\n{made.optimality or _UNKNOWN}"
-        note += _largest(shooting, actuation, made, np.hstack((bounds, inputs)))
+        note += _nearest_to_limits(
+            shooting, actuation, made, np.hstack((bounds, inputs))
+        )
         return Trajectory(
             robot, t, q, v, u, hold=hold, _note=note, _optimality=made.optimality
         )
@@ -423,28 +425,36 @@ def _note(shooting: Shooting, made: _Made) -> str:
     return f"the integrated motion {most} (checked at {_PARTS} points per interval)"
 
 
-def _largest(
+def _nearest_to_limits(
     shooting: Shooting, actuation: Actuation, made: _Made, limits: Array
 ) -> str:
     """Describe, for each group of signals, the state or input that is nearest to its limit.
 
-    `limits` (2, k) contains the lower and upper limits of all states and inputs.
+    `limits` (2, k) contains the lower and upper limits of all states and inputs. The rates of
+    wheels are a group of their own.
     """
-    wheels = {shooting.state.names[i].removeprefix("q_m.") for i in shooting.wheels}
     state = shooting.state
+    wheel_rates = {
+        state.names[i].replace("q_m.", "qdot_m.", 1) for i in shooting.wheels
+    }
+    names = state.names + input_keys(actuation)
+    units = state.units + actuation.units
+    low, high = limits
     values = np.hstack((shooting.limited_values(made.q, made.v), made.u))
-    names, units = state.names + input_keys(actuation), state.units + actuation.units
-    bound = np.abs(np.where(values > 0.0, limits[1], limits[0]))
-    shares = np.abs(values) / np.where(bound > 0.0, bound, np.inf)
+    limit = np.abs(np.where(values > 0.0, high, low))
+    # Fractions of the limits; 0 if the limit is zero.
+    fractions = np.abs(values) / np.where(limit > 0.0, limit, np.inf)
+
     nearest: dict[tuple[str, bool], tuple[float, str]] = {}
     for i in np.flatnonzero(np.isfinite(limits).any(axis=0)):
-        k = int(shares[:, i].argmax())
-        text = f"{names[i]} {abs(values[k, i]):.3g} of {bound[k, i]:.3g} {units[i]}"
-        group = group_of(names[i]), names[i].removeprefix("qdot_m.") in wheels
-        nearest[group] = max(
-            nearest.get(group, (0.0, text)), (float(shares[k, i]), text)
-        )
-    text = ", ".join(text.replace(" ", "\u00a0") for _, text in nearest.values())
-    if not text:
+        name = names[i]
+        group = group_of(name), name in wheel_rates
+        knot = int(fractions[:, i].argmax())
+        text = f"{name} {abs(values[knot, i]):.3g} of {limit[knot, i]:.3g} {units[i]}"
+        signal = float(fractions[knot, i]), text
+        nearest[group] = max(nearest.get(group, signal), signal)
+    if not nearest:
         return ""
-    return f"\nnearest to their limits at the knots: {text}"
+    texts = [text for _, text in nearest.values()]
+    listing = ", ".join(text.replace(" ", "\u00a0") for text in texts)
+    return f"\nnearest to their limits at the knots: {listing}"

@@ -30,7 +30,7 @@ from fflin.dynamics.outputs import KINDS, Measuring, state_indices
 from fflin.dynamics.state import Actuation, StateMap, selection
 from fflin.dynamics.state_rows import readout
 from fflin.kernel.allocation import nearest
-from fflin.linear.fit import about_point, require_fit, require_turns
+from fflin.linear.fit import about_point, require_configuration_size, require_fit
 from fflin.linear.holding import held_if_possible, wheel_notes
 from fflin.linear.model import LinearModel, gain_map
 from fflin.linear.trajectory import Trajectory
@@ -359,7 +359,7 @@ class Allocation(Policy):
                 f"the design's joints differ from the joints of '{robot.name}'; give the same "
                 "robot, with other inputs, as the design"
             )
-        require_turns(
+        require_configuration_size(
             f"the design was made for '{self.design.name}'", self.design.nq, robot
         )
         return AllocatedPolicy(self, robot)

@@ -360,7 +360,9 @@ class Policy(ABC):
         if lin is None or K is None:
             return ()
         loop = lin.A - lin.B @ K
-        unstable = unstable_note("linear loop", loop[_on_feedback(loop, K)], lin.dt, "")
+        unstable = unstable_note(
+            "linear loop", loop[_block_of_feedback(loop, K)], lin.dt, ""
+        )
         if unstable or lin.dt or not held:
             return unstable
         sampled = lin.discretize(held)
@@ -371,7 +373,7 @@ class Policy(ABC):
         )
         loop = sampled.A - sampled.B @ K
         return unstable_note(
-            "sampled linear loop", loop[_on_feedback(lin.A, K)], held, advice
+            "sampled linear loop", loop[_block_of_feedback(lin.A, K)], held, advice
         )
 
     def form(self, robot: Robot) -> Form | None:
@@ -469,11 +471,11 @@ def _check_members(policy: Policy) -> None:
     if defined_by_user(policy, "feedback_gain") and K is not None:
         label = f"{kind}.feedback_gain"
         shape = as_double(label, K).shape
-        if lin is not None:
-            shape = lin.B.shape[::-1]
-        elif len(shape) != 2:
+        if lin is None and len(shape) != 2:
             raise InputError(f"{label} has shape {shape}, expected (nu, nx)")
-        shaped(label, K, shape, " (nu, nx), the inputs and states of its model")
+        # Without a model, every nu and nx is accepted.
+        nx, nu = shape[::-1] if lin is None else lin.B.shape
+        shaped(label, K, (nu, nx), " (nu, nx), the inputs and states of its model")
     if defined_by_user(policy, "reference_motion"):
         motion = policy.reference_motion
         if motion is not None:
@@ -549,12 +551,16 @@ def unstable_note(what: str, matrix: Array, dt: float, advice: str) -> tuple[str
     return (f"the {what} is unstable, with a pole at {pole:.4g}{unit}{advice}",)
 
 
-def _on_feedback(A: Array, K: Array) -> tuple[Mask, ...]:
-    """Return rows and columns of the states that affect the states that the gain K feeds back.
+def _block_of_feedback(A: Array, K: Array) -> tuple[Mask, ...]:
+    """Return the index of the block of A (nx, nx) whose poles count for stability.
 
-    Other states, such as the position of a base that no input pushes, may drift in a stable loop.
+    The block contains the states that the gain K (nu, nx) feeds back, and the states that affect
+    them. Other states, such as the position of a base that no input pushes, may drift in a stable
+    loop.
     """
-    acting = K.any(axis=0)
-    for _ in A:
-        acting = acting | A[acting].any(axis=0)
-    return np.ix_(acting, acting)
+    chosen = K.any(axis=0)
+    # A state i affects a state j directly if A[j, i] is not zero. A chain of such effects has at
+    # most nx links.
+    for _ in range(len(A)):
+        chosen = chosen | A[chosen].any(axis=0)
+    return np.ix_(chosen, chosen)

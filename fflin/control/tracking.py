@@ -37,7 +37,7 @@ from fflin.dynamics.coordinates import Frame
 from fflin.dynamics.outputs import Measuring
 from fflin.dynamics.state import StateMap
 from fflin.dynamics.state_rows import moved_by, moving_error
-from fflin.linear.fit import require_same, require_turns, signals_of
+from fflin.linear.fit import require_configuration_size, require_same, signals_of
 from fflin.linear.model import LinearModel
 from fflin.linear.trajectory import Trajectory
 from fflin.robot.fields import warn_of_degrees
@@ -254,7 +254,7 @@ class TrajectoryFeedback(Feedback):
         made = f"the trajectory was made for '{origin.name}'"
         for kind in ("input", "state"):
             require_same(made, state, kind, *signals_of(design_state, kind))
-        require_turns(made, origin.nq, robot)
+        require_configuration_size(made, origin.nq, robot)
         return state
 
     def deviation(self, robot: Robot) -> Deviation:

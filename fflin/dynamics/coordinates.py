@@ -121,7 +121,9 @@ class Chart:
     reference.
     """
 
-    standing: ClassVar[bool] = False  # whether all attitudes are equal to the reference
+    at_reference: ClassVar[bool] = (
+        False  # whether all attitudes are equal to the reference
+    )
 
     q_b: Array  # vector part (.., 3) of the quaternion of refMb
     q0: float | Array  # scalar part (.., 1) of this quaternion, at least 0
@@ -157,22 +159,23 @@ class Chart:
 
     def rate(self, omega: Array) -> Array:
         """Return d q_b/dt (.., 3) for the angular velocity omega (.., 3) in base axes (1.2)."""
-        if self.standing:
+        if self.at_reference:
             return 0.5 * omega
         return times(self.N, omega)
 
     def turned(self, columns: Array) -> Array:
         """Convert k vectors, the columns of an array (.., 3, k), from base to reference axes."""
-        if self.standing:
+        if self.at_reference:
             return columns
         return product(self.R, columns)
 
     def rate_over_q_b(self, omega: Array, crossed: Array) -> Array:
         """Return the derivative (.., 3, 3) of d q_b/dt with respect to q_b (4.2).
 
-        omega is constant in base axes, and `crossed` is [omega]x.
+        It is the derivative at constant omega (.., 3) in base axes. `crossed` is [omega]x, which
+        callers have already.
         """
-        if self.standing:
+        if self.at_reference:
             return -0.5 * crossed
         return -0.5 * (
             crossed + omega[..., :, None] * (self.q_b / self.q0)[..., None, :]
@@ -184,7 +187,7 @@ class Chart:
         `by_turn` (.., k, 3) contains the derivatives with respect to d theta, a small rotation of
         the base in base axes (1.3).
         """
-        if self.standing:
+        if self.at_reference:
             return 2.0 * by_turn
         return product(by_turn, self.J)
 
@@ -194,7 +197,7 @@ class Chart:
         `parts` has one slice of three rows for each block. To multiply blocks of three columns of a
         matrix by R^T from the right, pass the transpose of this matrix as x.
         """
-        if not self.standing:
+        if not self.at_reference:
             _turn(self.R, parts, x)
 
     def to_reference(self, parts: tuple[slice, ...], x: Array) -> Array:
@@ -203,7 +206,7 @@ class Chart:
         Each slice in `parts` selects three rows of x: the components of k vectors. The given array
         is not changed.
         """
-        if self.standing or not parts:  # R is the identity, or no rows are selected
+        if self.at_reference or not parts:  # R is the identity, or no rows are selected
             return x
         # Keep the memory layout of x, which may be a transposed view.
         copied = x.copy("K")
@@ -215,17 +218,17 @@ class Chart:
         Each slice in `parts` selects three rows of x: the components of k vectors. The given array
         is not changed.
         """
-        if self.standing or not parts:  # R is the identity, or no rows are selected
+        if self.at_reference or not parts:  # R is the identity, or no rows are selected
             return x
         # Keep the memory layout of x, which may be a transposed view.
         copied = x.copy("K")
         return _turn(self.R.mT, parts, copied)
 
 
-class Standing(Chart):
+class ReferenceChart(Chart):
     """Chart at one or many attitudes that are equal to the reference: R = Q = E and J = 2 E."""
 
-    standing = True
+    at_reference = True
 
     def __init__(self, *count: int) -> None:
         super().__init__(np.zeros((*count, 3)), 1.0, _IDENTITY)

@@ -233,7 +233,7 @@ KINDS: dict[type[kinds.Output], tuple[Derivatives, Value]] = {
 
 
 # Attitude and position of a base that is at the reference.
-_STANDING: tuple[Array, Array] = (np.eye(3), np.zeros(3))
+_AT_REFERENCE: tuple[Array, Array] = (np.eye(3), np.zeros(3))
 
 
 class Sensing:
@@ -308,7 +308,7 @@ class Sensing:
         centred_q, centred_v = q.copy(), v.copy()
         centred_q[:7] = self._home
         centred_v[PIN_LINEAR] = 0.0
-        R, r_b = _STANDING
+        R, r_b = _AT_REFERENCE
         if not self._own_reference:
             R, r_b = state.rotation(q), state.positions(q)
         spin = np.zeros(3)

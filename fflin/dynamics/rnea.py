@@ -82,25 +82,25 @@ class Inertia:
         The configuration is not checked. If `quick` is true, the articulated-body inverse is used
         at configurations at which it is accurate.
         """
-        still = self.centred(q)
+        q_centred = self.centred(q)
         # For a robot with springs or dampers, `quick` should be false, because the articulated-body
         # inverse leaves rounding errors in entries of M^-1 K that should be exactly zero. Here K is
         # the stiffness. A Cholesky factor has relative rounding errors that do not depend on the
         # scaling of M.
         bounds = self._bounds if quick else None
-        if bounds is not None and (
-            not self._slides or np.abs(still.take(self._slides)).max() <= STROKE
-        ):
-            _compute_inverse(self._model, self._data, still)
+        if bounds is not None and self._slides:
+            stroke = np.abs(q_centred.take(self._slides)).max()
+            if not stroke <= STROKE:
+                bounds = None  # the bounds do not hold here
+        if bounds is not None:
+            _compute_inverse(self._model, self._data, q_centred)
             self._state.project(self._inverse, out)
-            # If a pivot is zero, the couplings are NaN, and this comparison is false.
-            if (
-                self.least_coupling
-                < bounds.dot(self._inverse_diagonal)
-                < _QUICK_COUPLING
-            ):
+            coupling = bounds.dot(self._inverse_diagonal)
+            # If a pivot is zero, the coupling is NaN, and this comparison is false.
+            if self.least_coupling < coupling < _QUICK_COUPLING:
                 return
-        upper = _crba(self._model, self._data, still)
+        # The articulated-body inverse is not accurate enough, or not asked for: factorise M.
+        upper = _crba(self._model, self._data, q_centred)
         if self._constrained or len(upper) > _DENSE_SIZE:
             M = self._state.project(upper.T)
             _invert_dense(M, out)

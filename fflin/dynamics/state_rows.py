@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from itertools import compress
-from operator import attrgetter
 
 import numpy as np
 import pinocchio as pin
@@ -33,54 +32,62 @@ def readout(
 
     In the state x, the angles of continuous joints are within half a turn of `near` (nx,).
     """
-    # The state x is linear in the vector z below. So u is one matrix-vector product, which takes a
-    # fifth of the time of computing x.
-    robot, g = state.robot, state.groups
-    idx_q = np.array([*map(attrgetter("idx_q"), robot.joints)], dtype=np.intp)
-    scales = np.array([*map(attrgetter("scale"), robot.joints)])
-    circling = state.unbounded
-    cos = idx_q[state.unbounded]
-    middle = near[g.q_m][circling]
-    # x = S z, where z stacks q, v, the angles of continuous joints, omega_b and v_b in world axes,
-    # and 1.
-    ends = np.cumsum((robot.nq, robot.nv, len(circling), 3, 3))
+    # The state is x = S z. The vector z consists of q, v, the angles of continuous joints, omega_b
+    # and v_b in world axes, and 1. So u = offset - K S z is one matrix-vector product, which takes
+    # a fifth of the time of computing x.
+    robot = state.robot
+    g = state.groups
+    idx_q = np.array([joint.idx_q for joint in robot.joints], dtype=np.intp)
+    scales = np.array([joint.scale for joint in robot.joints])
+    continuous = state.unbounded
+    cosines = idx_q[continuous]  # indices in q; the sines follow their cosines
+    sines = cosines + 1
+    middle = near[g.q_m][continuous]
+    omega_in_reference, v_in_reference = state.axes
+    origin = state.origin
+    quaternion_map = turning.product_matrix(state.origin_quaternion)
+
+    # Views of the columns of S for each part of z.
+    ends = np.cumsum((robot.nq, robot.nv, len(continuous), 3, 3))
     S = np.zeros((state.nx, ends[-1] + 1))
-    of_q, of_v, of_angles, of_angular, of_linear, constant = np.split(S, ends, axis=1)
-    at = state.origin
-    turn = turning.product_matrix(state.origin_quaternion)
-    of_q[g.q_b, 3:7] = turn[:3]
-    of_q[g.r_b, :3] = at.rotation
-    constant[g.r_b, 0] = at.translation
-    of_q[g.q_m][np.arange(robot.n), idx_q] = 1.0 / scales
-    of_q[:, cos] = 0.0
-    of_angles[6 + circling] = np.eye(len(circling))
-    of_v[6 + robot.n :] = state.velocities(np.eye(robot.nv)).T
-    for group, of_part in compress(
-        ((g.omega_b, of_angular), (g.v_b, of_linear)), state.axes
-    ):
-        of_v[group] = 0.0
-        of_part[group] = at.rotation
+    S_q, S_v, S_angles, S_omega, S_linear, S_one = np.split(S, ends, axis=1)
+    S_q[g.q_b, 3:7] = quaternion_map[:3]
+    S_q[g.r_b, :3] = origin.rotation
+    S_one[g.r_b, 0] = origin.translation
+    S_q[g.q_m][np.arange(robot.n), idx_q] = 1.0 / scales
+    S_q[:, cosines] = 0.0
+    S_angles[6 + continuous] = np.eye(len(continuous))
+    S_v[6 + robot.n :] = state.velocities(np.eye(robot.nv)).T
+    if omega_in_reference:
+        S_v[g.omega_b] = 0.0
+        S_omega[g.omega_b] = origin.rotation
+    if v_in_reference:
+        S_v[g.v_b] = 0.0
+        S_linear[g.v_b] = origin.rotation
     gains = -K @ S
     gains[:, -1] += offset
 
+    # Views of the parts of z, into which the law writes.
     z = np.zeros(gains.shape[1])
     z[-1] = 1.0
-    z_q, z_v, z_angles, z_angular, z_linear, _ = np.split(z, ends)
-    z_turn, scalar = z_q[3:7], turn[3]
-    turned_angular, turned_linear = state.axes
+    z_q, z_v, z_angles, z_omega, z_linear, _ = np.split(z, ends)
+    z_quaternion = z_q[3:7]
+    q0_map = quaternion_map[3]
 
     def law(_: float, q: Array, v: Array) -> Array:
-        z_q[:], z_v[:] = q, v
-        if scalar.dot(z_turn) < 0.0:
-            z_turn[:] = -z_turn
-        if cos.size:
-            angles = np.arctan2(q.take(cos + 1), q.take(cos))
+        z_q[:] = q
+        z_v[:] = v
+        # Both signs of a quaternion are the same attitude. The chart needs q0 >= 0.
+        if q0_map.dot(z_quaternion) < 0.0:
+            z_quaternion[:] = -z_quaternion
+        if cosines.size:
+            angles = np.arctan2(q.take(sines), q.take(cosines))
             z_angles[:] = angles + TURN * np.round((middle - angles) / TURN)
-        if turned_linear:
+        if v_in_reference:
             R = pin.XYZQUATToSE3(q[:7]).rotation
             z_linear[:] = R.dot(v[:3])
-            if turned_angular:
-                z_angular[:] = R.dot(v[3:6])
+            if omega_in_reference:  # never without v_in_reference
+                z_omega[:] = R.dot(v[3:6])
         u: Array = gains.dot(z)
         return u
 

@@ -30,7 +30,7 @@ from fflin.dynamics.coordinates import Frame, frame_of
 from fflin.dynamics.outputs import Measuring
 from fflin.dynamics.state import StateMap
 from fflin.export.laws import CASES, Law, law_of, measured
-from fflin.linear.fit import require_same, require_turns
+from fflin.linear.fit import require_configuration_size, require_same
 from fflin.robot.robot import Robot
 
 _DOUBLE = {"sqrt": "sqrt", "largest": "DBL_MAX", "two_pi": "6.283185307179586477"}
@@ -304,7 +304,7 @@ class CLaw(Policy):
         )
         for kind, (names, units) in self._about["signals"].items():
             require_same(made, state, kind, tuple(names), tuple(units))
-        require_turns(made, self._about["nq"], robot)
+        require_configuration_size(made, self._about["nq"], robot)
         if self._about["kind"] == "output":
             q, v = map(np.array, self._about["point"])
             measuring = Measuring(state, q)

@@ -50,7 +50,7 @@ _INTERVAL = 1.0
 
 _log = logging.getLogger("fflin")
 _TURN, _COMPILING = Lock(), RLock()
-_said_unstored: list[bool] = []
+_warned_unstored = Event()  # set after the warning that machine code cannot be stored
 
 
 def available_cores() -> int:
@@ -156,10 +156,10 @@ def _prepared(module: str, name: str) -> Compiled:
 def _compile_unstored(
     compile: Callable[[object], object], name: str, signature: object
 ) -> object:
-    """Compile a function whose machine code cannot be stored; say so once per process."""
+    """Compile a function whose machine code cannot be stored; warn once per process."""
     with _COMPILING:
-        if not _said_unstored:
-            _said_unstored.append(True)
+        if not _warned_unstored.is_set():
+            _warned_unstored.set()
             _log.warning(
                 "fflin: compiling without storing the code, because neither the folder of fflin "
                 "nor the user's cache folder is writable; every process compiles again. Set "

@@ -356,21 +356,29 @@ def _field(
     words: ir.Value,
     name: str,
 ) -> ir.Value:
+    """Generate the LLVM code that reads the field `name` of a struct from its words.
+
+    A number is one word. An array is a word with its address, and one word with the length of each
+    axis. The words of a struct within the struct begin at the field's place.
+    """
     field_kind = _numba_type(kind.struct.kinds[name])
     first = kind.struct.places[name]
 
-    def at(place: int) -> ir.Value:
-        return builder.gep(words, [_WORD(first + place)])
+    def pointer(index: int) -> ir.Value:
+        """Return the pointer to a word of the field."""
+        return builder.gep(words, [_WORD(first + index)])
 
-    def word(place: int) -> ir.Value:
-        value = builder.load(at(place))
+    def word(index: int) -> ir.Value:
+        """Load a word of the field, a 64-bit integer."""
+        value = builder.load(pointer(index))
         # The words are constant during a call, so LLVM may reuse a word that was read before.
         value.set_metadata("invariant.load", builder.module.add_metadata([]))
         return value
 
     if isinstance(field_kind, _StructType):
-        return at(0)
+        return pointer(0)
     if field_kind == float64:
+        # The word contains the bits of the double.
         return builder.bitcast(word(0), _DOUBLE)
     if field_kind == boolean:
         return builder.trunc(word(0), ir.IntType(1))
@@ -378,14 +386,15 @@ def _field(
         return word(0)
     array = context.make_array(field_kind)(context, builder)
     shape = [word(1 + axis) for axis in range(field_kind.ndim)]
-    size = context.get_constant(
-        intp, context.get_abi_sizeof(context.get_data_type(field_kind.dtype))
-    )
-    strides = [size]
-    for length in shape[:0:-1]:
+    entry_type = context.get_data_type(field_kind.dtype)
+    entry_size = context.get_constant(intp, context.get_abi_sizeof(entry_type))
+    # The array is C-contiguous. The stride of an axis is the stride of the next axis times the
+    # length of the next axis.
+    strides = [entry_size]
+    for length in reversed(shape[1:]):
         strides.insert(0, builder.mul(strides[0], length))
     data = builder.inttoptr(word(0), array.data.type)
-    populate_array(array, data, shape, strides, size, None)
+    populate_array(array, data, shape, strides, entry_size, None)
     return array._getvalue()
 
 

@@ -36,7 +36,7 @@ Entries: TypeAlias = Array | list[Number]
 # Functions of the kernel that numba does not inline. All other functions are inlined into their
 # callers.
 CALLED: set[Callable[..., object]] = set()
-# {function: function or operation that compiled code uses in its place}.
+# {function: function or operation that compiled code calls instead}.
 IN_PLACE: dict[Callable[..., object], Callable[..., object]] = {}
 
 
@@ -47,13 +47,17 @@ def called(function: F) -> F:
 
 
 def compiled_as(loop: Callable[..., object]) -> Callable[[F], F]:
-    """Return a decorator for a NumPy function that compiled code replaces by `loop`."""
+    """Return a decorator for a NumPy function; compiled code calls `loop` instead of it.
 
-    def noted(function: F) -> F:
+    NumPy is fast in Python, and `loop` is fast after compilation. The decorated function itself is
+    unchanged.
+    """
+
+    def register(function: F) -> F:
         IN_PLACE[function] = called(loop)
         return function
 
-    return noted
+    return register
 
 
 floor, whole, root, angle = np.floor, np.rint, np.sqrt, math.atan2
@@ -223,14 +227,14 @@ def times6(s, value):
 def cosine_and_sine(x):
     """Return the cosine and sine of x, accurate to one unit in the last place for |x| < 1e6.
 
-    A multiple of pi/2 is subtracted from x, so that |x| <= pi/4. For accuracy, pi/2 is the sum of
-    three numbers. For |x| <= pi/4, polynomials approximate the cosine and the sine. All
-    coefficients are from fdlibm (Sun Microsystems, 1993).
+    A multiple of pi/2 is subtracted from x, so that |x| <= pi/4 (Cody-Waite reduction). For
+    accuracy, pi/2 is the sum of three numbers. For |x| <= pi/4, polynomials approximate the cosine
+    and the sine. All coefficients are from fdlibm (Sun Microsystems, 1993).
     """
-    turns = floor(x * (2.0 / np.pi) + 0.5)
-    x = x - turns * 1.57079632673412561417e00
-    x = x - turns * 6.07710050630396597660e-11
-    x = x - turns * 2.02226624879595063154e-21
+    quarters = floor(x * (2.0 / np.pi) + 0.5)  # multiple of pi/2
+    x = x - quarters * 1.57079632673412561417e00
+    x = x - quarters * 6.07710050630396597660e-11
+    x = x - quarters * 2.02226624879595063154e-21
     z = x * x
     p = -2.50507602534068634195e-08 + z * 1.58969099521155010221e-10
     p = 2.75573137070700676789e-06 + z * p
@@ -244,13 +248,17 @@ def cosine_and_sine(x):
     p = -1.38888888888741095749e-03 + z * p
     p = 4.16666666666666019037e-02 + z * p
     cosine = (1.0 - 0.5 * z) + z * z * p
-    # Rotate back by the subtracted multiple of pi/2. `even` is the cosine of the multiple, and
-    # `odd` is the sine. Together they are (1, 0), (0, 1), (-1, 0) or (0, -1).
-    half = floor(turns * 0.5)
-    odd = turns - half - half
-    sign = 1.0 - 2.0 * (half - 2.0 * floor(half * 0.5))
-    even, odd = sign * (1.0 - odd), sign * odd
-    return even * cosine - odd * sine, odd * cosine + even * sine
+    # Add the multiple of pi/2 again, by the angle sum formulas. Its cosine c and sine s are (1, 0),
+    # (0, 1), (-1, 0) or (0, -1). They are computed without branches, because lanes may differ:
+    # `is_odd` and `half_is_odd` are 0 or 1, and `sign` is negative after an odd number of half
+    # turns.
+    halves = floor(quarters * 0.5)
+    is_odd = quarters - halves - halves
+    half_is_odd = halves - 2.0 * floor(halves * 0.5)
+    sign = 1.0 - 2.0 * half_is_odd
+    c = sign * (1.0 - is_odd)
+    s = sign * is_odd
+    return c * cosine - s * sine, s * cosine + c * sine
 
 
 def _series(first):

@@ -51,7 +51,7 @@ def require_fit(
     made = f"the model was made for '{lin.robot}'"
     require_same(made, state, "state", lin.state_names, lin.state_units, part=not whole)
     require_same(made, state, "input", lin.input_names, lin.input_units)
-    require_turns(made, len(lin.q), robot)
+    require_configuration_size(made, len(lin.q), robot)
     if sensed:
         require_same(made, state, "output", lin.output_names, lin.output_units)
 
@@ -114,18 +114,22 @@ def require_same(
     )
 
 
-def require_turns(made: str, size: int, robot: Robot) -> None:
+def require_configuration_size(made: str, size: int, robot: Robot) -> None:
     """Raise `InputError` if a configuration of the robot does not have `size` entries.
 
-    The number of entries depends on which joints are continuous, because the angle of a continuous
-    joint has two entries, its cosine and sine.
+    For robots with the same joint names, the number of entries depends only on which joints are
+    continuous: the angle of a continuous joint has two entries, its cosine and sine.
+
+    `made` is the beginning of the message, as in `require_same`.
     """
-    if size != robot.nq:
-        raise InputError(
-            f"{made}, but the given robot '{robot.name}' has other continuous joints, so that its "
-            f"configuration has {robot.nq} entries instead of {size}; make "
-            f"{made.partition(' was ')[0]} again for the given robot"
-        )
+    if size == robot.nq:
+        return
+    subject = made.partition(" was ")[0]
+    raise InputError(
+        f"{made}, but the given robot '{robot.name}' has other continuous joints, so that its "
+        f"configuration has {robot.nq} entries instead of {size}; make {subject} again for the "
+        "given robot"
+    )
 
 
 def outputs(

@@ -12,7 +12,7 @@ import pinocchio as pin
 from fflin.base import __version__
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, frozen, truth, vector
-from fflin.dynamics.coordinates import Chart, Frame, Standing, refuse_orbit
+from fflin.dynamics.coordinates import Chart, Frame, ReferenceChart, refuse_orbit
 from fflin.dynamics.outputs import Sensing
 from fflin.dynamics.rnea import AccelerationDerivatives, Accelerations
 from fflin.dynamics.state import Actuation, StateMap
@@ -29,7 +29,7 @@ from fflin.robot.robot import Robot
 # values, the computation of eigenvalues would overflow.
 LARGEST = 1e200
 
-_STANDING: Chart = Standing()
+_REFERENCE_CHART: Chart = ReferenceChart()
 
 
 class Prepared:
@@ -140,7 +140,7 @@ class Prepared:
     def state_at(self, lin: LinearModel) -> Array:
         """Return the state (nx,) at the point of a model."""
         state, q = self.map, lin.q
-        chart: Chart = _STANDING
+        chart: Chart = _REFERENCE_CHART
         r_b = chart.q_b
         if not self.own_reference:
             chart = state.chart(q)
@@ -340,7 +340,7 @@ class Linearizer:
     def _anywhere(self, q: Array, v: Array, u: Array) -> LinearModel:
         ready, lower = self.prepared, self._lower
         state, actuation = ready.map, ready.actuation
-        chart = _STANDING if ready.own_reference else state.chart(q)
+        chart = _REFERENCE_CHART if ready.own_reference else state.chart(q)
         nu = state.velocities(v)
         u_base = actuation.in_base_axes(chart, u)
         A, B = ready.rest["A"].copy(), np.zeros(self._shape_B)
@@ -374,7 +374,7 @@ class Linearizer:
         lower = self._lower
         count = len(q)
         state, actuation, sensing = ready.map, ready.actuation, ready.sensing
-        chart, nu = Standing(count), state.velocities(v)
+        chart, nu = ReferenceChart(count), state.velocities(v)
         x0 = state.compose(chart, chart.q_b, state.joint_positions(q), nu)
         A = np.tile(ready.rest["A"], (count, 1, 1))
         B = np.zeros((count, *self._shape_B))
@@ -386,7 +386,7 @@ class Linearizer:
                 rates = self._accelerations.rates(*point, A[k, lower], B[k, lower])
                 c[k], gravity[k] = rates.c, rates.gravity
                 if sensing is not None:
-                    measured_point = _STANDING, rates, x0[k], point
+                    measured_point = _REFERENCE_CHART, rates, x0[k], point
                     seen.append(
                         output_equations(
                             sensing, actuation, self._data, *measured_point

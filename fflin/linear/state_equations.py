@@ -44,8 +44,8 @@ def assemble(
     # (4.8)
     f0 = np.concatenate((chart.rate(w), position_rate, nu[..., 6:], rates.c), -1)
 
-    theta = _over_rotations(actuation, chart, u, rates, W)
-    lower[..., g.q_b] = chart.over_q_b(theta)
+    D_theta = _rotation_derivative(actuation, chart, u, rates, W)
+    lower[..., g.q_b] = chart.over_q_b(D_theta)
 
     # Write the rows of attitude and position. If the base is at the reference, do not write the
     # columns of the velocities in these rows: they are the same as at rest (2.1).
@@ -55,10 +55,10 @@ def assemble(
         by_q_b = chart.rate_over_q_b(w, W)
         if omega_in_reference:
             # Add N W J. At the reference, N W J is W, because N = E/2 and J = 2 E.
-            by_turn = W if chart.standing else chart.over_q_b(product(chart.N, W))
+            by_turn = W if chart.at_reference else chart.over_q_b(product(chart.N, W))
             by_q_b += by_turn
         A[..., g.q_b, g.q_b] = by_q_b  # (4.2)
-    if not chart.standing:
+    if not chart.at_reference:
         # Q R^T = Q^T.
         # (4.1)
         A[..., g.q_b, g.omega_b] = chart.N.mT if omega_in_reference else chart.N
@@ -66,7 +66,7 @@ def assemble(
             A[..., g.r_b, g.v_b] = chart.R
 
     # Rotate the rows of the accelerations from base axes to the axes of the frame.
-    if not chart.standing:
+    if not chart.at_reference:
         chart.turn_rows(state.in_reference, lower)  # (4.6)
         # The columns of the base's linear velocity need no rotation: before (4.5) below, these
         # columns are zero.
@@ -90,45 +90,47 @@ def assemble(
         A[..., g.v_b, g.omega_b] += V  # (4.5)
         A[..., g.v_b, g.v_b] -= W
         f0[..., g.v_b] -= times(W, v)  # (3.2)
-    if not chart.standing:
+    if not chart.at_reference:
         chart.turn_rows(state.in_reference, f0[..., nv:, None])
     return f0
 
 
-def _over_rotations(
+def _rotation_derivative(
     actuation: Actuation,
     chart: Chart,
     u: Array,
     rates: AccelerationDerivatives,
     W: Array,
 ) -> Array:
-    """Return the derivative of the accelerations with respect to base rotations (4.4).
+    """Return D_theta (.., 6 + n, 3): the derivative of the accelerations by base rotations (4.4).
 
-    The shape of the derivative is (.., 6 + n, 3). The function may add terms to `rates.by_turn` in
-    place.
+    The result may be the array `rates.by_turn`, changed in place.
     """
     state = actuation.state
+    c = rates.c
     omega_in_reference, v_in_reference = state.axes
-    # `rates.by_turn` is nonzero only in orbit. In orbit, omega is in base axes. So if omega is in
-    # reference axes, `rates.by_turn` is zero, and the product below can replace it.
-    theta, c = rates.by_turn, rates.c
+    D_theta = rates.by_turn  # zero without an orbit
     if omega_in_reference:
-        theta = product(rates.by_nu[..., ANGULAR], W)
+        # In orbit, omega is in base axes. So here `rates.by_turn` is zero, and is replaced.
+        D_theta = product(rates.by_nu[..., ANGULAR], W)
     if np.count_nonzero(u):
+        # A wrench that is fixed in reference axes turns relative to the base.
         for columns in actuation.held:
-            theta = theta + product(rates.by_u[..., columns], skew(u[..., columns]))
-    # `turning` and `shifting` are views of the angular and the linear rows of theta. Subtracting
-    # from a view is faster than `theta[rows] -= y`, which also copies the result back into theta.
-    turning, shifting = theta[..., ANGULAR, :], theta[..., LINEAR, :]
+            turned = product(rates.by_u[..., columns], skew(u[..., columns]))
+            D_theta = D_theta + turned
+    # The rows are views: changing them in place changes D_theta. This is faster than
+    # `D_theta[rows] -= y`, which also copies the result back.
+    angular_rows = D_theta[..., ANGULAR, :]
+    linear_rows = D_theta[..., LINEAR, :]
     if omega_in_reference:
-        turning -= skew(c[..., ANGULAR])
+        angular_rows -= skew(c[..., ANGULAR])
     if v_in_reference:
-        shifting -= skew(c[..., LINEAR])
+        linear_rows -= skew(c[..., LINEAR])
     elif state.falls:
-        shifting += skew(rates.gravity)
+        linear_rows += skew(rates.gravity)
     if state.orbit:  # (14.5)
-        turning += W @ skew(chart.R.mT @ state.orbit[0])
-    return theta
+        angular_rows += W @ skew(chart.R.mT @ state.orbit[0])
+    return D_theta
 
 
 def drift(state: StateMap, f0: Array, gravity: Array) -> Array:

@@ -142,8 +142,9 @@ class _Change:
 def tool_trajectory(
     traj: LinearTrajectory, tool: str, dt: float | None
 ) -> ToolTrajectory:
-    """Convert the linear models along a trajectory; see `LinearTrajectory.to`."""
-    change, step = _Change(traj.robot, tool), step_of(tool, dt)
+    """Convert the linear models along a trajectory to a tool; see `LinearTrajectory.to`."""
+    change = _Change(traj.robot, tool)
+    step = step_of(tool, dt)  # 0 for a continuous-time result
     if step and traj.dt:
         raise InputError(
             "the trajectory is sampled; leave out dt, or give the continuous one"
@@ -152,10 +153,8 @@ def tool_trajectory(
     B = change.T @ traj.B @ np.linalg.inv(change.T_u)
     if step:
         rates = np.hstack((traj.v, traj.accelerations()))
-        stepped = [
-            euler_step(*knot, step, tool)[:2] for knot in zip(A, B, rates, strict=True)
-        ]
-        A, B = (np.array(matrices) for matrices in zip(*stepped, strict=True))
+        for k, rate in enumerate(rates):
+            A[k], B[k], _ = euler_step(A[k], B[k], rate, step, tool)
     return ToolTrajectory(
         tool=tool,
         robot=traj.robot.name,

@@ -64,13 +64,15 @@ class Conserved:
         self._data = data = robot.create_data()
         self._M = data.M[:6]  # CRBA writes into this array
         self._M_bb = self._M[:, :6]
+        # Subtracted from q[:7], it makes the position of the base relative to the fixed point.
         self._start = np.concatenate((start, np.zeros(4)))
         self._x, self._y, self._z = start.tolist()  # numbers are faster than arrays
+        # The free-flyer joint of the model may have a placement other than the identity.
         self._root = robot.model.jointPlacements[ROOT]
         self._weight: Array | None = None
         if any(robot.gravity):
             self._weight = robot.mass * np.array(robot.gravity)
-        self._free = self._root.isIdentity(0.0)
+        self._root_is_identity = self._root.isIdentity(0.0)
         _, _, center, kept, _ = self.histories(plan.q[None], plan.v[None])
         self.momentum, self._momentum, self._center = kept[0], kept[0], center[0]
         per_mass = 1.0 / robot.mass
@@ -97,18 +99,18 @@ class Conserved:
         """Return the wrench (6,) about the fixed point in world axes, including the weight.
 
         `push` (6,) is the wrench about the base, in base axes and without the weight. In orbit,
-        return `push` itself.
+        return `push` itself, because the Jacobi integral changes by work instead of impulse.
         """
         if self._field:
             return push
-        base = _placement(q[:7] - self._start)
-        if not self._free:
-            base = self._root * base
-        total: Array = base.toDualActionMatrix().dot(push)
+        placement = _placement(q[:7] - self._start)  # of the base, from the fixed point
+        if not self._root_is_identity:
+            placement = self._root * placement
+        total: Array = placement.toDualActionMatrix().dot(push)
         if self._weight is not None:
-            near = q.copy()
-            near[:7] -= self._start
-            com = pin.centerOfMass(self._model, self._data, near, False)
+            q_near = q.copy()
+            q_near[:7] -= self._start
+            com = pin.centerOfMass(self._model, self._data, q_near, False)
             total[:3] += self._weight
             total[3:] += skew(com).dot(self._weight)
         return total
@@ -141,13 +143,13 @@ class Conserved:
             momentum = momentum.copy()
             momentum[3:] -= self._of_wheels()
         base = _placement(q[:7])
-        if not self._free:
+        if not self._root_is_identity:
             base = self._root * base
         base.translation = self.center(t)
         # The upper right 3 x 3 block of M_bb is -m [c_b]x.
         position = base.act(self._M[(1, 2, 0), (5, 3, 4)] / -self.mass)
         base.translation = position
-        if not self._free:
+        if not self._root_is_identity:
             position = self._root.actInv(position)
         x, y, z = position.tolist()
         q[0], q[1], q[2] = x + self._x, y + self._y, z + self._z

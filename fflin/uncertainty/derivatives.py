@@ -17,7 +17,7 @@ from fflin.base.errors import InputError
 from fflin.base.rotation import skew
 from fflin.base.validation import Array
 from fflin.dynamics.aba import Aba
-from fflin.dynamics.coordinates import LINEAR, PIN_ANGULAR, Chart, Standing
+from fflin.dynamics.coordinates import LINEAR, PIN_ANGULAR, Chart, ReferenceChart
 from fflin.dynamics.integrators import held_derivatives, held_exponential
 from fflin.dynamics.orbital import GravityGradient
 from fflin.dynamics.rnea import AccelerationDerivatives, Accelerations, Inertia
@@ -85,7 +85,7 @@ class ModelDerivatives:
         data = robot.create_data()
         self._state = state
         self._data = robot.create_data()
-        self._chart: Chart = Standing()
+        self._chart: Chart = ReferenceChart()
         if not default_reference:
             self._chart = state.chart(lin.q)
         self._u = actuation.in_base_axes(self._chart, lin.u0)

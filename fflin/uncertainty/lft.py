@@ -351,50 +351,68 @@ class _Form:
     def times(self, at: int, signals: Array) -> Array:
         """Multiply signals by the change of a parameter from its nominal value.
 
+        `at` is the index of the parameter in `ranges`.
+
         The result is (shift + half * delta) * signals, where shift is the middle of the range minus
         the nominal value. The products half * signals become new entries of z. So the products
         delta * half * signals are the new entries of w.
         """
-        (one, middle, half), first = self.ranges[at], _MOST * at + self.used[at]
+        parameter, middle, half = self.ranges[at]
+        first = _MOST * at + self.used[at]
         rows = slice(first, first + len(signals))
         self.used[at] += len(signals)
         self.z[rows] = half * signals
-        return (middle - one.value) * signals + self.unit[self.ends[2] :][rows]
+        w = self.unit[self.ends[2] :]  # the entries of w as signals
+        return (middle - parameter.value) * signals + w[rows]
 
     def add_piece(self, piece: Piece, parts: Mapping[str, int]) -> None:
-        """Replace the nominal inertial force of a link by the force with uncertain parameters."""
-        J = piece.placement.inverse().toActionMatrix() @ self.jacobians[piece.joint]
-        shifts = []
-        for axis, direction in zip(AXES, piece.frame.rotation.T, strict=True):
-            if (at := parts.get(f"com.{axis}")) is not None:
-                cross = -skew(piece.placement.rotation.T @ direction)
-                left, sizes, right = np.linalg.svd(cross)
-                shifts.append((at, left[:, :2] * sizes[:2], right[:2]))
+        """Replace the nominal inertial force of a link by the force with uncertain parameters.
+
+        `parts` contains the indices in `ranges` of the uncertain parameters of the link, such as
+        {"mass": 0, "com.x": 1}. The force is F = X^T T^T f with f = D s and s = T X a, as in the
+        module's docstring.
+        """
+        X = piece.placement.inverse().toActionMatrix() @ self.jacobians[piece.joint]
         D = np.zeros((6, 6))
         D[:3, :3] = piece.mass * np.eye(3)
         D[3:, 3:] = piece.inertia
-        now = J @ self.a
-        s = now.copy()
-        # a centre of mass shifted by d: v' = v + omega x d
-        for at, left, right in shifts:
-            s[:3] += left @ self.times(at, right @ now[3:])
+        shifts = []
+        for axis, direction in zip(AXES, piece.frame.rotation.T, strict=True):
+            parameter = parts.get(f"com.{axis}")
+            if parameter is not None:
+                # A shift of the centre of mass by d along this axis changes the velocity by
+                # omega x d. The matrix of this cross product has rank 2. It is factorised as
+                # L R, with L (3, 2) and R (2, 3), so that d multiplies only two signals.
+                cross = -skew(piece.placement.rotation.T @ direction)
+                left, sizes, right = np.linalg.svd(cross)
+                shifts.append((parameter, left[:, :2] * sizes[:2], right[:2]))
+
+        nominal = X @ self.a
+        s = nominal.copy()
+        for parameter, L, R in shifts:  # s = T X a
+            s[:3] += L @ self.times(parameter, R @ nominal[3:])
+
         f = D @ s
         if "mass" in parts:
             f[:3] += self.times(parts["mass"], s[:3])
         for entry, (i, j) in ENTRIES.items():
-            if f"inertia.{entry}" in parts:
-                rows = [i] if i == j else [i, j]
-                turned = self.times(
-                    parts[f"inertia.{entry}"], s[[3 + row for row in rows]]
-                )
-                for row, signal in zip(reversed(rows), turned, strict=True):
-                    f[3 + row] += signal
+            parameter = parts.get(f"inertia.{entry}")
+            if parameter is None:
+                continue
+            if i == j:
+                f[3 + i] += self.times(parameter, s[[3 + i]])[0]
+            else:
+                # The inertia is symmetric: its entries (i, j) and (j, i) change alike.
+                change_i, change_j = self.times(parameter, s[[3 + i, 3 + j]])
+                f[3 + j] += change_i
+                f[3 + i] += change_j
         if "density" in parts:
             f = f + self.times(parts["density"], f)
-        back = f.copy()
-        for at, left, right in shifts:
-            back[3:] += right.T @ self.times(at, left.T @ f[:3])
-        self.force += J.T @ (back - D @ now)
+
+        shifted_force = f.copy()
+        for parameter, L, R in shifts:  # T^T f
+            shifted_force[3:] += R.T @ self.times(parameter, L.T @ f[:3])
+        self.force += X.T @ (shifted_force - D @ nominal)
 
     def add_alone(self, at: int) -> None:
         """Add the effect of a parameter of a joint, thruster or wheel.

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from itertools import filterfalse
 
 import numpy as np
 import pinocchio as pin
@@ -76,12 +75,15 @@ class Parameters(dict[str, Parameter]):
         """Return the names of the parameters that match a name or pattern.
 
         For a pattern, mass properties of a body of several links are returned only if no other
-        parameter matches.
+        parameter matches. Otherwise a pattern such as "*.mass" would vary the mass of a link twice:
+        as the link, and as a part of the body.
         """
+        # If the key begins with the name of a body of one link, put the name of the link in its
+        # place. If several bodies fit, because names may contain dots, the longest name counts.
         bodies = [body for body in self._link_of if str(key).startswith(f"{body}.")]
         if key not in self and bodies:
             body = max(bodies, key=len)
-            key = self._link_of[body] + key[len(body) :]
+            key = self._link_of[body] + key.removeprefix(body)
         names = [
             name for name in self if key == name or not self._of_several_links(name)
         ]
@@ -98,15 +100,19 @@ class Parameters(dict[str, Parameter]):
         Mass properties of a body of several links are left out if other parameters match.
         """
         names = [
-            n
-            for n, x in self.items()
-            if only in (None, x.of, x.part, x.part.split(".")[0])
+            name
+            for name, parameter in self.items()
+            if only in (None, parameter.of, parameter.part)
+            or only == parameter.part.split(".")[0]
         ]
         names = names or self.find(str(only))
-        return [*filterfalse(self._of_several_links, names)] or names
+        of_single_links = [name for name in names if not self._of_several_links(name)]
+        return of_single_links or names
 
     def _of_several_links(self, name: str) -> bool:
-        return self[name].of in self._sums and self[name].part in OF_PIECES
+        """Return whether a parameter is a mass property of a body that consists of links."""
+        parameter = self[name]
+        return parameter.of in self._sums and parameter.part in OF_PIECES
 
     def refusal(self, values: Mapping[str, float]) -> str:
         """Return why the robot with {parameter: value} is not realisable, or an empty text."""

@@ -76,12 +76,13 @@ def find_chromium() -> str:
 def take_png(page: str, times: Sequence[float]) -> bytes:
     """Return a PNG of a motion's page at one time [s], or a strip with one picture per time."""
     if len(times) == 1:
-        return _film(page, times, _PICTURE, -1)[0]
+        return _screenshots(page, times, _PICTURE)[0]
     from PIL import Image
 
     width, height = _STRIP
     strip = Image.new("RGB", (width * len(times), height))
-    for index, frame in enumerate(_film(page, times, _STRIP, 1)):
+    frames = _screenshots(page, times, _STRIP, legends=1)
+    for index, frame in enumerate(frames):
         strip.paste(Image.open(io.BytesIO(frame)), (index * width, 0))
     content = io.BytesIO()
     strip.save(content, "PNG", optimize=True)
@@ -92,10 +93,12 @@ def take_gif(page: str, start: float, end: float, speed: float) -> bytes:
     """Return a GIF of a motion's page over a time span [s]; long spans are shown faster."""
     from PIL import Image
 
-    count = round(max(2, min(_GIF_FRAMES, (end - start) / speed * _GIF_FPS)))
+    wanted = (end - start) / speed * _GIF_FPS
+    count = round(max(2, min(_GIF_FRAMES, wanted)))
     times = [start + (end - start) * index / (count - 1) for index in range(count)]
-    frames = _film(page, times, _GIF, count)
+    frames = _screenshots(page, times, _GIF, legends=count)
     images = [Image.open(io.BytesIO(frame)).convert("RGB") for frame in frames]
+    # With one palette for all frames and without dithering, the background does not flicker.
     palette = images[0].quantize(160)
     images = [
         image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images
@@ -112,13 +115,16 @@ def take_gif(page: str, start: float, end: float, speed: float) -> bytes:
     return content.getvalue()
 
 
-def _film(
-    page: str, times: Sequence[float], size: tuple[int, int], keys: int
+def _screenshots(
+    page: str,
+    times: Sequence[float],
+    size: tuple[int, int],
+    legends: int | None = None,
 ) -> list[bytes]:
-    """Return a PNG of the page at each time.
+    """Return a PNG of the page at each time [s] of the motion.
 
-    If `keys` is negative, every picture shows the whole page. Otherwise, every picture shows only
-    the scene, and the first `keys` pictures also show a legend.
+    By default, every picture shows the whole page. If `legends` is given, every picture shows only
+    the scene, and the first `legends` pictures also show the legend.
     """
     program = find_chromium()
     try:
@@ -140,8 +146,9 @@ def _film(
                 time.sleep(0.05)
             shots = []
             for index, moment in enumerate(times):
-                if keys >= 0:
-                    browser.evaluate(f"fflin.plain(true, {json.dumps(index < keys)})")
+                if legends is not None:
+                    with_legend = json.dumps(index < legends)
+                    browser.evaluate(f"fflin.plain(true, {with_legend})")
                 # Wait for two animation frames: the first draws the scene, and the second starts
                 # after the drawing is displayed.
                 browser.evaluate(

@@ -466,38 +466,40 @@ def _references(kind: str, content: bytes) -> list[str]:
 
 def _require_no_cycle(content: bytes) -> None:
     """Raise ValueError if a node of a COLLADA file contains itself, directly or through others."""
-    contained: dict[str, list[str]] = {}
-    around: list[str] = []
+    # {node: nodes in it}; the document is the node "".
+    children: dict[str, list[str]] = {}
+    # Nodes around the parser's position, outermost first.
+    open_nodes: list[str] = []
 
     def begin(tag: str, attributes: dict[str, str]) -> None:
-        name = tag.rpartition(":")[2]
-        inside = around[-1] if around else ""
+        name = tag.rpartition(":")[2]  # without the XML namespace
+        parent = open_nodes[-1] if open_nodes else ""
         if name == "node":
-            node = attributes.get("id") or f" {len(contained)}"
-            contained.setdefault(inside, []).append(node)
-            contained.setdefault(node, [])
-            around.append(node)
+            # A node without an id gets a unique one. An id in XML cannot begin with a space.
+            node = attributes.get("id") or f" {len(children)}"
+            children.setdefault(parent, []).append(node)
+            children.setdefault(node, [])
+            open_nodes.append(node)
         elif name == "instance_node":
-            contained.setdefault(inside, []).append(
-                attributes.get("url", "").removeprefix("#")
-            )
+            node = attributes.get("url", "").removeprefix("#")
+            children.setdefault(parent, []).append(node)
 
     def end(tag: str) -> None:
         if tag.rpartition(":")[2] == "node":
-            around.pop()
+            open_nodes.pop()
 
     parser = ParserCreate()
     parser.StartElementHandler = begin
     parser.EndElementHandler = end
     parser.Parse(content, True)
     try:
-        order = list(TopologicalSorter(contained).static_order())
+        order = list(TopologicalSorter(children).static_order())
     except CycleError:
         raise ValueError("a node contains itself") from None
     # Nodes are drawn as often as they are contained, so their number can double at every level.
     drawn = dict.fromkeys(order, 1)
     for name in order:
-        drawn[name] += sum(drawn[child] for child in contained.get(name, ()))
+        drawn[name] += sum(drawn[child] for child in children.get(name, ()))
         if drawn[name] > _MOST_NODES:
             raise ValueError(f"more than {_MOST_NODES:,} nodes")
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fflin.base.rotation import rotation_matrix, skew
-from fflin.dynamics.coordinates import Chart, Standing
+from fflin.dynamics.coordinates import Chart, ReferenceChart
 
 SHAPES = [(), (4,)]
 
@@ -18,21 +18,21 @@ def tilted(q_b):
 def test_a_base_at_the_reference_has_the_values_of_every_expression(shape):
     rng = np.random.default_rng(0)
     general = Chart(np.zeros((*shape, 3)), np.ones((*shape, 1)), np.eye(3))
-    standing = Standing(*shape)
+    special = ReferenceChart(*shape)
     w, slopes = rng.normal(size=(*shape, 3)), rng.normal(size=(*shape, 8, 3))
     rows = rng.normal(size=(*shape, 8, 5))
     parts = (slice(0, 3), slice(3, 6))
     for one, other in (
-        (standing.q_b, general.q_b),
-        (standing.rate(w), general.rate(w)),
-        (standing.rate_over_q_b(w, skew(w)), general.rate_over_q_b(w, skew(w))),
-        (standing.over_q_b(slopes), general.over_q_b(slopes)),
-        (standing.to_reference(parts, rows), general.to_reference(parts, rows)),
-        (standing.to_base(parts, rows), general.to_base(parts, rows)),
+        (special.q_b, general.q_b),
+        (special.rate(w), general.rate(w)),
+        (special.rate_over_q_b(w, skew(w)), general.rate_over_q_b(w, skew(w))),
+        (special.over_q_b(slopes), general.over_q_b(slopes)),
+        (special.to_reference(parts, rows), general.to_reference(parts, rows)),
+        (special.to_base(parts, rows), general.to_base(parts, rows)),
     ):
         assert one.shape == other.shape and (one == other).all()
     for name in ("N", "J", "R"):
-        matrices = getattr(general, name), getattr(standing, name)
+        matrices = getattr(general, name), getattr(special, name)
         assert (matrices[0] - matrices[1] == 0.0).all()
 
 

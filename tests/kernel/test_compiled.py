@@ -221,11 +221,11 @@ def test_code_that_cannot_be_stored_is_compiled_and_told_once(
     compiled, caplog, signatures
 ):
     compiled.stats.cache_path = None
-    kernel_code._said_unstored.clear()
+    kernel_code._warned_unstored.clear()
     result = kernel_code.kernel("derivatives", "derive")
     result.compile("double")
     result.compile("long")
-    kernel_code._said_unstored.clear()
+    kernel_code._warned_unstored.clear()
     assert signatures == ["double", "long"]
     (record,) = caplog.records
     assert "NUMBA_CACHE_DIR" in record.message

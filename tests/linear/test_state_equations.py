@@ -8,7 +8,7 @@ import pytest
 
 import fflin
 from fflin.base.rotation import skew
-from fflin.dynamics.coordinates import Standing
+from fflin.dynamics.coordinates import ReferenceChart
 from fflin.dynamics.rnea import AccelerationDerivatives, Accelerations
 from fflin.dynamics.state import Actuation
 from fflin.linear.state_equations import assemble
@@ -36,13 +36,13 @@ def rows_of(robot, frame, default):
     if robot.orbit:
         q[:, :3] *= 0.1
     nv, nu = state.nx // 2, state.velocities(v)
-    chart = Standing(COUNT) if default else state.charts(q)
+    chart = ReferenceChart(COUNT) if default else state.charts(q)
     u = actuation.in_base_axes(chart, u)
     rates = [
         source.rates(*point, np.empty((nv, 2 * nv)), np.empty((nv, u.shape[1])))
         for point in zip(q, v, nu, u, strict=True)
     ]
-    charts = [Standing() if default else state.chart(row) for row in q]
+    charts = [ReferenceChart() if default else state.chart(row) for row in q]
     return (
         state,
         actuation,

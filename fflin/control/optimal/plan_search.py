@@ -98,14 +98,14 @@ class Models(NamedTuple):
     # interval, part and state of the other rows
     within: tuple[Indices, Indices, Indices]
 
-    def room(self, trial: Trial) -> Array:
-        """Return the lower and upper limits (2, m) of the rows about a trial."""
-        knot, limit = self.at_knots
-        k, part, state = self.within
-        room: Array = np.hstack(
-            (trial.knots[:, knot, limit], trial.inside[:, k, part, state])
-        )
-        return room
+    def distances(self, trial: Trial) -> Array:
+        """Return how far the limited states may move down and up (2, m), in the order of `rows`."""
+        knot, state = self.at_knots
+        at_knots = trial.knots[:, knot, state]
+        interval, part, state = self.within
+        inside = trial.inside[:, interval, part, state]
+        distances: Array = np.hstack((at_knots, inside))
+        return distances
 
 
 class Step(NamedTuple):
@@ -313,7 +313,7 @@ class Search(NamedTuple):
                 break
             gap = end.gap
             missed = missed + end.missed
-            room = models.room(end) + step.moved
+            room = models.distances(end) + step.moved
             again = self._step(trial, models, near, effort, missed, room)
             if again is None:
                 break
@@ -363,18 +363,21 @@ class Search(NamedTuple):
             return None
         # Soft limits apply to states at knots and to states within intervals. The latter depend on
         # x[k], u[k] and u[k + 1].
-        (knots, nu), nx = trial.u.shape, self.shooting.state.nx
-        nw = nx + nu
-        knot, limit = np.nonzero(np.isfinite(trial.knots).any(axis=0))
-        at_knots = sp.eye_array(knots * nw, format="csr")[knot * nw + limit]
-        k, part, state = np.nonzero(limited)
+        knots, nu = trial.u.shape
+        nx = self.shooting.state.nx
+        nw = nx + nu  # variables (x, u) of a knot
+        knot, state = np.nonzero(np.isfinite(trial.knots).any(axis=0))
+        at_knots = sp.eye_array(knots * nw, format="csr")[knot * nw + state]
+        k, part, inner_state = np.nonzero(limited)
+        # A row of the compressed sparse matrix has nx + 2 nu entries.
+        entries = inside[k, part, inner_state]
         columns = k[:, None] * nw + np.r_[:nw, nw + nx : 2 * nw]
-        starts = np.arange(len(k) + 1) * columns.shape[1]
-        entries = inside[k, part, state].ravel(), columns.ravel(), starts
-        rows = sp.vstack(
-            (at_knots, sp.csr_array(entries, (len(k), knots * nw))), format="csr"
+        starts = np.arange(len(k) + 1) * (nx + 2 * nu)
+        within = sp.csr_array(
+            (entries.ravel(), columns.ravel(), starts), (len(k), knots * nw)
         )
-        return Models(ends, rows, (knot, limit), (k, part, state))
+        rows = sp.vstack((at_knots, within), format="csr")
+        return Models(ends, rows, (knot, state), (k, part, inner_state))
 
     def _step(
         self,
@@ -395,7 +398,7 @@ class Search(NamedTuple):
         ends = models.ends
         rows = models.rows
         missed = trial.missed if missed is None else missed
-        room = models.room(trial) if room is None else room
+        room = models.distances(trial) if room is None else room
         prices, of_x = np.full(room.shape[1], self.price), np.zeros((len(u), nx))
         cost, g = np.hstack((of_x + near, self.cost)), np.hstack((of_x, effort))
         scale = np.concatenate((np.ones(nx), self.cost.sum(axis=0) ** -0.5))

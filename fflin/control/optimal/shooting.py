@@ -1,6 +1,6 @@
 """Multiple shooting: initial guess, motions of the intervals, gaps between them, Jacobians."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from functools import partial
 
 import numpy as np
@@ -75,10 +75,11 @@ class Shooting:
 
     def moved(self, q: Array, v: Array, z: Array) -> Point:
         """Return the knots q, v after steps z (N + 1, nx), one for each knot."""
-        model, (difference, rates) = self.state.robot.model, np.split(z, 2, axis=1)
-        return integrate_rows(
-            model, q, self.state.spread(difference)
-        ), v + self.state.spread(rates)
+        difference, rates = np.split(z, 2, axis=1)
+        moved_q = integrate_rows(
+            self.state.robot.model, q, self.state.spread(difference)
+        )
+        return moved_q, v + self.state.spread(rates)
 
     def motions(self, q: Array, v: Array, u: Array, steps: int = 0) -> Motions:
         """Integrate each interval from its first knot; q, v and the inputs u have N + 1 rows each.
@@ -164,38 +165,47 @@ class Shooting:
         at the next knot. The second array (N, parts - 1, nx, nx + 2 nu) contains the Jacobians of
         the points that divide each interval into equal parts.
         """
-        # Integrate dZ/dt = A Z + `driven` along the motions by Runge-Kutta steps. Z contains the
-        # Jacobians of all intervals, and `driven` contains B for the inputs at both knots. The
-        # stages of these steps are at the beginning, the middle and the end of the step, where the
-        # linear models are computed.
+        # Integrate dZ/dt = A Z + G along the motions by Runge-Kutta steps. Z contains the Jacobians
+        # of all intervals, and G = [0, (1 - s) B, s B], because the input is (1 - s) times the
+        # input at the first knot plus s times the input at the next knot. A and B are computed at
+        # the stages of these steps: the beginning, the middle and the end of each step.
         N = len(self.h)
         nx = len(self._size)
         nu = u.shape[1]
         steps = min(self.steps // 4, _MOST_OF_JACOBIANS)
-        motions = self.motions(q, v, u, 4 * steps)
-        late = np.arange(2 * steps + 1) / (2.0 * steps)
+        stages = 2 * steps + 1  # of an interval; neighbouring steps share a stage
+        s = np.arange(stages) / (2.0 * steps)
         if self.held:
-            late = np.zeros_like(late)
-        q, v = (motion[:, ::2] for motion in motions)
-        inputs = u[:-1, None] + late[:, None] * np.diff(u, axis=0)[:, None]
+            s = np.zeros(stages)  # the input of the first knot is held
+        q, v = self.motions(q, v, u, 4 * steps)
+        q = q[:, ::2]
+        v = v[:, ::2]
+        inputs = u[:-1, None] + s[:, None] * np.diff(u, axis=0)[:, None]
         points = (rows.reshape(-1, rows.shape[-1]) for rows in (q, v, inputs))
         models = self._linearizer.along(*points)
-        A, B = (models[name].reshape(N, len(late), nx, -1) for name in "AB")
-        late = late[:, None, None]
+        A = models["A"].reshape(N, stages, nx, nx)
+        B = models["B"].reshape(N, stages, nx, nu)
         A = self._size[:, None] * A / self._size
-        driven = np.concatenate((np.zeros_like(A), (1.0 - late) * B, late * B), axis=3)
+        s = s[:, None, None]
+        G = np.concatenate((np.zeros_like(A), (1.0 - s) * B, s * B), axis=3)
+
         h = self.h[0] / steps
         Z: Array = np.tile(np.eye(nx, nx + 2 * nu), (N, 1, 1))
-        fractions = np.arange(1, parts) / parts * steps
+        # Points within the interval, in steps from its beginning. The Jacobians at these points are
+        # interpolated by a cubic polynomial over each step.
+        inner_points = np.arange(1, parts) / parts * steps
         inside = list[Array]()
         for step in range(steps):
-            F = [(A[:, k], driven[:, k]) for k in range(2 * step, 2 * step + 3)]
+            first = 2 * step
+            last = first + 2
+            rate = partial(_rate, A[:, first : last + 1], G[:, first : last + 1])
             before = Z
-            Z = CommutatorFree4.vector_step(partial(_rate, F), h, Z)
-            begin, end = (h * (f[0] @ z + f[1]) for f, z in ((F[0], before), (F[2], Z)))
-            coefficients = cubic(before, Z, begin, end)
-            within = (fractions >= step) & (fractions < step + 1)
-            powers = (fractions[within] - step)[:, None] ** np.arange(4)
+            Z = CommutatorFree4.vector_step(rate, h, Z)
+            begin_rate = h * (A[:, first] @ before + G[:, first])
+            end_rate = h * (A[:, last] @ Z + G[:, last])
+            coefficients = cubic(before, Z, begin_rate, end_rate)
+            in_step = (inner_points >= step) & (inner_points < step + 1)
+            powers = (inner_points[in_step] - step)[:, None] ** np.arange(4)
             inside.append(np.einsum("ij,kjlm->kilm", powers, coefficients))
         return Z, np.concatenate(inside, axis=1)
 
@@ -207,8 +217,10 @@ class Shooting:
         rates = np.array((T * start[1], T * end[1]))
         turned = rotation_matrices(np.array((start[0][3:7], end[0][3:7])))
         rates[:, PIN_LINEAR] = (turned @ rates[:, PIN_LINEAR, None])[..., 0]
-        difference, mean = pin.difference(model, start[0], end[0]), rates.mean(axis=0)
+        mean = rates.mean(axis=0)
+        difference = pin.difference(model, start[0], end[0])
         difference[PIN_LINEAR] = end[0][:3] - start[0][:3]
+        # Add full turns, so that the rotation fits the mean angular velocity.
         turn = pin.log3(turned[0].T @ turned[1])
         axis = turn if turn.any() else mean[PIN_ANGULAR]
         axis = axis / (np.linalg.norm(axis) or 1.0)
@@ -220,10 +232,12 @@ class Shooting:
         rates[1, PIN_ANGULAR] = np.linalg.lstsq(
             jacobian, rates[1, PIN_ANGULAR], rcond=1e-6
         )[0]
-        late = 3 * difference - 2 * rates[0] - rates[1]
-        bend = rates.sum(axis=0) - 2 * difference
-        displacements = s * (rates[0] + s * (late + s * bend))
-        v = (rates[0] + s * (2 * late + 3 * s * bend)) / T
+        # The displacement from the start is the cubic polynomial c1 s + c2 s^2 + c3 s^3.
+        c1 = rates[0]
+        c2 = 3 * difference - 2 * rates[0] - rates[1]
+        c3 = rates.sum(axis=0) - 2 * difference
+        displacements = s * (c1 + s * (c2 + s * c3))
+        v = (c1 + s * (2 * c2 + 3 * s * c3)) / T
         q = np.array([pin.integrate(model, start[0], step) for step in displacements])
         q[:, :3] = start[0][:3] + displacements[:, PIN_LINEAR]
         for turn, rate in zip(
@@ -248,10 +262,11 @@ class Shooting:
         return inputs
 
 
-def _rate(F: Sequence[tuple[Array, Array]], node: float, Z: Array) -> Array:
-    """Return A Z + `driven` at the fraction `node` of a step.
+def _rate(A: Array, G: Array, node: float, Z: Array) -> Array:
+    """Return A Z + G at the fraction `node` of a step: 0, 1/2 or 1.
 
-    F contains A and `driven` at the beginning, the middle and the end of the step.
+    The second axis of A and G is the beginning, the middle and the end of the step.
     """
-    A, driven = F[round(2.0 * node)]
-    return A @ Z + driven
+    stage = round(2.0 * node)
+    rate: Array = A[:, stage] @ Z + G[:, stage]
+    return rate
