@@ -7,6 +7,7 @@ notebook. `fflin.base.svg` draws the pictures on cards.
 from __future__ import annotations
 
 import os
+import re
 import sys
 from collections.abc import Sequence
 from functools import lru_cache
@@ -54,12 +55,22 @@ def escape(text: str) -> str:
     return text.translate(_ENTITIES)
 
 
+# A number with an exponent, such as 2e-08 or residual=1.4e-13. Browsers break lines at its hyphen.
+_EXPONENT = re.compile(r"[\w=.]*\de-\d+")
+
+
+def _running_text(text: str) -> str:
+    """Return text as HTML for a block with line breaks, which do not split numbers."""
+    return _EXPONENT.sub(r'<span class="whole">\g<0></span>', escape(text))
+
+
 def card(title: str, about: str, *parts: str) -> str:
     """Return a card with a title, a short description, and parts in HTML; empty parts are omitted.
 
     The title and the description are text, which is escaped.
     """
-    head = f'<div class="head">{escape(title)} <span>{escape(about)}</span></div>'
+    shown = _running_text(about)
+    head = f'<div class="head">{escape(title)} <span>{shown}</span></div>'
     content = "\n".join(filter(None, (head, *parts)))
     return f'<div class="fflin"><style>{_style()}</style>\n{content}\n</div>'
 
@@ -92,7 +103,7 @@ def paragraph(text: str, kind: str = "") -> str:
     if not text:
         return ""
     style = f' class="{kind}"' if kind else ""
-    return f"<p{style}>{escape(text)}</p>"
+    return f"<p{style}>{_running_text(text)}</p>"
 
 
 def verdict(text: str, is_good: bool | None) -> str:

@@ -26,7 +26,7 @@ import zlib
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
-from dataclasses import Field, dataclass, field, fields
+from dataclasses import MISSING, Field, dataclass, field, fields
 from errno import ENOMEM
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -419,7 +419,10 @@ class Design(Result):
 
     @classmethod
     def _read(cls: type[Kind], path: str | Path, **given: object) -> Kind:
-        """Read a file as `load` does; `given` contains the fields that files do not store."""
+        """Read a file as `load` does; `given` contains the fields that files do not store.
+
+        Files of earlier versions may lack fields that have a default.
+        """
         source = writing.as_path(path)
         name = cls.__name__
         with reading(source, name):
@@ -427,7 +430,9 @@ class Design(Result):
             if text(record["kind"]) != name:
                 raise ValueError(f"the file contains: {text(record['kind'])}")
             values = {
-                item.name: _value(item, record[item.name]) for item in _saved(cls)
+                item.name: _value(item, record[item.name])
+                for item in _saved(cls)
+                if item.name in record or item.default is MISSING
             }
             require_possible(values, getattr(cls, "_SHAPES", ""))
             return cls(**given, **values, verified=verified)

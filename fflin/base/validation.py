@@ -159,13 +159,16 @@ def function(name: str, value: Callable[..., object], arguments: str) -> None:
 def looks_like_degrees(value: float, least: float, largest: float) -> bool:
     """Return whether an angle [rad] or rate [rad/s] of a joint looks like degrees.
 
-    This is so if the value is finite, its magnitude exceeds `ONE_ROTATION`, and it is beyond the
-    limits `least` and `largest` of the joint. A missing limit of an angle is one rotation. A rate
-    without a limit never looks like degrees; its limits are infinite.
+    This is so if its magnitude in radians exceeds `ONE_ROTATION`, it is beyond the limits `least`
+    and `largest` of the joint, and in degrees it is neither. So a weight or a limit of 1000 rad,
+    which stands for "any value", does not look like degrees. A missing limit of an angle is one
+    rotation. A rate without a limit never looks like degrees; its limits are infinite.
     """
-    if not ONE_ROTATION < abs(value) < math.inf:
-        return False
-    return not least <= value <= largest
+
+    def plausible(angle: float) -> bool:
+        return abs(angle) <= ONE_ROTATION or least <= angle <= largest
+
+    return not plausible(value) and plausible(math.radians(value))
 
 
 def truth(name: str, value: object) -> bool:

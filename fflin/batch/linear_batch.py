@@ -76,6 +76,8 @@ class LinearBatch(ModelHeader):
     verified : bool
         Whether the data are known to be unchanged. The value is False for a file without a
         checksum, or if the checksum was not verified.
+    notes : tuple of str
+        Why the models were computed in Python although no engine was given.
 
     Examples
     --------
@@ -109,6 +111,7 @@ class LinearBatch(ModelHeader):
     # that compute a field from the robot when the field is read.
     _asked: Mapping[str, object]
     verified: bool = True
+    notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.q)
@@ -368,6 +371,7 @@ class LinearBatch(ModelHeader):
         first = self[0]
         header = {key: getattr(self, key) for key in TEXTS}
         header |= {"_ignorable": first.ignorable, "mean_motion": first.mean_motion}
+        header["notes"] = self.notes
         wheels = (
             first._robot.flown_wheels if first._robot else self._asked.get("_wheels")
         )
@@ -462,6 +466,8 @@ def _checked_fields(
     values["columns"] = tuple(
         (int(a), int(b), float(scale)) for a, b, scale in header["columns"]
     )
+    # Files of earlier versions do not contain notes.
+    values["notes"] = tuple(map(str, header.get("notes", ())))
     nx, nu, ny = (len(values[f"{kind}_names"]) for kind in ("state", "input", "output"))
     shapes = {
         "A": (nx, nx),

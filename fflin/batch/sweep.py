@@ -194,13 +194,18 @@ def sweep(
 
 def kernel_of(prepared: Prepared, engine: str | None) -> RowAccelerations | None:
     """Return the compiled kernel for accelerations and derivatives, or None if Python is used."""
-    task = Task(robots=(prepared.robot,), outputs=prepared.sensing is not None)
     tree = batch_tree(prepared.robot)
-    if not compiles(engine, lambda: reason_against(task)) or tree is None:
+    if not compiles(engine, lambda: _reason(prepared)) or tree is None:
         return None
     from fflin.kernel.derivatives import RowAccelerations
 
     return RowAccelerations(prepared.map, prepared.actuation, tree)
+
+
+def _reason(prepared: Prepared) -> str:
+    """Return why the compiled kernel cannot be used, or an empty text if it can."""
+    task = Task(robots=(prepared.robot,), outputs=prepared.sensing is not None)
+    return reason_against(task)
 
 
 class ChunkJob:
@@ -219,6 +224,9 @@ class ChunkJob:
         prepared = linearizer.prepared
         self._kernel = kernel_of(prepared, engine)
         self.threaded = self._kernel is not None
+        self.notes: tuple[str, ...] = ()
+        if engine is None and not self.threaded:
+            self.notes = (f"linearised in Python, because {_reason(prepared)}",)
         # A and f0 are the same at all points if the robot is at rest, no forces such as springs or
         # gravity act on it (`free`), and each point is its own reference. Only B is then computed.
         self.only_inertia = at_rest and prepared.own_reference and prepared.free
@@ -414,7 +422,9 @@ class SweepTask:
         for joint in self.robot.joints:
             second = joint.idx_q + 1 if joint.unbounded else -1
             columns.append((joint.idx_q, second, joint.scale))
-        return LinearBatch(**rows, columns=tuple(columns), _asked=common)
+        return LinearBatch(
+            **rows, columns=tuple(columns), _asked=common, notes=self.job.notes
+        )
 
     def header(self) -> dict[str, str]:
         """Return the header of a file of the batch."""

@@ -26,6 +26,7 @@ from fflin.campaign.runs import (
     Judge,
     completed,
     kind_named,
+    notes_on_engine,
     of_campaign,
 )
 from fflin.control.tracking import TrajectoryFeedback, prepared
@@ -105,6 +106,8 @@ class Funnel(Design):
         Confidence level of the intervals.
     at, P : ndarray (M,), (M, nx, nx)
         Times [s] and cost to go of the schedule.
+    notes : tuple of str
+        Why the runs were simulated in Python although no engine was given.
     knots, q, v, u, hold, frame
         The followed trajectory, see `trajectory`.
 
@@ -134,6 +137,7 @@ class Funnel(Design):
     u: Array
     hold: str
     frame: str
+    notes: tuple[str, ...] = ()
 
     @cached_property
     def _counts(self) -> list[tuple[int, float, tuple[float, float]]]:
@@ -291,7 +295,8 @@ class Funnel(Design):
             rows.append(
                 [f"{self.t[k]:.4g}", f"{self.rho[k]:.3g}", *reach, many, *shares]
             )
-        return "\n".join([folded([head]), "", grid(rows, "r"), "", folded(tail)])
+        lines = [folded([head, *self.notes]), "", grid(rows, "r"), "", folded(tail)]
+        return "\n".join(lines)
 
     @classmethod
     def load(cls, path: str | Path, robot: Robot) -> Funnel:  # type: ignore[override]
@@ -433,6 +438,7 @@ def funnel(
         at=gains.t - gains.t[0] + motion.t[0],
         P=gains.P,
         knots=motion.t,
+        notes=notes_on_engine(jobs[0], engine),
     )
 
 

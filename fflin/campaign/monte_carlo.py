@@ -21,11 +21,10 @@ from fflin.batch import files
 from fflin.batch.run import Execution, Progress, run_chunks
 from fflin.campaign.campaign import NOT_RUN, Campaign
 from fflin.campaign.replay import replay_settings
-from fflin.campaign.runs import KINDS, CampaignJob, chunk_size, expect
+from fflin.campaign.runs import KINDS, CampaignJob, chunk_size, expect, notes_on_engine
 from fflin.campaign.spreads import placed
 from fflin.kernel.tree import LANES
 from fflin.robot.robot import Robot
-from fflin.simulation.lanes import not_compilable
 from fflin.simulation.plan import SimulationOptions
 from fflin.simulation.report import pushed
 
@@ -257,9 +256,8 @@ def monte_carlo(
             enough = partial(_is_narrow, header, until, width, confidence)
         resumed = _computed(job, store, how, header, enough)
         campaign = Campaign.of(store.complete(), header, job)
-    if engine is None and job.engine == "python":
-        note = f"simulated in Python, because {not_compilable(job.plan)}"
-        campaign = replace(campaign, notes=(*campaign.notes, note))
+    notes = (*campaign.notes, *notes_on_engine(job, engine))
+    campaign = replace(campaign, notes=notes)
     if resumed:
         note = f"{resumed:,} of {runs:,} runs are from the unfinished file of an earlier call"
         campaign = replace(campaign, notes=(*campaign.notes, note))

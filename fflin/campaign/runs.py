@@ -512,6 +512,13 @@ def chunk_size(count: int, workers: int, least: int = LANES) -> int:
     return size
 
 
+def notes_on_engine(job: CampaignJob, engine: str | None) -> tuple[str, ...]:
+    """Return why the runs of a job are simulated in Python although `engine` is None."""
+    if engine is not None or job.engine != "python":
+        return ()
+    return (f"simulated in Python, because {lanes.not_compilable(job.plan)}",)
+
+
 def completed(
     job: CampaignJob, drawn: Array, how: Execution, progress: Progress | None = None
 ) -> dict[str, Array]:

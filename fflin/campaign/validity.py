@@ -22,7 +22,7 @@ from fflin.base.validation import (
     whole,
 )
 from fflin.batch.run import Execution, Progress
-from fflin.campaign.runs import expect
+from fflin.campaign.runs import expect, notes_on_engine
 from fflin.campaign.settling import OUTCOMES, PATIENCE, Loop, settle
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
@@ -85,6 +85,8 @@ class Validity(html.Reported, FrozenArrays):
         "rad" or "m" if all joints have this unit, otherwise "rad|m".
     frame : str
         Frame whose axes express the base velocities and inputs in the feedback.
+    notes : tuple of str
+        Why the runs were simulated in Python although no engine was given.
 
     Examples
     --------
@@ -110,6 +112,7 @@ class Validity(html.Reported, FrozenArrays):
     joint_unit: str
     robot: str
     frame: str
+    notes: tuple[str, ...] = ()
 
     @property
     def settled(self) -> int:
@@ -153,7 +156,7 @@ class Validity(html.Reported, FrozenArrays):
         )
         if failures:
             overall += f"; {failures}"
-        return folded([prediction, safe, overall])
+        return folded([prediction, safe, overall, *self.notes])
 
 
 _ENDS = {
@@ -276,13 +279,14 @@ def validity(
         for predicts in (True, False)
     )
     total = len(first) + samples
+    example = predicting()
     with how:
         # A random run usually settles, and ends, after about 1 / PATIENCE of its largest duration.
         # So all random runs take about as long as `few` runs of the largest duration.
         few = math.ceil(samples / PATIENCE)
         expect(
             how.progress,
-            [(predicting(), first, len(first)), (settling(), second, few)],
+            [(example, first, len(first)), (settling(), second, few)],
             how,
         )
         part_progress = how.progress and partial(_report, how.progress, 0, total)
@@ -312,6 +316,7 @@ def validity(
         joint_unit=joint_unit(loop.lin),
         robot=loop.lin.robot,
         frame=loop.lin.frame,
+        notes=notes_on_engine(example, engine),
     )
 
 

@@ -218,6 +218,12 @@ def reference_of(arguments: Namespace) -> pin.SE3 | None:
 
 def linear_model(arguments: Namespace) -> tuple[fflin.Robot, fflin.LinearModel]:
     """Return the robot, and its linear model about the operating point in the arguments."""
+    if not (arguments.equilibrium or arguments.relative_equilibrium):
+        refuse(
+            arguments,
+            ("tilt",),
+            "without --equilibrium, the base is not tilted",
+        )
     robot = load_robot(arguments)
     return robot, model_about(robot, arguments, *point_of(robot, arguments))
 
@@ -250,14 +256,24 @@ def model_about(
             ("effort",),
             f"{option} already sets the inputs at the operating point",
         )
-        held = fflin.equilibrium(robot, q, v=v, tilt=may_tilt(arguments), **axes)
+        tilt = may_tilt(robot, arguments)
+        held = fflin.equilibrium(robot, q, v=v, tilt=tilt, **axes)
         q, u = held.q, held.u
         warn_beyond_limits(robot, u)
     return fflin.linearize(robot, q, v, u, **axes)
 
 
-def may_tilt(arguments: Namespace) -> bool:
-    """Return whether an equilibrium under gravity may tilt the base."""
+def may_tilt(robot: fflin.Robot, arguments: Namespace) -> bool:
+    """Return whether an equilibrium under gravity may tilt the base.
+
+    Raise an error if --tilt or --no-tilt is given for a robot without gravity.
+    """
+    if not any(robot.gravity):
+        refuse(
+            arguments,
+            ("tilt",),
+            f"'{robot.name}' has no gravity (--gravity), so an equilibrium does not tilt the base",
+        )
     return arguments.tilt is not False
 
 
@@ -277,7 +293,7 @@ def model_to_regulate(
 
     point = model_about(robot, arguments, q, v, reference)
     hold = held_if_possible
-    if not may_tilt(arguments):
+    if not may_tilt(robot, arguments):
         hold = partial(held, tilt=False)
     lin = hold(point)
     if arguments.reduce:
@@ -413,7 +429,7 @@ def loop_of(
     )
     if arguments.free:
         of_law = ("limit", "delay", "reduce", "allocate", "gain", "controller", "mpc")
-        names = (*_WEIGHTS, *_POSE, *_TARGETS[:2], *of_law)
+        names = (*_WEIGHTS, *_POSE, *_TARGETS[:2], "tilt", *of_law)
         refuse(
             arguments,
             names,

@@ -336,9 +336,11 @@ def sweep(arguments: Namespace) -> Report:
         }
         batch = fflin.sweep(robot, q, v, u, **settings, **work, out=path)
     states, inputs = len(batch.state_names), len(batch.input_names)
-    text = f"{robot.name}: {len(batch):,} points, {states} states, {inputs} inputs"
+    counts = f"{len(batch):,} points, {states} states, {inputs} inputs"
+    text = folded([f"{robot.name}: {counts}", *batch.notes])
     names = ("state_names", "state_units", "input_names", "input_units", "frame")
     result = {"points": len(batch), **{name: getattr(batch, name) for name in names}}
+    result["notes"] = batch.notes
     return Report(robot.name, result, text, {path: None})
 
 

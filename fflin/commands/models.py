@@ -390,7 +390,7 @@ def equilibrium(arguments: Namespace) -> Report:
     robot = load_robot(arguments)
     q, v, reference = point_of(robot, arguments)
     axes = {"frame": arguments.frame, "reference": reference}
-    held = fflin.equilibrium(robot, q, v=v, tilt=may_tilt(arguments), **axes)
+    held = fflin.equilibrium(robot, q, v=v, tilt=may_tilt(robot, arguments), **axes)
     lin = fflin.linearize(robot, held.q, v, held.u, **axes)
     lin_modes = fflin.modes(lin)
     poles = lin_modes.poles

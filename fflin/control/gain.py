@@ -424,11 +424,11 @@ def summary_of_poles(design: HasPoles) -> str:
     count = f"{len(rates)} poles"
     neutral = rates[~moving]
     if len(neutral):
-        decay = -neutral.real.min()
-        ratio = decay / _smallest_decay(rates, design.dt)
+        decay = max(-neutral.real.min(), 0.0)
+        rounding = _smallest_decay(rates, design.dt)
         count += (
-            f", {len(neutral)} of them neutral (decay {max(decay, 0.0):.2g} 1/s, only "
-            f"{max(ratio, 0.0):.1g} times the smallest decay that exceeds rounding errors)"
+            f", {len(neutral)} of them neutral (decay {decay:.2g} 1/s, within the rounding "
+            f"error of {rounding:.2g} 1/s)"
         )
     if not moving.any():
         return count

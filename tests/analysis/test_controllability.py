@@ -1,12 +1,14 @@
 """Controllability against closed forms and exact rational arithmetic, and the names it gives."""
 
+import re
+
 import numpy as np
 import pytest
 from scipy.linalg import null_space
 
 import fflin
 from fflin import BaseForce, BaseTorque
-from fflin.analysis.controllability import _dominant
+from fflin.analysis.controllability import _dominant, _named
 from tests.support import exact
 from tests.support.mechanisms import mechanical, motors
 from tests.support.messages import says
@@ -403,3 +405,22 @@ def test_states_are_named_whatever_the_basis_of_their_combinations_is():
             [[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]]
         )
         assert _dominant(turn @ vectors, names) == expected
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_names_of_uncontrollable_combinations_do_not_depend_on_units(seed):
+    """In other units, x' = c x has the mass M / c^2, and the combinations are rows / c."""
+    rng = np.random.default_rng(seed)
+    rows = rng.normal(size=(3, 8))
+    size, c = 10.0 ** rng.uniform(-2.0, 2.0, size=(2, 8))
+    states = [f"x{k}" for k in range(8)]
+    expected, names = _named(rows, states, size)
+    result, others = _named(rows / c, states, size / c)
+    terms = [re.findall(r"x\d", name) for name in names]
+    assert [re.findall(r"x\d", name) for name in others] == terms
+    # Each combination has a state of its own with the factor 1, and the largest terms first.
+    for row, given, listed in zip(result, expected, terms, strict=True):
+        (pivot,) = [k for k in range(8) if row[k] == 1.0 and given[k] == 1.0]
+        assert row == pytest.approx(given * c[pivot] / c, rel=1e-9)
+        sizes = np.abs(given) / size
+        assert [f"x{k}" for k in np.argsort(-sizes)[:3]] == listed

@@ -74,6 +74,41 @@ def test_of_a_symmetric_pair_one_mode_alone_has_mass(shift):
     assert fast.energy["panel_0"] == pytest.approx(fast.energy["panel_1"], rel=1e-9)
 
 
+def cross_of_panels(mass):
+    """Four equal panels around a hub of `mass` [kg], on hinges along its edges.
+
+    The frames of the hinges are rotated at random, so that the panels differ by rounding errors.
+    """
+    rng = np.random.default_rng(3)
+    tilted = random_pose(rng, 60.0).rotation
+    model = pin.Model()
+    model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "free")
+    hub = pin.Inertia(mass, np.zeros(3), mass * np.eye(3))
+    model.appendBodyToJoint(1, hub, pin.SE3.Identity())
+    lever = np.array([ARM, 0.0, 0.0])
+    panel = pin.Inertia(mass, lever, mass * np.diag([0.2, 0.5, 0.6]))
+    for i in range(4):
+        turn = tilted @ pin.utils.rotate("z", 0.5 * np.pi * i)
+        place = pin.SE3(turn, turn @ np.array([HINGE, 0.0, 0.0]))
+        own = pin.SE3(random_pose(rng, 90.0).rotation, np.zeros(3))
+        hinge = pin.JointModelRevoluteUnaligned(own.rotation.T @ np.eye(3)[1])
+        index = model.addJoint(1, hinge, place * own, f"panel_{i}")
+        model.appendBodyToJoint(index, panel, own.inverse())
+    return fflin.from_model(model, name="cross", stiffness=mass)
+
+
+@pytest.mark.parametrize("mass", [1e-9, 1.0, 1e6])
+def test_modes_of_equal_frequency_are_separated_whatever_the_mass_is(mass):
+    # One mode lifts the base, two rotate it about axes in the plane, and one does neither.
+    result = masses(cross_of_panels(mass))
+    J, pull, turn = 0.5 + ARM**2, ARM, 0.5 + ARM * (ARM + HINGE)
+    moved, rotated = 4.0 * mass * pull**2 / J, 2.0 * mass * turn**2 / J
+    close = {"rtol": 1e-12, "atol": 1e-12 * mass}
+    np.testing.assert_allclose(result.masses.sum(axis=1), [moved, 0, 0, 0], **close)
+    about = result.inertias.sum(axis=1)
+    np.testing.assert_allclose(about, [0, rotated, rotated, 0], **close)
+
+
 @pytest.mark.parametrize("name", ["servicer_7dof", "dual_arm", "talos"])
 def test_effective_masses_and_the_residual_sum_to_the_mass_and_inertia(name):
     rng = np.random.default_rng(2)

@@ -53,6 +53,17 @@ def test_a_card_has_a_light_and_a_dark_theme_and_no_script():
     assert used and all(card.count(f"{name}:") == 4 for name in used)
 
 
+@pytest.mark.parametrize("number", ["2e-08", "-1.5e-7", "residual=1.4e-13"])
+def test_no_line_breaks_at_the_hyphen_of_an_exponent(number):
+    text = f"a-b {number} <1/s>"
+    parsed = Parsed(html.card("A", text, html.verdict(text, True)))
+    assert parsed.text.count(text) == 2 and parsed.verdicts == [("good", text)]
+    digits = number.lstrip("-")
+    whole = number.replace(digits, f'<span class="whole">{digits}</span>')
+    assert html.paragraph(text) == f"<p>a-b {whole} &lt;1/s&gt;</p>"
+    assert ".whole{white-space:nowrap}" in html.card("A", text)
+
+
 def test_verdicts_have_the_colour_of_their_meaning():
     kinds = [Parsed(html.verdict("x", good)).verdicts for good in (True, False, None)]
     assert kinds == [[("good", "x")], [("bad", "x")], []]

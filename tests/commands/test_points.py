@@ -233,3 +233,26 @@ def test_the_option_for_a_tilt_is_refused_where_it_has_no_effect(tmp_path):
     for option in ("--tilt", "--no-tilt"):
         err = refused("simulate", path, "--gain", gain, option)
         assert f"remove {option}" in err
+
+
+@pytest.mark.parametrize("option", ["--tilt", "--no-tilt"])
+@pytest.mark.parametrize(
+    ("command", "options"),
+    [
+        ("linearize", ["--equilibrium"]),
+        ("equilibrium", []),
+        ("lqr", []),
+        ("simulate", ["--duration", 1]),
+    ],
+)
+def test_the_option_for_a_tilt_is_refused_without_gravity(command, options, option):
+    err = " ".join(refused(command, "planar_detumble", *options, option).split())
+    assert "'planar_detumble' has no gravity" in err and f"remove {option}" in err
+
+
+def test_the_option_for_a_tilt_needs_an_equilibrium(tmp_path):
+    path = falling_without_tilt(tmp_path)
+    for command in ("linearize", "check", "modes"):
+        err = refused(command, path, "--no-tilt")
+        assert "without --equilibrium" in err and "remove --no-tilt" in err
+    assert "remove --tilt" in refused("simulate", path, "--free", "--tilt")

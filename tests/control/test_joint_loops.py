@@ -1,12 +1,15 @@
 """Loops of joints that rotate a floating base: area rule, closed form, and the initial guess."""
 
+from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
 import pinocchio as pin
 import pytest
 
 import fflin
+from fflin.control.optimal import joint_loops
 from fflin.control.optimal.floating_base import FloatingBase
 from fflin.control.optimal.initial_guess import initial_guess
 from fflin.control.optimal.joint_loops import (
@@ -24,18 +27,25 @@ from tests.support.robots import random_tree
 HUB, INERTIA, POINT = 5.0, 0.8, 1.5
 
 
-@pytest.fixture(scope="module")
-def polar():
-    """A hub with a point mass that turns about its centre of mass and slides radially."""
+def polar_of(unit):
+    """A hub with a point mass that turns about its centre of mass and slides radially.
+
+    Masses and inertias are multiplied by `unit`.
+    """
     model = pin.Model()
     model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "free")
-    hub = pin.Inertia(HUB, np.zeros(3), INERTIA * np.eye(3))
+    hub = pin.Inertia(unit * HUB, np.zeros(3), unit * INERTIA * np.eye(3))
     model.appendBodyToJoint(1, hub, pin.SE3.Identity())
     turn = model.addJoint(1, pin.JointModelRZ(), pin.SE3.Identity(), "turn")
     slide = model.addJoint(turn, pin.JointModelPX(), pin.SE3.Identity(), "slide")
-    point = pin.Inertia(POINT, np.zeros(3), np.zeros((3, 3)))
+    point = pin.Inertia(unit * POINT, np.zeros(3), np.zeros((3, 3)))
     model.appendBodyToJoint(slide, point, pin.SE3.Identity())
     return fflin.from_model(model, name="polar")
+
+
+@pytest.fixture(scope="module")
+def polar():
+    return polar_of(1.0)
 
 
 def base_at_rest(robot, q=None):
@@ -163,6 +173,27 @@ def test_loops_of_a_turn_and_a_slide_reach_an_attitude_within_limits(polar, degr
     assert (joints >= limits[0] - 0.01).all() and (joints <= limits[1] + 0.01).all()
     assert joints[0] == pytest.approx(loops.path[0], abs=1e-12)
     assert joints[-1] == pytest.approx(loops.path[0], abs=1e-12)
+
+
+def test_loops_do_not_depend_on_the_unit_of_mass(monkeypatch):
+    # The attitude depends on ratios of masses only, and torques are compared with the torques of
+    # the first ellipse. So the first residuals are equal.
+    residuals = []
+
+    def recorded(function, start, **_):
+        residuals.append(function(start))
+        return SimpleNamespace(x=start)
+
+    monkeypatch.setattr(joint_loops, "least_squares", recorded)
+    target = pin.exp3(np.array([0.0, 0.0, 0.1]))
+    for unit in (1.0, 1e3):
+        robot = polar_of(unit)
+        start = fflin.configuration(robot, {"slide": 0.6})
+        loops = loops_of(robot, start, target)
+        loops = replace(loops, t=loops.t[::20], path=loops.path[::20])
+        next(loops.improved(1, np.array([[1.0, 0.0]])))
+    assert np.abs(residuals[0]).max() > 1e-3
+    assert residuals[1] == pytest.approx(residuals[0], rel=1e-6, abs=1e-9)
 
 
 @pytest.mark.exhaustive

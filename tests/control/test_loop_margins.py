@@ -8,8 +8,9 @@ import pytest
 from scipy.linalg import expm
 
 import fflin
-from fflin.control.margins import _Closed, _law_of
+from fflin.control.margins import _Closed, _delayed, _law_of
 from fflin.control.optimal.disk import best_scaling, worst_perturbation
+from fflin.control.policy import System
 from fflin.dynamics.delays import HeldSystem, split
 from tests.support.marks import exhaustive
 
@@ -24,6 +25,23 @@ def loop_of(policy, lin, **how):
     """Return the loop whose margins are computed."""
     how = {"delay": 0.0, "sample": None, "at": "inputs", **how}
     return _Closed(_law_of(policy, lin, how["sample"]), lin, *how.values())
+
+
+def test_each_input_of_a_continuous_plant_has_its_own_delay():
+    """G(jw) diag(exp(-jw T)), as long as w T is below the order of the approximation."""
+    rng = np.random.default_rng(2)
+    A, B = rng.normal(size=(4, 4)), rng.normal(size=(4, 3))
+    C, D = rng.normal(size=(2, 4)), rng.normal(size=(2, 3))
+    delays = np.array([0.3, 0.0, 0.5])
+    late = _delayed(System(A, B, C, D), delays)
+
+    def response(plant, w):
+        inner = 1j * w * np.eye(len(plant.A)) - plant.A
+        return plant.D + plant.C @ np.linalg.solve(inner, plant.B)
+
+    for w in (0.4, 2.0, 9.0):
+        expected = response(System(A, B, C, D), w) * np.exp(-1j * w * delays)
+        assert response(late, w) == pytest.approx(expected, abs=1e-9)
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.03, 0.1, 0.1 + 1e-12, 0.17, 0.2, 0.33])

@@ -215,7 +215,39 @@ def test_violations_of_the_robot_are_reported_even_if_no_plan_has_them(servicer)
         assert over.any() == passes == ("robot" in motion.notes[0])
         if passes:
             assert f"exceeds a soft limit: {over[:-1].sum()} (" in motion.notes[0]
-            assert f" by {sampled[:-1].max() - 0.1:.2g} at " in motion.notes[0]
+            at = motion.t[5::5][sampled[:-1].max(axis=1).argmax()]
+            largest = f" by {sampled[:-1].max() - 0.1:.2g} at {at:.4g} s"
+            assert largest in motion.notes[0]
+
+
+def test_the_worst_violation_is_the_largest_relative_to_the_range_of_its_limit(
+    servicer,
+):
+    _, lin = servicer
+    limits = {"qdot_m.joint_1": 0.1, "qdot_m.joint_2": 1.0}
+    ahead = Receding(fflin.mpc(lin, dt=0.1, limits=limits).horizon, None)
+    e = np.zeros(30)
+    ahead.step(0.0, e)
+    e[21:23] = 0.3, 1.5  # beyond by 100 % and by 25 % of the ranges
+    ahead.step(0.1, e)
+    assert "(worst: qdot_m.joint_1 by 0.2 at 0.1 s)" in ahead.notes[0]
+
+
+def test_an_output_that_the_inputs_act_on_exceeds_its_limit_by_its_value(servicer):
+    """At the end of a sample, y = C e + D d with the inputs d of this sample."""
+    robot = servicer[0].replace(stiffness=10.0, outputs=[fflin.Accelerometer("base")])
+    lin = fflin.linearize(robot)
+    name, limit = lin.output_names[0], 1e-3
+    ahead = Receding(fflin.mpc(lin, dt=0.1, limits={name: limit}).horizon, None)
+    start, end = np.zeros((2, 30))
+    start[3] = -0.1
+    d = ahead.step(0.0, start)
+    by_inputs = lin.D[0] @ d
+    end[6:15] = lin.C[0, 6:15] * by_inputs / (lin.C[0, 6:15] @ lin.C[0, 6:15])
+    ahead.step(0.1, end)
+    excess = abs(lin.C[0] @ end + by_inputs) - limit
+    assert abs(by_inputs) > 0.5 * limit
+    assert f"(worst: {name} by {excess:.2g} at 0.1 s)" in ahead.notes[0]
 
 
 def test_slews_that_break_the_regulator_are_held(servicer):

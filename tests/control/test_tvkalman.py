@@ -127,6 +127,16 @@ def test_at_rest_it_tends_to_the_steady_filter_and_stays_positive():
     assert np.abs(begun.L - steady.L).max() < 1e-7 * np.abs(steady.L).max()
 
 
+def test_noise_of_the_inputs_is_noise_of_the_states_with_the_covariance_b_w_bt():
+    _, traj = resting("cubesat", 0.4, knots=3)
+    W, V = noise_of(traj)
+    B = traj.B[0]
+    of_inputs = fflin.tvkalman(traj, W, V, traj.B, 0.1, sample=0.2)
+    of_states = fflin.tvkalman(traj, B * W @ B.T, V, None, 0.1, sample=0.2)
+    assert of_inputs.P == near(of_states.P, 1e-12)
+    assert of_inputs.L == near(of_states.L, 1e-12)
+
+
 @pytest.mark.parametrize("ending", ["npz", *exhaustive("mat", "json")])
 def test_filters_are_kept(moving, tmp_path, ending):
     schedule = fflin.tvkalman(moving, 0.1, 0.1, P0=0.1, sample=0.2)

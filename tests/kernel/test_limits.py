@@ -5,6 +5,7 @@ import pinocchio as pin
 import pytest
 
 import fflin
+from fflin.campaign.runs import CampaignJob, notes_on_engine
 from fflin.kernel import limits
 from fflin.kernel.limits import LIMITS, Task, reason_against
 from fflin.robot.joints import ROOT
@@ -71,6 +72,48 @@ def test_sweeps_simulations_and_campaigns_state_the_same_reason(monkeypatch):
         fflin.monte_carlo(
             IN_ORBIT, None, {"q_b": 0.02}, runs=2, duration=1.0, **options
         )
+
+
+WHY = "because a joint of 'composite' does not move along a screw with a fixed axis"
+
+
+def test_a_sweep_states_why_its_models_were_computed_in_python(monkeypatch):
+    monkeypatch.setattr(limits, "numba_is_there", lambda: True)
+    robot = with_displaced_axis()
+    q = np.tile(robot.neutral(), (3, 1))
+    assert fflin.sweep(robot, q)[1:].notes == (f"linearised in Python, {WHY}",)
+    assert fflin.sweep(robot, q, engine="python").notes == ()
+
+
+def test_runs_state_why_they_are_simulated_in_python(monkeypatch):
+    monkeypatch.setattr(limits, "numba_is_there", lambda: True)
+    job = CampaignJob(with_displaced_axis(), None, None, 0, None, {"duration": 0.1})
+    assert notes_on_engine(job, None) == (f"simulated in Python, {WHY}",)
+    assert notes_on_engine(job, "python") == ()
+
+
+@pytest.mark.exhaustive
+def test_validity_and_funnels_state_why_they_were_simulated_in_python(
+    monkeypatch, tmp_path
+):
+    monkeypatch.setattr(limits, "numba_is_there", lambda: True)
+    robot = with_displaced_axis()
+    lin = fflin.linearize(robot)
+    reach = fflin.validity(robot, lin, fflin.lqr(lin), samples=1)
+    rest = fflin.Trajectory(
+        robot,
+        [0.0, 0.1, 0.2],
+        np.tile(robot.neutral(), (3, 1)),
+        np.zeros((3, robot.nv)),
+        np.zeros((3, len(lin.u0))),
+    )
+    schedule = fflin.tvlqr(fflin.linearize_trajectory(robot, rest))
+    goal = {"attitude": 170.0}
+    tube = fflin.funnel(robot, schedule, goal, samples=1, knots=1, dt=0.1)
+    tube.save(tmp_path / "funnel.npz")
+    for result in (reach, tube, fflin.Funnel.load(tmp_path / "funnel.npz", robot)):
+        assert result.notes == (f"simulated in Python, {WHY}",)
+        assert result.notes[0] in " ".join(str(result).split())
 
 
 def test_a_campaign_states_why_its_runs_were_simulated_in_python(monkeypatch):

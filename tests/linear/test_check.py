@@ -11,6 +11,7 @@ import pytest
 
 import fflin
 from fflin.linear.aba_route import Route
+from fflin.linear.check import References
 from tests.support.random_robots import random_case
 from tests.support.robots import mostly, random_point, random_pose
 
@@ -130,6 +131,36 @@ def test_check_keeps_its_edge_at_orbital_speed():
         A[groups.omega_b, groups.q_m] *= 1.0 + 1e-4
         result = fflin.check(robot, replace(lin, A=A))
         assert "A[omega_b, q_m]" in {row.block for row in result.failures}
+
+
+def test_differences_by_the_velocity_of_the_base_are_exact_at_orbital_speed():
+    # The rate of the position is a rotation of v_b, so only rounding errors are left: a few EPS of
+    # the speed, divided by a step that is a tenth of the speed.
+    robot = fflin.load("servicer_7dof")
+    q, v, _ = random_point(robot, np.random.default_rng(4))
+    v[:3] = 7.6e3, -200.0, 30.0
+    lin = fflin.linearize(robot, q, v, frame="local", reference=pin.SE3.Identity())
+    (row,) = [
+        row
+        for row in fflin.check(robot, lin).rows
+        if (row.test, row.block) == ("differences", "A[r_b, v_b]")
+    ]
+    assert row.error < 1e2 * np.finfo(float).eps
+
+
+def test_the_rounding_of_an_output_is_divided_by_the_step_of_each_state_it_depends_on():
+    robot = fflin.load(
+        "servicer_7dof", outputs=[fflin.Gyroscope("base"), fflin.JointVelocities()]
+    )
+    point = random_point(robot, np.random.default_rng(1), degrees=50.0)
+    lin = fflin.linearize(robot, *point)
+    outputs = References(robot, lin)._outputs
+    steps = np.full(len(lin.x0), 0.1)
+    C, rounding, _ = outputs._kinematics(steps)
+    least = np.finfo(float).eps * np.abs(lin.y0)[:, None] / steps
+    depends = np.abs(lin.C) > 1e-9
+    assert depends.any() and (np.abs(C - lin.C) <= rounding)[depends].all()
+    assert (rounding >= least)[depends].all()
 
 
 def test_far_joints_are_confirmed_as_far_as_m_is():

@@ -305,6 +305,20 @@ def test_the_step_of_mujoco_comes_back():
     assert relative(only.A, lin.A) < 1e-13 and relative(only.B, lin.B) < 1e-13
 
 
+def test_a_step_of_mujoco_rotates_the_errors_of_a_spinning_sphere():
+    # Its angular velocity w is constant, so a step rotates the base by exp(h w). An error of its
+    # attitude, in base axes, is then rotated back, and an error of w adds h times Jexp(h w).
+    h, v = 0.2, np.array((0.3, -0.2, 0.1, 1.0, -2.0, 0.5))
+    sphere = free_body((3.0, 3.0, 3.0))
+    lin = fflin.linearize(sphere, v=v)
+    m = lin.to("mujoco", dt=h)
+    w = v[3:]
+    assert m.A[3:6, 3:6] == pytest.approx(pin.exp3(-h * w), abs=1e-14)
+    assert m.A[3:6, 9:12] == pytest.approx(h * pin.Jexp3(h * w), abs=1e-14)
+    # The world-frame velocity of the base is constant, too.
+    assert m.A[:3] == pytest.approx(np.eye(3, 12) + h * np.eye(3, 12, 6), abs=1e-14)
+
+
 def test_wrong_matrices_are_detected():
     robot = fflin.load("servicer_7dof")
     q, v, u, _ = point(robot, 6, {})

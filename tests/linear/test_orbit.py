@@ -9,6 +9,7 @@ import pinocchio as pin
 import pytest
 
 import fflin
+from fflin.linear.equilibrium import on_orbit
 from tests.support.orbits import N, in_orbit
 from tests.support.robots import free_body, random_pose
 
@@ -143,6 +144,26 @@ def test_a_root_that_stands_askew_in_the_world_changes_nothing():
         assert (
             np.abs(fflin.equilibrium(robot, one.q, reference=about).u[:6]).max() < 1e-12
         )
+
+
+@pytest.mark.parametrize("frame", ["lvlh", "hill"])
+def test_the_centre_of_mass_is_put_on_the_orbit_wherever_the_root_stands(frame):
+    # The orbit passes the origin along x in lvlh, and along y in hill.
+    rng = np.random.default_rng(6)
+    model = fflin.load("ets_vii").model.copy()
+    model.jointPlacements[1] = random_pose(rng, 70.0)
+    robot = fflin.from_model(model, orbit=550e3)
+    q = fflin.configuration(robot, base=random_pose(rng, 50.0))
+    placed = on_orbit(robot, q, frame)
+    before, center = (
+        pin.centerOfMass(robot.model, robot.create_data(), point)
+        for point in (q, placed)
+    )
+    along = ("lvlh", "hill").index(frame)
+    expected = np.where(np.arange(3) == along, before, 0.0)
+    assert np.abs(before).min() > 0.01
+    assert center == pytest.approx(expected, abs=1e-13)
+    assert np.array_equal(placed[3:], q[3:])
 
 
 def test_a_base_that_flies_fast_is_seen_from_the_frame_that_turns():

@@ -29,6 +29,10 @@ def arm():
         (30.0, (-40.0, 40.0), False),  # within the limits
         (30.0, (-math.inf, math.inf), False),
         (math.inf, (-2.0, 2.0), False),
+        (360.0, (-2.0, 2.0), True),
+        (361.0, (-2.0, 2.0), False),  # more than one rotation in degrees, too
+        (1000.0, (-2.0, 2.0), False),  # a weight or limit that stands for any value
+        (720.0, (-13.0, 13.0), True),
     ],
 )
 def test_an_angle_beyond_one_rotation_and_its_limits_looks_like_degrees(
@@ -134,6 +138,13 @@ def test_a_configuration_in_degrees_gets_the_angle_in_radians(arm):
     with pytest.warns(fflin.FflinWarning) as caught:
         fflin.configuration(arm, {"joint_1": 3.1})
     assert "deg?" not in str(caught[0].message)
+
+
+def test_a_largest_value_without_meaning_raises_no_suspicion(arm):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        Q = fflin.bryson(fflin.linearize(arm), {"q_m.joint_1": 1000.0})
+    assert Q.max() == pytest.approx(1e-6, rel=1e-12)
 
 
 def test_commands_warn_once():

@@ -60,6 +60,7 @@ class Parsed(HTMLParser):
         self.text += data
         if tags and tags[-1] == "title":
             self.titles[-1] += data
-        if tags and tags[-1] == "p" and "class" in self._open[-1][1]:
+        verdict = any(tag == "p" and "class" in given for tag, given in self._open)
+        if verdict:
             kind, text = self.verdicts[-1]
             self.verdicts[-1] = kind, text + data
