@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from dataclasses import astuple, dataclass, field
 from functools import cached_property
@@ -214,8 +215,11 @@ class Trajectory(Design):
             joints = [
                 x for x in robot.joints if x.prismatic == prismatic and not x.mode
             ]
-            curves = {x.name: np.array([x.value(row) for row in q]) for x in joints}
-            charts[title] = ("m" if prismatic else "rad", curves)
+            unit, factor = ("m", 1.0) if prismatic else ("deg", math.degrees(1.0))
+            curves = {
+                x.name: factor * np.array([x.value(row) for row in q]) for x in joints
+            }
+            charts[title] = (unit, curves)
         pictures = [
             svg.figure(title, svg.curves(self.t[rows], curves, unit))
             for title, (unit, curves) in charts.items()
