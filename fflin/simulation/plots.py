@@ -24,7 +24,11 @@ from fflin.base.validation import Array
 from fflin.simulation.motion import Motion, require_motion
 from fflin.simulation.report import DEGREES, STATES, Curve, curves
 
-_MOST_IN_A_PANEL, _ACROSS = 6, 3
+_MOST_IN_A_PANEL = 6
+# Width [in] of the figure, by its number of columns.
+_WIDTHS = {1: 7.0, 2: 8.5, 3: 11.0}
+# number of characters of a legend that fit into an inch
+_LETTERS = 13.6
 # Title of the chart of q_b, whose curves are the components of a rotation vector in deg.
 _ATTITUDE = "attitude: rotation vector"
 # {(group, unit) of curves: title of their chart}, in the order of the charts.
@@ -128,16 +132,18 @@ def plot_motion(
     per_row = [3.0]  # height of a chart of states
     if errors:
         per_row.append(1.2)  # height of the errors below
-    heights = per_row * math.ceil(len(states) / _ACROSS)
+    columns = min(max(_WIDTHS), max(len(states), others))
+    width = _WIDTHS[columns]
+    heights = per_row * math.ceil(len(states) / columns)
     above = len(heights)
-    heights += [3.0] * math.ceil(others / _ACROSS)
-    spots = [(k // _ACROSS * len(per_row), k % _ACROSS) for k in range(len(states))]
-    spots += [(above + k // _ACROSS, k % _ACROSS) for k in range(others)]
+    heights += [3.0] * math.ceil(others / columns)
+    spots = [(k // columns * len(per_row), k % columns) for k in range(len(states))]
+    spots += [(above + k // columns, k % columns) for k in range(others)]
     styles = styles_of(motion)
     legends: dict[str, dict[str, Artist]] = {}
-    with drawing(path, 11.0, 0.3 + sum(heights), axes=axes) as figure:
+    with drawing(path, width, 0.3 + sum(heights), axes=axes) as figure:
         grid = figure.add_gridspec(
-            len(heights), _ACROSS, height_ratios=heights, hspace=0.06
+            len(heights), columns, height_ratios=heights, hspace=0.06
         )
         for (row, column), (title, chart) in zip(spots, drawn.items(), strict=False):
             panel = figure.add_subplot(grid[row, column])
@@ -166,7 +172,7 @@ def plot_motion(
                 _draw_errors(strip, motion.t, below, chart_styles, error_label)
                 panel.tick_params(labelbottom=False)
                 panel.set_xlabel("")
-        _name_below(figure, legends)
+        _name_below(figure, legends, width)
         starts, rest = motion.starts[1:].tolist(), resting_from(motion)
         marks = starts if rest is None else [rest]
         for panel, mark in product(figure.axes, marks):
@@ -358,15 +364,16 @@ def _draw_errors(
     axes.ticklabel_format(axis="y", scilimits=(-2, 3))
 
 
-def _name_below(figure: Figure, legends: Mapping[str, Mapping[str, Artist]]) -> None:
-    """Add legends below all charts, with as many columns as fit."""
+def _name_below(
+    figure: Figure, legends: Mapping[str, Mapping[str, Artist]], width: float
+) -> None:
+    """Add legends below all charts, with as many columns as fit in a width [in]."""
     for title, named in legends.items():
-        letters = 75
+        letters = _LETTERS * width / len(legends)
         side = "left" if title == "joints" else "right"
         if len(legends) == 1:
-            letters = 150
             side = "center"
-        columns = min(len(named), 8, max(1, letters // (max(map(len, named)) + 6)))
+        columns = min(len(named), 8, max(1, int(letters / (max(map(len, named)) + 6))))
         names = sorted(named, key="limit".__eq__)  # the limit last
         lines = [named[name] for name in names]
         place: Any = f"outside lower {side}"
