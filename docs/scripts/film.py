@@ -1,4 +1,4 @@
-"""Draw moving pictures: ``python docs/scripts/film.py hero``, ``... tutorials`` or ``... examples``.
+"""Draw moving pictures: ``python docs/scripts/film.py hero``, ``... tutorials``, ``... examples``.
 
 ``hero`` simulates the example of the README, and draws docs/hero.webp and a still picture.
 ``tutorials`` draws docs/_static/tutorials/NAME.webp from the page that the tutorial wrote in the
@@ -26,8 +26,9 @@ DOCS = Path(__file__).resolve().parents[1]
 PAGES = DOCS / "_build" / "executed" / "pages" / "tutorials"
 EXAMPLES = DOCS.parent / "examples"
 FPS = 12
-# Small pictures are [px] wide and high, and have this number of frames.
-SMALL, SMALL_FRAMES = (256, 160), 24
+# Small pictures are [px] wide and high, and have this number of frames. They are drawn larger by
+# this factor, which smooths their edges.
+SMALL, SMALL_FRAMES, ENLARGED = (256, 160), 24, 2
 # The last picture stays for this time [ms] before the film begins again.
 REST = 1500
 BROWSER = (
@@ -37,14 +38,21 @@ BROWSER = (
 )
 
 
-def frames(html: Path, size: tuple[int, int], count: int, share: float) -> list[Image.Image]:
-    """Return pictures of the scene at equal distances in the first `share` of the motion."""
+def frames(
+    html: Path, size: tuple[int, int], count: int, share: float, *, texts: bool = True
+) -> list[Image.Image]:
+    """Return pictures of the scene at equal distances in the first `share` of the motion.
+
+    With `texts`, each picture states its time.
+    """
     width, height = size
     with sync_playwright() as play:
         browser = play.chromium.launch(executable_path=find_chromium(), args=[*BROWSER])
         page = browser.new_page(viewport={"width": width, "height": height})
         page.goto(f"{html.resolve().as_uri()}#pause")
         page.wait_for_function("window.fflin && window.fflin.ready", timeout=120_000)
+        if not texts:
+            page.add_style_tag(content="#stamp, #legend { display: none !important }")
         page.evaluate("fflin.plain(true, false)")
         first, last = page.evaluate(
             "(() => { const s = document.querySelector('#bar input[type=range]');"
@@ -148,7 +156,11 @@ def examples(names: list[str]) -> None:
             html = Path(folder, "page.html")
             fflin.visualize(code["robot"], motion, html=html, open=False)
             os.chdir(DOCS)
-            pictures = frames(html, SMALL, SMALL_FRAMES, 1.0)
+            width, height = SMALL
+            drawn = frames(
+                html, (ENLARGED * width, ENLARGED * height), SMALL_FRAMES, 1.0, texts=False
+            )
+            pictures = [picture.resize(SMALL, Image.Resampling.LANCZOS) for picture in drawn]
         save(pictures, target / f"{source.stem}.webp", 45)
 
 
