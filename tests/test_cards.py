@@ -101,6 +101,8 @@ def test_a_card_is_well_formed_small_and_escapes_names(results, name):
     if name not in ("Equilibrium",):  # whose report has no names
         assert ROBOT in parsed.text
     assert name in parsed.text
+    # The title of a card is not repeated below it.
+    assert f"{name}(" not in parsed.text
 
 
 def test_the_repr_of_every_result_is_short(results):

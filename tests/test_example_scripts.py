@@ -43,3 +43,13 @@ def test_the_page_shows_every_example():
         assert text.split('"""')[1] in page
         assert text.count("\n") <= 30
         assert (FOLDER / f"{name}.png").stat().st_size < 70_000
+
+
+def test_the_gallery_has_a_small_moving_picture_of_every_example():
+    page = (FOLDER.parent / "docs" / "examples.md").read_text(encoding="utf-8")
+    pictures = re.findall(r'src="(_static/examples/(\w+)\.webp)"', page)
+    assert sorted(name for _, name in pictures) == SCRIPTS
+    for path, name in pictures:
+        content = (FOLDER.parent / "docs" / path).read_bytes()
+        assert b"ANIM" in content[:64] and len(content) < 60_000
+        assert f"../examples/{name}.py" in page

@@ -1,8 +1,10 @@
-"""Draw moving pictures: ``python docs/scripts/film.py hero`` or ``... tutorials [NAME ...]``.
+"""Draw moving pictures: ``python docs/scripts/film.py hero``, ``... tutorials``, ``... examples``.
 
 ``hero`` simulates the example of the README, and draws docs/hero.webp and a still picture.
 ``tutorials`` draws docs/_static/tutorials/NAME.webp from the page that the tutorial wrote in the
 last build of the site. If a tutorial writes no page, its code is run, and its motion is shown.
+``examples`` runs the scripts of examples/ and draws docs/_static/examples/NAME.webp. Names after
+the word select tutorials or examples.
 Needs Chromium and playwright, which the extra ``test`` installs.
 """
 
@@ -22,7 +24,11 @@ from fflin.view.capture import find_chromium
 
 DOCS = Path(__file__).resolve().parents[1]
 PAGES = DOCS / "_build" / "executed" / "pages" / "tutorials"
+EXAMPLES = DOCS.parent / "examples"
 FPS = 12
+# Small pictures are [px] wide and high, and have this number of frames. They are drawn larger by
+# this factor, which smooths their edges.
+SMALL, SMALL_FRAMES, ENLARGED = (256, 160), 24, 2
 # The last picture stays for this time [ms] before the film begins again.
 REST = 1500
 BROWSER = (
@@ -32,14 +38,21 @@ BROWSER = (
 )
 
 
-def frames(html: Path, size: tuple[int, int], count: int, share: float) -> list[Image.Image]:
-    """Return pictures of the scene at equal distances in the first `share` of the motion."""
+def frames(
+    html: Path, size: tuple[int, int], count: int, share: float, *, texts: bool = True
+) -> list[Image.Image]:
+    """Return pictures of the scene at equal distances in the first `share` of the motion.
+
+    With `texts`, each picture states its time.
+    """
     width, height = size
     with sync_playwright() as play:
         browser = play.chromium.launch(executable_path=find_chromium(), args=[*BROWSER])
         page = browser.new_page(viewport={"width": width, "height": height})
         page.goto(f"{html.resolve().as_uri()}#pause")
         page.wait_for_function("window.fflin && window.fflin.ready", timeout=120_000)
+        if not texts:
+            page.add_style_tag(content="#stamp, #legend { display: none !important }")
         page.evaluate("fflin.plain(true, false)")
         first, last = page.evaluate(
             "(() => { const s = document.querySelector('#bar input[type=range]');"
@@ -124,8 +137,37 @@ def run(source: Path, folder: Path) -> Path:
     return html
 
 
+def examples(names: list[str]) -> None:
+    """Draw a small film of each example, or only of those named."""
+    target = DOCS / "_static" / "examples"
+    target.mkdir(exist_ok=True)
+    for source in sorted(EXAMPLES.glob("*.py")):
+        if names and source.stem not in names:
+            continue
+        with tempfile.TemporaryDirectory() as folder:
+            os.chdir(folder)
+            code: dict[str, Any] = {}
+            exec(source.read_text("utf-8"), code)
+            if "campaign" in code:
+                campaign = code["campaign"]
+                motion = campaign.replay(campaign.worst(1)[0])
+            else:
+                motion = code.get("motion", code.get("in_c"))
+            html = Path(folder, "page.html")
+            fflin.visualize(code["robot"], motion, html=html, open=False)
+            os.chdir(DOCS)
+            width, height = SMALL
+            drawn = frames(
+                html, (ENLARGED * width, ENLARGED * height), SMALL_FRAMES, 1.0, texts=False
+            )
+            pictures = [picture.resize(SMALL, Image.Resampling.LANCZOS) for picture in drawn]
+        save(pictures, target / f"{source.stem}.webp", 45)
+
+
 if __name__ == "__main__":
     if sys.argv[1:] == ["hero"]:
         hero()
+    elif sys.argv[1:2] == ["examples"]:
+        examples(sys.argv[2:])
     else:
         tutorials(sys.argv[2:])

@@ -65,6 +65,17 @@ def conjugate(a: Array) -> Array:
     return np.array((-x, -y, -z, w))
 
 
+def rotation_vectors(vector_parts: Array) -> Array:
+    """Return the rotation vectors (N, 3) [rad] of unit quaternions with scalar parts >= 0.
+
+    `vector_parts` (N, 3) are their vector parts. A linear prediction can exceed length 1, which no
+    rotation has. Its angle is then pi times the length.
+    """
+    sines = np.minimum(1.0, np.linalg.norm(vector_parts, axis=1, keepdims=True))
+    rotations: Array = vector_parts * (2.0 / np.sinc(np.arcsin(sines) / np.pi))
+    return rotations
+
+
 def rotation_matrix(a: Array) -> Array:
     """Return the rotation (3, 3) of a unit quaternion."""
     return np.array(rotation_rows(*a.tolist()))

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import cmath
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +15,14 @@ import numpy as np
 from fflin.base.figures import COLORS
 from fflin.base.html import escape
 from fflin.base.names import runs
+from fflin.base.pole_grid import (
+    RATIOS,
+    Label,
+    damped_poles,
+    nyquist_frequency,
+    oscillates,
+    spaced,
+)
 from fflin.base.tables import rounding
 from fflin.base.validation import Array, Indices, Values
 
@@ -37,6 +45,9 @@ _LETTER = 5.8
 # A pole is drawn as unstable beyond this distance from the stability boundary, relative to the
 # largest pole. Rounding errors move double poles by this distance.
 _MARGINAL = 1e-7
+
+# Half the side [px] of a pole map.
+_MIDDLE = 95.0
 
 # Number of points of a curve, and number of curves in a plot.
 _POINTS, _CURVES = 160, 8
@@ -156,9 +167,10 @@ def _per(row: str, column: str) -> str:
 def pole_map(poles: Values, dt: float = 0.0) -> str:
     """Return a map of poles: [1/s] for dt = 0, otherwise poles z with the unit circle.
 
-    The axes of poles in 1/s are logarithmic on both sides of zero.
+    The axes of poles in 1/s are logarithmic on both sides of zero. Dashed curves mark equal damping
+    ratios if a pole oscillates.
     """
-    size, middle = 190.0, 95.0
+    size, middle = 2.0 * _MIDDLE, _MIDDLE
     finite = [complex(pole) for pole in poles if cmath.isfinite(pole)]
     moduli = sorted(abs(pole) for pole in finite if abs(pole) > 0.0)
     if dt:
@@ -180,6 +192,8 @@ def pole_map(poles: Values, dt: float = 0.0) -> str:
         parts.append(
             f'<circle class="axis" cx="{middle}" cy="{middle}" r="{radius:.1f}"/>'
         )
+    if dt or oscillates(np.array(finite)):
+        parts += _damping_curves(place, moduli[-1] if moduli else 1.0, dt)
     shown = set[str]()
     for pole in finite:
         excess = abs(pole) - 1.0 if dt else pole.real / (moduli[-1] if moduli else 1.0)
@@ -206,6 +220,35 @@ def pole_map(poles: Values, dt: float = 0.0) -> str:
     )
     parts.append(f'<text x="{middle + 4:g}" y="10">Im</text>')
     return picture(0.0, 0.0, size, size, "".join(parts))
+
+
+def _damping_curves(
+    place: Callable[[float], float], largest: float, dt: float
+) -> list[str]:
+    """Return curves of constant damping ratio and their labels, up to the modulus `largest`."""
+    parts = []
+    labels = []
+    for ratio in RATIOS:
+        end = nyquist_frequency(ratio, dt) if dt else largest
+        frequencies = np.concatenate(([0.0], np.geomspace(1e-6 * end, end, 60)))
+        if dt:
+            frequencies = np.linspace(0.0, end, 60)
+        poles = damped_poles(ratio, frequencies, dt)
+        for half in (poles, poles.conj()):
+            points = " ".join(
+                f"{_MIDDLE + place(pole.real):.1f},{_MIDDLE - place(pole.imag):.1f}"
+                for pole in half.tolist()
+            )
+            parts.append(f'<polyline class="damping" points="{points}"/>')
+        tip = complex(poles[len(poles) // 2] if dt else poles[-1])
+        x, y = _MIDDLE + place(tip.real), _MIDDLE - place(tip.imag)
+        labels.append(Label(x, y - 3.0, f"{ratio:g}"))
+    for label in spaced(labels, 2.5 * _LETTER, 9.0):
+        parts.append(
+            f'<text class="damping" x="{label.x:.1f}" y="{label.y:.1f}" '
+            f'text-anchor="middle">{label.text}</text>'
+        )
+    return parts
 
 
 def sampled(count: int) -> Indices:

@@ -47,6 +47,16 @@ def first_paragraph(report: str) -> str:
     return " ".join(_PARAGRAPH.split(report, maxsplit=1)[0].split())
 
 
+def without_first_paragraph(report: str, paragraph: str) -> str:
+    """Return a report without its first paragraph, if it is equal to `paragraph` except for breaks.
+
+    The report may have been wrapped after its first paragraph was formatted.
+    """
+    if first_paragraph(report) != " ".join(paragraph.split()):
+        return report
+    return "".join(_PARAGRAPH.split(report, maxsplit=1)[1:])
+
+
 def cut(rows: Sequence[Sequence[str]], rest: str = "see -o") -> list[Sequence[str]]:
     """Cut a long table to its header and first rows; `rest` says where the other rows are."""
     left = len(rows) - 1 - MOST_ROWS

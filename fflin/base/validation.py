@@ -350,8 +350,10 @@ class Result(FrozenArrays):
 
     def _html_parts(self) -> Sequence[str]:
         """Return the parts of the card in HTML."""
-        report = self._report().removeprefix(repr(self)).lstrip("\n")
-        return (html.preformatted(report),)
+        from fflin.base.tables import without_first_paragraph  # only cards need it
+
+        report = without_first_paragraph(self._report(), repr(self))
+        return (html.preformatted(report.lstrip("\n")),)
 
 
 # Parts of the title of a result, as {attribute: function that formats its value}. Attributes that a

@@ -14,7 +14,7 @@ from fflin.campaign.funnel import Funnel
 from fflin.campaign.report import ended_of, goal_met
 from fflin.campaign.runs import KINDS
 from fflin.campaign.validity import Validity, shown
-from fflin.simulation.report import TRUSTED
+from fflin.simulation.report import DEGREES, TRUSTED
 
 # Bands, widest first: (fraction of runs above the band, name, opacity). The same fraction of runs
 # is below the band.
@@ -210,7 +210,7 @@ def plot_funnel(
     reach = {
         "attitude [deg]": funnel.attitude,
         "position [m]": funnel.position,
-        "joints [rad|m]": funnel.joints,
+        **_joint_axes(funnel),
     }
     reach = {name: axes for name, axes in reach.items() if axes.any()}
     with drawing(path, 9.0, 1.6 + 1.5 * (len(reach) + 1), axes=axes) as figure:
@@ -236,6 +236,16 @@ def plot_funnel(
             fontsize=10,
         )
     return figure
+
+
+def _joint_axes(funnel: Funnel) -> dict[str, Array]:
+    """Return the half-axes (m, k) of the joints of each unit, with angles in deg."""
+    units = np.array([joint.unit for joint in funnel.robot.joints])
+    axes = {}
+    for unit in dict.fromkeys(units.tolist()):
+        shown_unit, factor = DEGREES.get(unit, (unit, 1.0))
+        axes[f"joints [{shown_unit}]"] = factor * funnel.joints[:, units == unit]
+    return axes
 
 
 def _bands(

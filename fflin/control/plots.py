@@ -1,9 +1,9 @@
 """Figures of linear models and control loops: matrices, modes, checks, poles and margins."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,6 +19,15 @@ from fflin.base.figures import (
     logarithmic,
 )
 from fflin.base.names import input_keys, runs
+from fflin.base.pole_grid import (
+    RATIOS,
+    Label,
+    damped_poles,
+    equally_fast_poles,
+    nyquist_frequency,
+    oscillates,
+    spaced,
+)
 from fflin.base.tables import counted, rounding
 from fflin.base.validation import (
     Array,
@@ -34,6 +43,18 @@ from fflin.linear.check import Check
 from fflin.linear.model import LinearModel
 
 _LINE = "#888888"
+
+# Colour of curves of constant damping ratio and natural frequency, and the style of their labels.
+_GRID = "#b8bcc4"
+_GRID_TEXT: dict[str, Any] = {
+    "fontsize": 7,
+    "color": "#666666",
+    "zorder": 0.9,
+    "clip_on": True,
+    "bbox": {"facecolor": "white", "edgecolor": "none", "pad": 0.6},
+}
+# Width and height of these labels, as fractions of the axes.
+_LABEL_SIZE = (0.1, 0.07)
 
 _POINTS = 400
 
@@ -264,7 +285,9 @@ def plot_poles(
 ) -> Figure:
     """Plot a pole map.
 
-    The axes are logarithmic if the poles differ by more than a factor of 10.
+    The axes are logarithmic if the poles differ by more than a factor of 10. If a pole oscillates,
+    dashed rays, or spirals in z, mark the damping ratios 0.2 to 0.8. Dotted curves mark equal
+    natural frequencies; in s, they are circles through the ticks.
 
     Parameters
     ----------
@@ -427,14 +450,103 @@ def _pole_map(axes: Axes, sets: dict[str, Values], dt: float) -> None:
         angle = np.linspace(0.0, 2.0 * np.pi, 201)
         axes.plot(np.cos(angle), np.sin(angle), color=_LINE, lw=0.8)
         axes.set_aspect("equal")
+        _sampled_grid(axes, dt)
     else:
         axes.axvline(0.0, color=_LINE, lw=0.8)
         every = np.concatenate([np.ravel(values) for values in sets.values()])
         unit = float(np.abs(every).max(initial=0.0))
         logarithmic(axes, "x", every.real, unit)
         logarithmic(axes, "y", every.imag, unit)
+        if oscillates(every):
+            _damping_grid(axes)
     unit_label = "" if dt else " [1/s]"
     axes.set(xlabel=f"real part{unit_label}", ylabel=f"imaginary part{unit_label}")
+
+
+def _damping_grid(axes: Axes) -> None:
+    """Draw rays of constant damping ratio, and circles of constant natural frequency.
+
+    The circles have the radii of the ticks of an axis, so they need no labels.
+    """
+    left, right = axes.get_xlim()
+    bottom, top = axes.get_ylim()
+    if left >= 0.0 or top <= 0.0:
+        return
+    has_decades = axes.get_xscale() != "linear"
+    ticks = axes.get_xticks() if has_decades else axes.get_yticks()
+    for frequency in sorted({abs(tick) for tick in ticks.tolist()} - {0.0}):
+        _grid_line(axes, equally_fast_poles(frequency), "_natural frequency", ":")
+    ends = {}
+    for ratio in RATIOS:
+        # The ray ends at the left or upper edge.
+        end = min(-left / ratio, top / math.sqrt(1.0 - ratio * ratio))
+        frequencies = np.concatenate(([0.0], np.geomspace(1e-9 * end, end, 200)))
+        poles = damped_poles(ratio, frequencies)
+        _grid_line(axes, poles, "_damping", "--")
+        ends[ratio] = poles[-1]
+    axes.set(xlim=(left, right), ylim=(bottom, top))
+    _label_ratios(axes, ends)
+
+
+def _sampled_grid(axes: Axes, dt: float) -> None:
+    """Draw spirals of constant damping ratio, and curves of constant natural frequency."""
+    limits = {"xlim": axes.get_xlim(), "ylim": axes.get_ylim()}
+    middles = {}
+    for ratio in RATIOS:
+        end = nyquist_frequency(ratio, dt)
+        poles = damped_poles(ratio, np.linspace(0.0, end, 200), dt)
+        _grid_line(axes, poles, "_damping", "--")
+        middles[ratio] = poles[len(poles) // 2]
+    for part in (0.2, 0.4, 0.6, 0.8):
+        frequency = part * math.pi / dt
+        poles = equally_fast_poles(frequency, dt)
+        _grid_line(axes, poles, "_natural frequency", ":")
+        tip = 0.96 * poles[0]
+        axes.text(
+            tip.real,
+            tip.imag,
+            f"{frequency:.3g} rad/s",
+            ha="right" if tip.real > 0.0 else "left",
+            va="top",
+            **_GRID_TEXT,
+        )
+    axes.set(**limits)
+    _label_ratios(axes, middles)
+
+
+def _grid_line(axes: Axes, poles: Values, label: str, style: str) -> None:
+    """Draw a curve of poles and its reflection at the real axis."""
+    axes.grid(visible=False)
+    for half in (poles, poles.conj()):
+        axes.plot(
+            half.real,
+            half.imag,
+            color=_GRID,
+            lw=0.6,
+            ls=style,
+            label=label,
+            zorder=0.8,
+        )
+
+
+def _label_ratios(axes: Axes, ends: Mapping[float, complex]) -> None:
+    """Write damping ratios at points {ratio: pole}, each within the axes."""
+    to_fraction = axes.transData + axes.transAxes.inverted()
+    labels = []
+    for ratio, pole in ends.items():
+        x, y = to_fraction.transform((pole.real, pole.imag)).tolist()
+        labels.append(Label(x, y, f"\N{GREEK SMALL LETTER ZETA} {ratio:g}"))
+    width, height = _LABEL_SIZE
+    for label in spaced(labels, width, height):
+        axes.text(
+            max(label.x, 0.01),
+            label.y,
+            label.text,
+            ha="left" if label.x < width / 2.0 else "center",
+            va="top" if label.y > 1.0 - height / 2.0 else "center",
+            transform=axes.transAxes,
+            **_GRID_TEXT,
+        )
 
 
 def _poles_of(given: object) -> tuple[Values, float]:

@@ -211,12 +211,15 @@ class Trajectory(Design):
         for joint in robot.joints:
             if joint.mode:
                 continue
-            curves = prismatic if joint.prismatic else revolute
-            curves[joint.name] = np.array([joint.value(row) for row in q])
+            values = np.array([joint.value(row) for row in q])
+            if joint.prismatic:
+                prismatic[joint.name] = values
+            else:
+                revolute[joint.name] = np.degrees(values)
         # title of each picture: unit and curves
         charts: dict[str, tuple[str, dict[str, Array]]] = {
             "attitude from the start": ("deg", {"base": angle}),
-            "joints": ("rad", revolute),
+            "joints": ("deg", revolute),
             "prismatic joints": ("m", prismatic),
         }
         pictures = [

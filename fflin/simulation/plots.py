@@ -19,14 +19,21 @@ from fflin.base.figures import (
     drawing,
 )
 from fflin.base.names import chosen, input_keys
+from fflin.base.rotation import rotation_vectors
 from fflin.base.validation import Array
 from fflin.simulation.motion import Motion, require_motion
-from fflin.simulation.report import STATES, Curve, curves
+from fflin.simulation.report import DEGREES, STATES, Curve, curves
 
-_MOST_IN_A_PANEL, _ACROSS = 6, 3
+_MOST_IN_A_PANEL = 6
+# Width [in] of the figure, by its number of columns.
+_WIDTHS = {1: 7.0, 2: 8.5, 3: 11.0}
+# number of characters of a legend that fit into an inch
+_LETTERS = 13.6
+# Title of the chart of q_b, whose curves are the components of a rotation vector in deg.
+_ATTITUDE = "attitude: rotation vector"
 # {(group, unit) of curves: title of their chart}, in the order of the charts.
 _TITLES = {
-    ("q_b", "1"): "attitude",
+    ("q_b", "1"): _ATTITUDE,
     ("r_b", "m"): "position",
     ("q_m", "rad"): "joints",
     ("q_m", "m"): "prismatic joints",
@@ -50,6 +57,8 @@ JOINTS, WHEELS = ("q_m", "qdot_m", "tau_m"), ("speed", "wheel", "momentum")
 # A target is at rest if none of its positions changes by more than this [SI units] from one row to
 # the next.
 _STILL = 1e-12
+
+_NONE = np.zeros(0)
 
 
 def resting_from(motion: Motion) -> float | None:
@@ -76,6 +85,9 @@ def plot_motion(
     axes: Axes | None = None,
 ) -> Figure:
     """Draw the errors, inputs and momentum drift of a motion, with the linear prediction.
+
+    Angles are in deg. The attitude is drawn as the rotation vector of q_b, whose length is the
+    angle from the reference.
 
     Parameters
     ----------
@@ -120,23 +132,26 @@ def plot_motion(
     per_row = [3.0]  # height of a chart of states
     if errors:
         per_row.append(1.2)  # height of the errors below
-    heights = per_row * math.ceil(len(states) / _ACROSS)
+    columns = min(max(_WIDTHS), max(len(states), others))
+    width = _WIDTHS[columns]
+    heights = per_row * math.ceil(len(states) / columns)
     above = len(heights)
-    heights += [3.0] * math.ceil(others / _ACROSS)
-    spots = [(k // _ACROSS * len(per_row), k % _ACROSS) for k in range(len(states))]
-    spots += [(above + k // _ACROSS, k % _ACROSS) for k in range(others)]
+    heights += [3.0] * math.ceil(others / columns)
+    spots = [(k // columns * len(per_row), k % columns) for k in range(len(states))]
+    spots += [(above + k // columns, k % columns) for k in range(others)]
     styles = styles_of(motion)
     legends: dict[str, dict[str, Artist]] = {}
-    with drawing(path, 11.0, 0.3 + sum(heights), axes=axes) as figure:
+    with drawing(path, width, 0.3 + sum(heights), axes=axes) as figure:
         grid = figure.add_gridspec(
-            len(heights), _ACROSS, height_ratios=heights, hspace=0.06
+            len(heights), columns, height_ratios=heights, hspace=0.06
         )
         for (row, column), (title, chart) in zip(spots, drawn.items(), strict=False):
             panel = figure.add_subplot(grid[row, column])
             group = chart[0].group
-            panel.set_title(f"{title} {group}" if title in states else title)
+            is_state = title in states and title != _ATTITUDE
+            panel.set_title(f"{title} {group}" if is_state else title)
             chart_styles = styles[family_of(group)]
-            _draw(panel, motion.t, chart, chart_styles)
+            _draw(panel, motion.t, _in_degrees(motion, chart), chart_styles)
             if motion.tracked and [title] == states[:1]:
                 panel.plot(
                     [], [], color="#888888", lw=3.6, alpha=0.3, label="reference"
@@ -157,7 +172,7 @@ def plot_motion(
                 _draw_errors(strip, motion.t, below, chart_styles, error_label)
                 panel.tick_params(labelbottom=False)
                 panel.set_xlabel("")
-        _name_below(figure, legends)
+        _name_below(figure, legends, width)
         starts, rest = motion.starts[1:].tolist(), resting_from(motion)
         marks = starts if rest is None else [rest]
         for panel, mark in product(figure.axes, marks):
@@ -232,22 +247,67 @@ def _errors(motion: Motion) -> tuple[str, dict[str, Curve]]:
     curves are the differences from the linear prediction. If there is neither a
     reference nor a prediction, there are no curves.
     """
-    names = motion.state_names
-    units = motion.state_units
     label = "error"
     if motion.tracked and (e := motion.error) is not None:
-        units = ("deg",) * 3 + units[3:]
-        sines = np.minimum(1.0, np.linalg.norm(e[:, :3], axis=1, keepdims=True))
-        e[:, :3] *= np.degrees(2.0 / np.sinc(np.arcsin(sines) / np.pi))
+        rotations = np.degrees(rotation_vectors(e[:, :3]))
     elif motion.linear is not None:
         label = "difference"
         e = motion.x - motion.linear
+        flown, predicted = (
+            np.degrees(rotation_vectors(x[:, :3])) for x in (motion.x, motion.linear)
+        )
+        rotations = flown - predicted
     else:
         return label, {}
-    columns, none = zip(names, units, e.T, strict=True), np.zeros(0)
-    return label, {
-        name: Curve(name, "", name, unit, x, none) for name, unit, x in columns
-    }
+    errors = {}
+    for i, (name, unit) in enumerate(
+        zip(motion.state_names, motion.state_units, strict=True)
+    ):
+        if i < 3:
+            error = Curve(name, "", name, "deg", rotations[:, i], _NONE)
+        else:
+            shown_unit, factor = DEGREES.get(unit, (unit, 1.0))
+            error = Curve(name, "", name, shown_unit, factor * e[:, i], _NONE)
+        errors[name] = error
+    return label, errors
+
+
+def _in_degrees(motion: Motion, chart: list[Curve]) -> list[Curve]:
+    """Return the curves of a chart with angles in deg, and q_b as a rotation vector in deg.
+
+    Speeds of wheels stay in rad/s.
+    """
+    group, unit = chart[0].group, chart[0].unit
+    if group == "q_b":
+        return _rotations(motion, chart)
+    if unit not in DEGREES or group == "speed":
+        return chart
+    return [curve.scaled(*DEGREES[unit]) for curve in chart]
+
+
+def _rotations(motion: Motion, chart: list[Curve]) -> list[Curve]:
+    """Return curves of q_b as components of rotation vectors [deg].
+
+    At 180 deg, the vector changes its sign. The curves have a gap there.
+    """
+    columns = [motion.state_names.index(curve.key) for curve in chart]
+    shown: list[dict[str, Any]] = [
+        {**curve._asdict(), "unit": "deg"} for curve in chart
+    ]
+    fields: tuple[tuple[str, Array | None], ...] = (
+        ("values", motion.x),
+        ("linear", motion.linear),
+        ("reference", motion.target if motion.tracked else None),
+    )
+    for field, x in fields:
+        if x is None:
+            continue
+        q_b = x[:, :3]
+        rows = np.degrees(rotation_vectors(q_b))
+        rows[1:][(q_b[1:] * q_b[:-1]).sum(axis=1) < -0.5] = np.nan
+        for curve, column in zip(shown, columns, strict=True):
+            curve[field] = rows[:, column]
+    return [Curve(**curve) for curve in shown]
 
 
 def _draw(
@@ -259,15 +319,6 @@ def _draw(
 ) -> None:
     """Draw curves and their limits, with references in pale colours and predictions dashed."""
     group, unit = chart[0].group, chart[0].unit
-    # At 180 degrees, the quaternion changes its sign, so attitude curves jump. Leave a gap there.
-    jumping = ("values", "linear", "reference") if group == "q_b" else ()
-    for field in jumping:
-        if getattr(chart[0], field) is not None:
-            rows = np.array([getattr(curve, field) for curve in chart])
-            rows[:, 1:][:, (rows[:, 1:] * rows[:, :-1]).sum(axis=0) < -0.5] = np.nan
-            chart = [
-                c._replace(**{field: row}) for c, row in zip(chart, rows, strict=True)
-            ]
     steps = "default" if group in ("", *STATES, "speed", "momentum") else "steps-post"
     # Grey curves are drawn below the others. One name at the end of the legend counts them.
     order = sorted(chart, key=lambda curve: not styles[curve.short].is_named)
@@ -313,15 +364,16 @@ def _draw_errors(
     axes.ticklabel_format(axis="y", scilimits=(-2, 3))
 
 
-def _name_below(figure: Figure, legends: Mapping[str, Mapping[str, Artist]]) -> None:
-    """Add legends below all charts, with as many columns as fit."""
+def _name_below(
+    figure: Figure, legends: Mapping[str, Mapping[str, Artist]], width: float
+) -> None:
+    """Add legends below all charts, with as many columns as fit in a width [in]."""
     for title, named in legends.items():
-        letters = 75
+        letters = _LETTERS * width / len(legends)
         side = "left" if title == "joints" else "right"
         if len(legends) == 1:
-            letters = 150
             side = "center"
-        columns = min(len(named), 8, max(1, letters // (max(map(len, named)) + 6)))
+        columns = min(len(named), 8, max(1, int(letters / (max(map(len, named)) + 6))))
         names = sorted(named, key="limit".__eq__)  # the limit last
         lines = [named[name] for name in names]
         place: Any = f"outside lower {side}"

@@ -76,6 +76,12 @@ _MODAL = "kg^0.5 m"  # unit of the amplitudes of flexible appendages
 # Rotation [deg] above which modal amplitudes are inaccurate, because the modal model is linear.
 _LINEAR = 5.0
 
+# Units of angles in figures and on pages: {unit of a curve: shown unit and its factor}.
+DEGREES = {
+    "rad": ("deg", float(np.degrees(1.0))),
+    "rad/s": ("deg/s", float(np.degrees(1.0))),
+}
+
 # A limit is drawn only if the curve reaches this fraction of the limit.
 _NEAR = 1.0 / 3.0
 
@@ -114,6 +120,16 @@ class Curve(NamedTuple):
             for level in self.levels
             if level and (self.values / level).max() >= _NEAR
         ]
+
+    def scaled(self, unit: str, factor: float) -> Curve:
+        """Return the curve in another unit, in which its values are multiplied by a factor."""
+        return self._replace(
+            unit=unit,
+            values=factor * self.values,
+            limits=factor * self.limits,
+            linear=None if self.linear is None else factor * self.linear,
+            reference=None if self.reference is None else factor * self.reference,
+        )
 
 
 def curves(motion: Motion) -> Iterator[Curve]:
@@ -660,7 +676,7 @@ def verdict(motion: Motion, kinds: list[ErrorSize]) -> str:
 
 
 # {unit of an error: unit and factor in the heading of a page}
-_PAGE_UNITS = {"rad": ("deg", float(np.degrees(1.0))), "m": ("mm", 1e3)}
+_PAGE_UNITS = {**DEGREES, "m": ("mm", 1e3)}
 
 
 def _in_deg_mm(kind: ErrorSize) -> str:

@@ -35,7 +35,7 @@ from fflin.simulation.plots import (
     resting_from,
     styles_of,
 )
-from fflin.simulation.report import STATES, THERE, TRUSTED, Curve, headline
+from fflin.simulation.report import DEGREES, STATES, THERE, TRUSTED, Curve, headline
 from fflin.view.page import Drawing, Page, body_poses, encoded, packed, subtitle
 from fflin.view.shapes import carriers_of
 
@@ -69,8 +69,7 @@ _SMALL = 0.01
 
 # {unit of a curve: unit and factor on the page}. Lengths of _LONG [m] or more stay in m.
 _UNITS = {
-    "rad": ("deg", math.degrees(1.0)),
-    "rad/s": ("deg/s", math.degrees(1.0)),
+    **DEGREES,
     "m": ("mm", 1e3),
     "m/s": ("mm/s", 1e3),
 }
@@ -525,20 +524,7 @@ def in_page_units(lines: list[Curve]) -> list[Curve]:
     long = unit in ("mm", "mm/s") and max(map(_size, lines)) >= _LONG
     if long or lines[0].group == "speed":
         return lines
-
-    def scaled(values: Array | None) -> Array | None:
-        return None if values is None else factor * values
-
-    return [
-        curve._replace(
-            unit=unit,
-            values=factor * curve.values,
-            limits=factor * curve.limits,
-            linear=scaled(curve.linear),
-            reference=scaled(curve.reference),
-        )
-        for curve in lines
-    ]
+    return [curve.scaled(unit, factor) for curve in lines]
 
 
 def conserved(motion: Motion) -> dict[str, object]:

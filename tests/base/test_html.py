@@ -139,6 +139,36 @@ def test_stable_poles_are_left_of_the_axis_and_unstable_ones_marked():
     assert marks == ["", " unstable"] and '<circle class="axis"' in sampled
 
 
+def damping_curves(drawing):
+    """The points (k, 2) of the curves of constant damping in a pole map, from its middle."""
+    found = re.findall(r'<polyline class="damping" points="([^"]*)"', drawing)
+    return [
+        np.array([pair.split(",") for pair in points.split()], float) - 95.0
+        for points in found
+    ]
+
+
+def test_curves_of_damping_pass_through_poles_of_their_ratio():
+    pole = 2.0 * complex(-0.6, 0.8)
+    drawing = svg.pole_map(np.array([pole, pole.conjugate(), -0.5]))
+    mark = re.findall(r'class="mark" d="M([\d.]+) ([\d.]+)', drawing)[0]
+    x, y = (float(entry) - 95.0 for entry in mark)
+    curves = damping_curves(drawing)
+    assert len(curves) == 8
+    nearest = [np.hypot(*(curve - (x, y)).T).min() for curve in curves]
+    # The pole has the largest modulus, so that the curve of its ratio ends there.
+    assert nearest[4] < 0.2 and min(nearest[:4]) > 5.0
+    assert ">0.2</text>" in drawing
+    assert not damping_curves(svg.pole_map(np.array([-1.0, -2.0])))
+
+
+def test_curves_of_damping_of_sampled_poles_begin_at_one():
+    curves = damping_curves(svg.pole_map(np.array([0.5]), 0.1))
+    assert len(curves) == 8
+    for curve in curves:
+        assert curve[0] == pytest.approx((88.0 / 1.1, 0.0), abs=0.1)
+
+
 def test_a_repeated_pole_is_drawn_once():
     assert svg.pole_map(np.full(50, -1.0)).count("<g>") == 1
 

@@ -259,7 +259,11 @@ def test_it_prints_saves_and_is_drawn(arm, found, tmp_path):
         arm[1].save(tmp_path / "s.npz")
         fflin.Funnel.load(tmp_path / "s.npz", arm[0])
     pytest.importorskip("matplotlib")
-    fflin.plot_funnel(found, tmp_path / "a.png")
+    figure = fflin.plot_funnel(found, tmp_path / "a.png")
+    (panel,) = [ax for ax in figure.axes if ax.get_ylabel().startswith("joints")]
+    assert panel.get_ylabel() == "joints [deg]"
+    shown = np.array([line.get_ydata() for line in panel.get_lines()]).T
+    np.testing.assert_allclose(shown, np.degrees(found.joints), rtol=1e-12)
     with pytest.raises(fflin.InputError, match=r"fflin\.funnel"):
         fflin.plot_funnel(3)
 

@@ -101,7 +101,61 @@ def test_pole_map_has_the_poles_of_each_set():
     ]
     sampled = fflin.plot_poles(lin.discretize(0.1))
     assert sampled.axes[0].get_xlabel() == "real part"
-    assert len(sampled.axes[0].get_lines()) == 2  # with the unit circle
+    points = [x.get_xdata() + 1j * x.get_ydata() for x in sampled.axes[0].get_lines()]
+    assert any(np.allclose(np.abs(z), 1.0) and len(z) == 201 for z in points)
+
+
+def curves_of(axes, label):
+    """The curves with a label, as complex numbers."""
+    found = [line for line in axes.get_lines() if line.get_label() == label]
+    return [line.get_xdata() + 1j * line.get_ydata() for line in found]
+
+
+@pytest.mark.parametrize("scale", [1.0, 300.0])
+def test_rays_of_damping_are_labelled_at_the_edge_of_the_axes(scale):
+    figure = fflin.plot_poles([-1.0 + 2.0j, -1.0 - 2.0j, -3.0 * scale])
+    assert_legible(figure)
+    axes = figure.axes[0]
+    rays = curves_of(axes, "_damping")
+    assert len(rays) == 8
+    ratios = []
+    for ray in rays:
+        ratio = -ray[1:].real / np.abs(ray[1:])
+        np.testing.assert_allclose(ratio, ratio[0], rtol=1e-12)
+        ratios.append(round(ratio[0], 12))
+        # A ray ends at the left, upper or lower edge.
+        left, bottom, top = axes.get_xlim()[0], *axes.get_ylim()
+        end = ray[-1]
+        distances = [abs(end.real - left), abs(end.imag - top), abs(end.imag - bottom)]
+        assert min(distances) < 1e-9 * abs(end)
+    assert sorted(set(ratios)) == [0.2, 0.4, 0.6, 0.8]
+    labels = [
+        text
+        for text, _ in texts(figure)
+        if text.startswith("\N{GREEK SMALL LETTER ZETA}")
+    ]
+    assert labels and len(set(labels)) == len(labels)
+    for circle in curves_of(axes, "_natural frequency"):
+        np.testing.assert_allclose(np.abs(circle), abs(circle[0]), rtol=1e-12)
+
+
+def test_real_poles_have_no_rays():
+    axes = fflin.plot_poles([-1.0, -2.0]).axes[0]
+    assert not curves_of(axes, "_damping")
+
+
+def test_sampled_poles_have_spirals_of_damping():
+    figure = fflin.plot_poles([0.5 + 0.2j, 0.5 - 0.2j], dt=0.5)
+    assert_legible(figure)
+    axes = figure.axes[0]
+    spirals = curves_of(axes, "_damping")
+    assert len(spirals) == 8
+    for spiral in spirals:
+        rates = np.log(spiral[1:-1]) / 0.5
+        ratio = -rates.real / np.abs(rates)
+        np.testing.assert_allclose(ratio, ratio[0], rtol=1e-9)
+    # pi / dt = 6.28 rad/s
+    assert "1.26 rad/s" in [text for text, _ in texts(figure)]
 
 
 @pytest.mark.exhaustive

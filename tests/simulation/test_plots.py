@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import fflin
+from fflin.dynamics.state_rows import attitude_rotations
 from fflin.simulation.plots import resting_from
 from tests.support.motions import tracked
 from tests.support.weights import unit_weights
@@ -43,16 +44,23 @@ def test_motion_shows_linear_next_to_nonlinear_and_their_difference(loop):
     _, _, motion = loop
     figure = motion.plot()
     axes = {ax.get_title(): ax for ax in figure.axes if ax.get_title()}
-    attitude = axes["attitude q_b"]
+    attitude = axes["attitude: rotation vector"]
     full, dashed = attitude.get_lines()[4], attitude.get_lines()[5]
     assert full.get_label() == "z"
-    np.testing.assert_array_equal(full.get_ydata(), motion.x[:, 2])
-    np.testing.assert_array_equal(dashed.get_ydata(), motion.linear[:, 2])
+    # The robot is planar, so z is the angle of the rotation.
+    angle, predicted = (
+        np.degrees(2.0 * np.arcsin(x[:, 2])) for x in (motion.x, motion.linear)
+    )
+    np.testing.assert_allclose(full.get_ydata(), angle, atol=1e-12)
+    np.testing.assert_allclose(dashed.get_ydata(), predicted, atol=1e-12)
+    assert attitude.get_ylabel() == "[deg]"
     assert dashed.get_linestyle() == "--"
     differences = [ax for ax in figure.axes if ax.get_ylabel().startswith("difference")]
     assert len(differences) == 6
     apart = differences[0].get_lines()[2].get_ydata()
-    np.testing.assert_array_equal(apart, motion.x[:, 2] - motion.linear[:, 2])
+    np.testing.assert_allclose(apart, angle - predicted, atol=1e-12)
+    units = [ax.get_ylabel().partition("\n")[2] for ax in differences]
+    assert units == ["[deg]", "[m]", "[deg]", "[deg/s]", "[m/s]", "[deg/s]"]
     assert axes["velocity v_b"].get_ylabel() == "[m/s]"
     torque = lines(axes["base torque"])["z"]
     np.testing.assert_array_equal(torque.get_ydata(), motion.u[:, 2])
@@ -68,11 +76,26 @@ def along():
     return tracked(fflin.load("planar_detumble"), 2.0, run=4.0, limits=0.3)
 
 
+def shown_rows(x):
+    """The states (N, 18) of a robot with three joints, as figures show them."""
+    turns = (slice(6, 12), slice(15, 18))  # joints, angular velocity, joint rates
+    rows = x.copy()
+    rows[:, :3] = np.degrees(attitude_rotations(x, np.zeros(18)))
+    for turn in turns:
+        rows[:, turn] = np.degrees(x[:, turn])
+    return rows
+
+
 def test_a_reference_is_drawn_in_a_pale_colour_below_the_motion(along):
     _, motion = along
     figure = motion.plot()
     result = panels(figure)
-    titles = ("attitude q_b", "position r_b", "joints q_m", "angular velocity omega_b")
+    titles = (
+        "attitude: rotation vector",
+        "position r_b",
+        "joints q_m",
+        "angular velocity omega_b",
+    )
     titles = (*titles, "velocity v_b", "joint rates qdot_m")
     for title, start in zip(titles, range(0, 18, 3), strict=True):
         curves = [
@@ -80,8 +103,13 @@ def test_a_reference_is_drawn_in_a_pale_colour_below_the_motion(along):
         ]
         assert len(curves) == 6
         for k, (pale, flown) in enumerate(zip(curves[::2], curves[1::2], strict=True)):
-            np.testing.assert_array_equal(pale.get_ydata(), motion.target[:, start + k])
-            np.testing.assert_array_equal(flown.get_ydata(), motion.x[:, start + k])
+            for curve, x in ((pale, motion.target), (flown, motion.x)):
+                np.testing.assert_allclose(
+                    curve.get_ydata(),
+                    shown_rows(x)[:, start + k],
+                    rtol=1e-12,
+                    atol=1e-12,
+                )
             assert pale.get_color() == flown.get_color() and pale.get_alpha() < 0.5
             assert pale.get_linewidth() > 2.0 * flown.get_linewidth()
     texts = [text.get_text() for axes in figure.axes for text in legend_texts(axes)]
@@ -103,14 +131,16 @@ def test_below_it_stands_the_error(along):
     _, motion = along
     figure = motion.plot()
     strips = [item for item in figure.axes if item.get_ylabel().startswith("error")]
-    units = ["[deg]", "[m]", "[rad]", "[rad/s]", "[m/s]", "[rad/s]"]
+    units = ["[deg]", "[m]", "[deg]", "[deg/s]", "[m/s]", "[deg/s]"]
     assert [item.get_ylabel() for item in strips] == [
         f"error\n{unit}" for unit in units
     ]
     flown = np.array(
         [item.get_ydata() for axes in strips for item in axes.get_lines()[:3]]
     ).T
-    np.testing.assert_allclose(flown[:, 3:], motion.error[:, 3:], atol=1e-15)
+    np.testing.assert_allclose(
+        flown[:, 3:], shown_rows(motion.error)[:, 3:], rtol=1e-12, atol=1e-13
+    )
     turned = motion.error[:, :3] / np.linalg.norm(
         motion.error[:, :3], axis=1, keepdims=True
     )
@@ -265,7 +295,8 @@ def test_limits_are_drawn_where_a_curve_comes_to_a_third_of_them(limited):
     assert levels(result["joint torques"]) == ([300.0], 1)
     assert levels(result["wheel speed"]) == ([300.0], 1)
     assert levels(result["wheel momentum"]) == ([15.0], 1)
-    assert levels(result["joint rates qdot_m"])[0] in ([0.05], [-0.05, 0.05])
+    rate = math.degrees(0.05)
+    assert levels(result["joint rates qdot_m"])[0] in ([rate], [-rate, rate])
     assert levels(result["joints q_m"]) == ([], 0)
     (named,) = [x for x in figure.legends if x.get_title().get_text() == "joints"]
     assert [text.get_text() for text in named.get_texts()].count("limit") == 1
@@ -302,7 +333,9 @@ def test_attitude_through_180_degrees_has_a_gap():
     motion = fflin.simulate(robot, v0=[0, 0, 0, 0, 0, 2.0], duration=2.0)
     z = motion.plot().axes[0].get_lines()[2].get_ydata()
     assert np.isnan(z).sum() == 1
-    assert np.nanmax(np.abs(np.diff(z))) < 0.1
+    # 2 rad/s, until it would pass 180 deg
+    assert np.nanmax(np.abs(np.diff(z))) < math.degrees(0.1)
+    assert 170.0 < np.nanmax(z) <= 180.0
 
 
 @pytest.mark.exhaustive

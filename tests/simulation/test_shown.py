@@ -5,6 +5,7 @@ import pytest
 
 import fflin
 from fflin.commands.cli import main
+from fflin.dynamics.state_rows import attitude_rotations
 
 pytest.importorskip("matplotlib")
 
@@ -39,17 +40,20 @@ def test_groups_names_and_patterns_pick_panels_and_lines(motion):
     panels = drawn(motion, ["q_b.z", "*.joint_1", "F_b"])
     assert set(panels) == {
         *(
-            "attitude q_b",
+            "attitude: rotation vector",
             "joints q_m",
             "joint rates qdot_m",
             "base force",
             "joint torques",
         )
     }
-    np.testing.assert_array_equal(panels["attitude q_b"]["z"], motion.x[:, 2])
+    turned = np.degrees(attitude_rotations(motion.x, np.zeros(motion.x.shape[1])))
+    np.testing.assert_allclose(
+        panels["attitude: rotation vector"]["z"], turned[:, 2], atol=1e-12
+    )
     np.testing.assert_array_equal(
         panels["joint rates qdot_m"]["joint_1"],
-        motion.x[:, names.index("qdot_m.joint_1")],
+        np.degrees(1.0) * motion.x[:, names.index("qdot_m.joint_1")],
     )
     assert list(panels["joints q_m"]) == ["joint_1"]
     assert list(panels["base force"]) == ["x", "y", "z"]

@@ -96,12 +96,22 @@ STATE = """(() => {
     return [renderer.getPixelRatio(), renderer.shadowMap.autoUpdate, triangles];
 })()"""
 
+# Number of meshes of the robot whose materials reflect.
+REFLECTING = """(() => {
+    let count = 0;
+    viewer.scene_tree.find(['meshcat', 'robot']).object.traverse((o) => {
+        if (o.isMesh && o.material.isMeshStandardMaterial) count += 1;
+    });
+    return count;
+})()"""
+
 
 @pytest.mark.browser
 def test_slow_frames_lower_the_quality_until_the_motion_stands_still(panda, watch):
     watched = watch(panda[2].as_uri() + "#pause", size=(480, 300))
     full = watched.do(STATE)
-    assert full[:2] == [1, True] and full[2] > 30_000
+    shiny = watched.do(REFLECTING)
+    assert full[:2] == [1, True] and full[2] > 30_000 and shiny > 5
 
     def frames(time, count):
         watched.do(f"for (let k = 0; k < {count}; k++) fflin.quality.measure({time})")
@@ -110,12 +120,26 @@ def test_slow_frames_lower_the_quality_until_the_motion_stands_still(panda, watc
     assert frames(30, 200) == full
     lower = frames(400, 5)
     assert lower[0] < 1 and not lower[1] and lower[2] == full[2]
+    assert watched.do(REFLECTING) == shiny
     lowest = frames(400, 50)
     assert lowest[0] < 0.5 and lowest[2] < 0.4 * full[2]
+    assert watched.do(REFLECTING) == 0
     assert frames(30, 50) == lowest
     # Paused, it is drawn in full; played on, it is as quick as before.
     watched.do("fflin.play(), fflin.pause()")
-    assert watched.do(STATE) == full
+    assert watched.do(STATE) == full and watched.do(REFLECTING) == shiny
     assert frames(30, 1) == lowest
     watched.do("fflin.play(), fflin.pause()")
     assert watched.do(STATE) == full
+
+
+@pytest.mark.browser
+def test_two_very_slow_frames_lower_the_quality_at_once(panda, watch):
+    watched = watch(panda[2].as_uri() + "#pause", size=(480, 300))
+    levels = "fflin.quality.state.level"
+    watched.do("fflin.quality.measure(900)")
+    assert watched.do(levels) == 0
+    watched.do("fflin.quality.measure(900)")
+    assert watched.do(levels) == 1
+    watched.do("for (let k = 0; k < 4; k++) fflin.quality.measure(900)")
+    assert watched.do(levels) == 3

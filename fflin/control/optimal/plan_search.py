@@ -545,8 +545,10 @@ def solve_stages(
     of_rows = 1.0 / np.tile(scale[:nx], knots)
     none = sp.csc_array((N * nx, nw))
     after = np.concatenate((np.tile(-np.eye(nx), (N, 1, 1)), ends[:, :, nw:]), axis=2)
-    links = sp.hstack((sp.block_diag(ends[:, :, :nw]), none))
-    links = links + sp.hstack((none, sp.block_diag(after)))
+    # With an empty sparse array, the block diagonal is a sparse array in every version of SciPy.
+    empty = sp.csc_array((0, 0))
+    links = sp.hstack((sp.block_diag((empty, *ends[:, :, :nw])), none))
+    links = links + sp.hstack((none, sp.block_diag((empty, *after))))
     first = sp.eye_array(nx, knots * nw)
     E = sp.diags_array(of_rows) @ sp.vstack((first, links)) @ sp.diags_array(size)
     # Full blocks of H are stored, including zeros. Without the zeros, PIQP would return inputs that

@@ -33,7 +33,7 @@ function makeCamera(viewer, info, aim) {
       if (w <= NARROW) return { right: 0, top: head, bottom: (panel.height ? h - panel.top : bottom) + 4 };
       return { right: 0, top: Math.max(head, panel.bottom + 4), bottom };
     }
-    if (w <= NARROW) return { right: 0, top: 64, bottom: (panel.height ? h - panel.top : bottom) + legend.height + 8 };
+    if (w <= NARROW) return { right: 0, top: Math.max(64, box("heading").bottom + 4), bottom: (panel.height ? h - panel.top : bottom) + legend.height + 8 };
     return { right: panel.width ? w - panel.left : 0, top: 40, bottom };
   };
   const resize = () => {

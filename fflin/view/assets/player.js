@@ -45,7 +45,7 @@ function makePlayer(viewer, info, quality, onTime) {
   const state = { time: first, playing: false, speed: info.speed, loop: false };
   const digits = last - first > 200 ? 0 : last - first > 20 ? 1 : 2;
   // The width does not change while the motion plays.
-  clock.style.minWidth = `${2 * last.toFixed(digits).length + 5}ch`;
+  clock.style.minWidth = `${2 * last.toFixed(digits).length + 3}ch`;
   let then = 0, i = 0;
 
   const seek = (time) => {
