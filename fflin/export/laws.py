@@ -14,7 +14,8 @@ from fflin.base.rotation import conjugate, quaternion_product
 from fflin.base.validation import Array, Indices, instance
 from fflin.control.gain import Gain, model_of
 from fflin.control.kalman import Compensator
-from fflin.control.policies import Sample, StateFeedback
+from fflin.control.loops import Sample
+from fflin.control.policies import StateFeedback
 from fflin.control.policy import Command, OutputForm, PathForm, Policy, StateForm, bound
 from fflin.control.tracking import TrajectoryFeedback
 from fflin.control.tvlqr import GainSchedule
