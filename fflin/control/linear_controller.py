@@ -255,7 +255,8 @@ class OutputFeedback(LinearController):
             Compensator,
             "a Compensator, as fflin.lqg returns it",
         )
-        super().__init__(compensator, lin, noise=noise)
+        windup = compensator.E if compensator.E.size else None
+        super().__init__(compensator, lin, noise=noise, anti_windup=windup)
         self.compensator = compensator
         if not lin.dt:
             raise InputError(
