@@ -350,7 +350,7 @@ class Result(FrozenArrays):
 
     def _html_parts(self) -> Sequence[str]:
         """Return the parts of the card in HTML."""
-        from fflin.base.tables import without_first_paragraph  # only cards need it
+        from fflin.base.paragraphs import without_first_paragraph  # only cards need it
 
         report = without_first_paragraph(self._report(), repr(self))
         return (html.preformatted(report.lstrip("\n")),)

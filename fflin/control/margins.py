@@ -264,7 +264,10 @@ def _law_of(policy: Policy | Gain, lin: LinearModel, sample: float | None) -> Sy
     """
     outputs = False
     if isinstance(policy, Gain):
-        law = proportional(policy.K, policy.dt, policy.state_names, policy.input_names)
+        names = policy.state_names, policy.input_names
+        law = proportional(policy.K, policy.dt, *names)
+        if policy.integrals:
+            law = policy.integral_law()
     else:
         given = as_policy(policy)
         if sample:

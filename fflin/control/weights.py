@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -328,7 +328,7 @@ def rule_weights(
     source = lin.generator or lin
     if not isinstance(given, Mapping):
         given = {"rule": given}
-    require_known("part of weights", given, ("rule", "q", "r", "bryson"))
+    require_known("part of weights", given, ("rule", "q", "r", "bryson", "integral"))
     robot_weights = lin.weights if given.get("rule") is None else {}
     name = robot_weights.get("rule", given.get("rule"))
     terms: Array = np.zeros(sum(lin.B.shape))
@@ -367,6 +367,14 @@ def rule_weights(
     if source.dt == lin.dt:
         return Q, R, None, rule
     return (*sampled_cost(source, lin.dt, Q, R), rule)
+
+
+def integrated(lin: LinearModel, given: Rule | None) -> Any:
+    """Return the integrated signals of `given` or of the robot's weights, or None."""
+    own = given.get("integral") if isinstance(given, Mapping) else None
+    if own is None and isinstance(lin, LinearModel):
+        own = lin.weights.get("integral")
+    return own
 
 
 def _limited_wheels(lin: LinearModel, wheels: Indices) -> Indices:
