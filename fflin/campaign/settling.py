@@ -23,7 +23,7 @@ from fflin.dynamics.integrators import DEFAULT_INTEGRATOR, held_exponential
 from fflin.dynamics.state import StateMap, selection
 from fflin.linear.fit import require_fit
 from fflin.linear.linearization import linearize
-from fflin.linear.model import LinearModel
+from fflin.linear.model import LinearModel, refuse_delayed
 from fflin.robot.robot import Robot
 from fflin.simulation.pace import Pace, Poles
 from fflin.simulation.run import STOPS
@@ -56,6 +56,8 @@ class Loop:
 
     def __init__(self, robot: Robot, lin: LinearModel, gain: object) -> None:
         instance("robot", robot, Robot, "a fflin.Robot")
+        instance("lin", lin, LinearModel, "a fflin.LinearModel")
+        refuse_delayed(lin, "the comparison of linear and nonlinear motions")
         K = StateFeedback(lin, as_double("gain", gain_matrix(gain))).K
         kept = regulated_states(gain)
         part = regulated_part(lin, any(f"qdot_m.{name}" in kept for name in lin.wheels))

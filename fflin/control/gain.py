@@ -17,6 +17,7 @@ from fflin.base.names import group_of, input_keys, with_units
 from fflin.base.record import Design
 from fflin.base.tables import cut, folded, grid, matrix, signals
 from fflin.base.validation import Array, Mask, Poles, Values, Vector
+from fflin.control.delayed import is_delayed, law_with_memory
 from fflin.control.optimal.disk import Loop, as_continuous, disk_gain, disk_phase
 from fflin.control.optimal.largest_gain import gain_crossings, largest_gain
 from fflin.control.optimal.riccati import Solution, rates_of
@@ -510,9 +511,29 @@ def asymmetry(gain: Gain) -> Loop:
     """
     S = _regulated(gain)
     scale = np.sqrt(gain.R.diagonal())
+    if is_delayed(gain.state_names):
+        return _remembered_asymmetry(gain, S, scale)
     F = S @ gain.closed_loop @ S.T
     G = S @ gain.B / scale
     H = -scale[:, None] * gain.K @ S.T
+    return as_continuous(F, G, H, 0.5 * np.eye(len(H)), gain.dt)
+
+
+def _remembered_asymmetry(gain: Gain, S: Array, scale: Array) -> Loop:
+    """Return the loop of `asymmetry` for a model with delayed inputs.
+
+    The law remembers its own commands, and not the changed inputs, which are on their way in the
+    plant.
+    """
+    A, B = S @ gain.A @ S.T, S @ gain.B
+    names = gain.regulated or gain.state_names
+    law = law_with_memory(gain.K @ S.T, A, B, gain.dt, names, gain.input_names)
+    n = len(law.inputs)
+    D = np.hstack((law.D, np.zeros((len(B.T), len(A) - n))))
+    memory = np.hstack((law.B, np.zeros((len(law.A), len(A) - n))))
+    F = np.block([[A + B @ D, B @ law.C], [memory, law.A]])
+    G = np.vstack((B, np.zeros((len(law.A), len(B.T))))) / scale
+    H = scale[:, None] * np.hstack((D, law.C))
     return as_continuous(F, G, H, 0.5 * np.eye(len(H)), gain.dt)
 
 
@@ -526,7 +547,7 @@ def _may_be_fragile(gain: Gain) -> bool:
 
     Both conditions below exclude it, and are quicker than the margin itself.
     """
-    if guaranteed_margin(gain) >= _FRAGILE:
+    if guaranteed_margin(gain) >= _FRAGILE and not is_delayed(gain.state_names):
         return False
     F, G, H, D = asymmetry(gain)
     bound = 1.0 / _FRAGILE
