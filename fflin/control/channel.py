@@ -2,7 +2,7 @@
 
 import math
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
@@ -176,16 +176,17 @@ class Law:
 
 
 def channel_of(
-    limits: Saturation, initial: Array, sample: int, delay: int
+    limits: Saturation, initial: Array, sample: int, delays: Sequence[int]
 ) -> rules.Channel:
-    """Return the kernel's channel for limits, a sample time [steps] and a delay [steps].
+    """Return the kernel's channel for limits, a sample time [steps] and delays [steps].
 
+    There is one delay for all inputs, or one for each input.
     Until the first command arrives, the channel applies the inputs `initial` (nu,), saturated at
     their limits.
     """
     slots = 1
     if sample:
-        slots = delay // sample + 1
+        slots = max(delays) // sample + 1
     fresh = {key: np.zeros(len(limits.pulses.at)) for key in ("left", "level", "end")}
     channel = rules.Channel(
         **limits._replace(pulses=limits.pulses._replace(**fresh))._asdict(),
@@ -193,8 +194,8 @@ def channel_of(
         pending=np.zeros(slots * len(initial)),
         slots=slots,
         sample=sample,
-        delay=np.array([float(delay)]),
-        fresh=np.zeros(1),
+        delay=np.array(delays, dtype=float),
+        fresh=np.zeros(len(delays)),
     )
     rules.limit(channel, channel.held)
     return channel
@@ -206,7 +207,7 @@ def channelled(
     limits: Saturation,
     initial: Array,
     sample: int,
-    delay: int,
+    delays: Sequence[int],
 ) -> Inputs:
     """Return f(step, *point), which sends a command through a channel and returns inputs (nu,).
 
@@ -217,7 +218,7 @@ def channelled(
     if not (sample or limits.cuts):
         return lambda _, *point: law(*point)
     within = limits._replace(wheels=limits.wheels._replace(row=np.arange(wheels)))
-    channel = channel_of(within, initial, sample, delay)
+    channel = channel_of(within, initial, sample, delays)
 
     def applied(step: int, *point: object) -> Array:
         if rules.is_asked(channel, step):

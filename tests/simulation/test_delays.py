@@ -1,0 +1,172 @@
+"""Delayed commands in simulations: exact arrival times, default steps, laws and engines."""
+
+import numpy as np
+import pytest
+
+import fflin
+
+H = 0.1  # sampling time [s]
+
+
+def satellite(inputs=(fflin.BaseTorque(), fflin.BaseForce())):
+    """Return a rigid satellite and its model, a double integrator in each coordinate."""
+    robot = fflin.load("cubesat", inputs=list(inputs))
+    return robot, fflin.linearize(robot)
+
+
+def commands_of(rows):
+    """Return a policy that commands one of the rows after the other."""
+    return lambda t, q, v: rows[round(t / H)]
+
+
+def steps_of(model, commands):
+    """Return the states (N + 1, nx) of the robot in a sampled model."""
+    z = np.zeros(len(model.A))
+    rows = [z]
+    for u in commands:
+        z = model.A @ z + model.B @ u
+        rows.append(z)
+    return np.array(rows)[:, : len(model.robot_states)]
+
+
+@pytest.mark.parametrize(
+    "delay", [0.03, 0.1, 0.27, {"tau_b": 0.15, "F_b": 0.27, "F_b.z": 0.0}]
+)
+def test_small_motions_are_those_of_the_sampled_model(delay):
+    """Commands of 1e-10 N m give states below 1e-8, whose products are below rounding."""
+    robot, lin = satellite()
+    rng = np.random.default_rng(1)
+    commands = 1e-10 * rng.normal(size=(30, 6))
+    motion = fflin.simulate(
+        robot, commands_of(commands), duration=3.0, sample=H, delay=delay
+    )
+    expected = steps_of(lin.discretize(H, delay), commands)
+    at = np.arange(31) * round(H / motion.step)
+    assert np.abs(expected).max() > 1e-10
+    assert motion.x[at] == pytest.approx(expected, abs=1e-15)
+
+
+def test_the_default_step_divides_all_delays():
+    robot, _ = satellite()
+    policy = commands_of(np.zeros((11, 6)))
+    for delay, step in ((0.07, 0.01), ({"tau_b": 0.025, "F_b": 0.04}, 0.005)):
+        motion = fflin.simulate(robot, policy, duration=1.0, sample=H, delay=delay)
+        assert motion.step == pytest.approx(step)
+
+
+def test_a_step_that_misses_the_arrivals_is_refused_with_the_nearest_one():
+    robot, _ = satellite()
+    policy = commands_of(np.zeros((11, 6)))
+    settings = {"duration": 1.0, "sample": H, "dt": 0.02}
+    with pytest.raises(fflin.InputError, match=r"the nearest step .* is dt=0\.0125 "):
+        fflin.simulate(robot, policy, **settings, delay={"tau_b": 0.0125})
+    with pytest.raises(fflin.InputError, match=r"nearest step .* is dt=0\.01 "):
+        fflin.simulate(robot, policy, **settings, delay=0.07)
+    irrational = 0.1 / np.pi
+    with pytest.raises(fflin.InputError, match=r"the nearest delay .* is 0\.04 s"):
+        fflin.simulate(robot, policy, **settings, delay=irrational)
+    with pytest.raises(fflin.UnknownNameError, match="tau_c"):
+        fflin.simulate(robot, policy, **settings, delay={"tau_c": 0.02})
+    with pytest.raises(fflin.InputError, match="less than the duration"):
+        fflin.simulate(robot, policy, **settings, delay={"tau_b": 1.0})
+
+
+def test_one_delay_for_all_inputs_equals_equal_delays():
+    robot, _ = satellite()
+    rng = np.random.default_rng(2)
+    policy = commands_of(1e-3 * rng.normal(size=(11, 6)))
+    one, many = (
+        fflin.simulate(robot, policy, duration=1.0, sample=H, delay=delay)
+        for delay in (0.13, {"tau_b": 0.13, "F_b": 0.13})
+    )
+    assert (one.x == many.x).all() and (one.u == many.u).all()
+
+
+def test_pulses_begin_when_their_command_arrives():
+    """Thrusters with different delays fire at their own times."""
+    thrusters = [
+        fflin.Thruster(
+            "base", (0, 0, 0), direction, name, max=1.0, on_off=True, least_impulse=1e-4
+        )
+        for name, direction in (("early", (1, 0, 0)), ("late", (0, 1, 0)))
+    ]
+    robot, _ = satellite(thrusters)
+    motion = fflin.simulate(
+        robot,
+        lambda t, q, v: (0.5, 0.5) if t < 0.05 else (0.0, 0.0),
+        duration=0.6,
+        sample=H,
+        delay={"late": 0.25},
+    )
+    early, late = (np.flatnonzero(motion.u[:-1, k]) for k in (0, 1))
+    steps = round(H / motion.step)
+    assert early.tolist() == list(range(steps // 2))
+    assert late.tolist() == [k + round(0.25 / motion.step) for k in early]
+
+
+def compensator(late):
+    """Return the output feedback of a model with delayed inputs."""
+    noise = {"tau_b": 1e-6, "F_b": 1e-6}
+    estimator = fflin.kalman(late, noise, 1e-6, G=late.B)
+    return fflin.OutputFeedback(late, fflin.lqg(fflin.lqr(late), estimator))
+
+
+def state_feedback(late):
+    """Return the state feedback of a model with delayed inputs."""
+    return fflin.StateFeedback(late, fflin.lqr(late))
+
+
+DELAYS = [0.07, 0.1, {"tau_b": 0.15, "F_b": 0.27}]
+
+
+@pytest.mark.parametrize("delay", DELAYS)
+@pytest.mark.parametrize("make", [compensator])
+def test_laws_of_a_delayed_model_fly_with_its_delay(make, delay):
+    """From 1e-8, the nonlinear motion is that of the sampled linear loop."""
+    robot, lin = satellite()
+    late = lin.discretize(H, delay)
+    law = make(late)
+    loop, dt = law.closed_loop()
+    assert dt == H
+    assert np.abs(np.linalg.eigvals(loop)).max() < 1.0
+    x0 = 1e-8 * np.random.default_rng(3).normal(size=12)
+    motion = fflin.simulate(robot, law, x0=x0, duration=8.0)
+    z = np.zeros(len(loop))
+    z[:12] = x0
+    for k in range(80):
+        at = k * round(H / motion.step)
+        assert motion.x[at] == pytest.approx(z[:12], abs=1e-14)
+        z = loop @ z
+    assert len(motion.prediction)
+    assert motion.prediction == pytest.approx(motion.x, abs=1e-14)
+
+
+@pytest.mark.compiled
+@pytest.mark.parametrize("make", [compensator])
+def test_both_engines_fly_delayed_laws(make):
+    robot, lin = satellite()
+    law = make(lin.discretize(H, DELAYS[-1]))
+    x0 = 0.1 * np.random.default_rng(4).normal(size=12)
+    python, compiled = (
+        fflin.simulate(robot, law, x0=x0, duration=5.0, engine=engine)
+        for engine in ("python", "compiled")
+    )
+    assert compiled.x == pytest.approx(python.x, abs=1e-12)
+    assert compiled.u == pytest.approx(python.u, abs=1e-12)
+
+
+@pytest.mark.compiled
+@pytest.mark.parametrize("make", [compensator])
+def test_campaigns_fly_delayed_laws(make):
+    """The drawn delay changes the delays of all inputs."""
+    robot, lin = satellite()
+    law = make(lin.discretize(H, DELAYS[-1]))
+    spreads = {"q_b": 0.05, "delay": 0.03}
+    campaigns = [
+        fflin.monte_carlo(
+            robot, law, spreads, runs=4, duration=3.0, seed=5, engine=engine
+        )
+        for engine in ("python", "compiled")
+    ]
+    one, other = (campaign.largest for campaign in campaigns)
+    assert one == pytest.approx(other, rel=1e-9, abs=1e-12)
