@@ -11,6 +11,7 @@ import pinocchio as pin
 
 from fflin.base.errors import FflinWarning, InputError, listed
 from fflin.base.validation import DOUBLE, Array, as_double
+from fflin.control.policy import BoundLaw
 from fflin.kernel import loop as rules
 from fflin.kernel.tree import empty
 from fflin.robot.fields import input_limits
@@ -19,6 +20,9 @@ from fflin.robot.robot import Robot
 from fflin.robot.rotors import motor_of
 
 Inputs: TypeAlias = Callable[..., Array]
+
+# Function that corrects the memory of a law by the difference of limited and commanded inputs.
+Correction: TypeAlias = Callable[[Array], None]
 
 
 class Saturation(NamedTuple):
@@ -148,6 +152,13 @@ class Law:
     # motion, a command that is not finite raises no error.
     slow: float
 
+    @property
+    def correct(self) -> Correction | None:
+        """Function that corrects the memory of the policy, or None; see `BoundLaw`."""
+        if isinstance(self.policy, BoundLaw):
+            return self.policy.correct
+        return None
+
     def __call__(self, t: float, q: Array, v: Array) -> Array:
         """Return the command (nu,), or raise `InputError` if its shape or a value is invalid."""
         u = self.policy(t, q.copy(), v.copy())
@@ -208,21 +219,26 @@ def channelled(
     initial: Array,
     sample: int,
     delays: Sequence[int],
+    correct: Correction | None = None,
 ) -> Inputs:
     """Return f(step, *point), which sends a command through a channel and returns inputs (nu,).
 
     f calls ``law(*point)`` for the command, and ``speeds(*point)`` for the speeds (k,) of the
-    wheels whose speed is limited.
+    wheels whose speed is limited. After each command, f calls `correct` with the change of the
+    command by the input limits.
     """
     wheels, u = len(limits.wheels.at), initial.copy()
-    if not (sample or limits.cuts):
+    if not (sample or limits.cuts or correct):
         return lambda _, *point: law(*point)
     within = limits._replace(wheels=limits.wheels._replace(row=np.arange(wheels)))
     channel = channel_of(within, initial, sample, delays)
 
     def applied(step: int, *point: object) -> Array:
         if rules.is_asked(channel, step):
-            u[:] = law(*point)
+            u[:] = command = law(*point)
+            if correct:
+                rules.limit(channel, u)
+                correct(u - command)
         wheel_speeds = speeds(*point) if wheels else u[:0]
         rules.transmit(channel, step, wheel_speeds, u)
         return u.copy()

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from importlib import import_module
 from itertools import compress
 from pathlib import Path
@@ -16,32 +15,33 @@ import numpy as np
 from fflin.base.errors import FileError, InputError, listed, located, unknown
 from fflin.base.names import undotted
 from fflin.base.record import read_record, reading, texts
-from fflin.base.validation import Array, Mask, as_double, instance, number, shaped
+from fflin.base.validation import (
+    ArrayLike,
+    Mask,
+    as_double,
+    instance,
+    number,
+    shaped,
+)
 from fflin.base.writing import RECORDS, as_path, check_ending, reason
 from fflin.control.kalman import Compensator
-from fflin.control.policies import Feedback, Loop, OutputSensing, Sample
+from fflin.control.loops import NOT_CORRECTED
+from fflin.control.policies import LinearLaw, OutputSensing
 from fflin.control.policy import (
     Noise,
-    OutputForm,
-    Policy,
-    Predictor,
     System,
     unstable_note,
 )
-from fflin.dynamics.integrators import held_exponential
-from fflin.dynamics.outputs import Measuring
-from fflin.dynamics.state import StateMap
-from fflin.linear.fit import about_point, require_fit
+from fflin.linear.fit import about_point
 from fflin.linear.holding import held_if_possible, wheel_notes
 from fflin.linear.model import LinearModel
-from fflin.robot.robot import Robot
 
 # default signal names such as u[0], or no name
 _NUMBERED = re.compile(r"([a-z]\[\d+\])?")
 
 
 @dataclass(eq=False, repr=False)
-class LinearController(OutputSensing, Feedback):
+class LinearController(OutputSensing, LinearLaw):
     r"""Output feedback ``u - u0 = system (y - y0)`` by any linear controller `system`.
 
     .. math:: \dot z = A z + B (y - y_0),\qquad u - u_0 = C z + D (y - y_0),\qquad z(0) = 0
@@ -79,6 +79,9 @@ class LinearController(OutputSensing, Feedback):
         negative feedback, ``u - u0 = -K (y - y0)``.
     noise : callable, optional
         Function noise(t) that returns measurement noise (ny,), which is added to y.
+    anti_windup : array_like (nz, nu), optional
+        Gain E of the anti-windup: if limits change the command u to u_a, ``E (u_a - u)`` is added
+        to dz/dt, or to the next z of a sampled controller. By default, limits do not affect z.
 
     Attributes
     ----------
@@ -115,6 +118,7 @@ class LinearController(OutputSensing, Feedback):
     lin: LinearModel
     sign: float = field(default=1.0, kw_only=True)
     noise: Noise | None = field(default=None, kw_only=True)
+    anti_windup: ArrayLike | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         self.lin = lin = held_if_possible(about_point(self.lin))
@@ -144,6 +148,11 @@ class LinearController(OutputSensing, Feedback):
         B[:, columns] = controller.B
         C[rows] = self.sign * controller.C
         D[np.ix_(rows, columns)] = self.sign * controller.D
+        if lin.added and lin.C[:, len(lin.robot_states) :].any():
+            raise InputError(
+                "an output of the model feels delayed inputs directly, such as an accelerometer, "
+                "which a law with delayed inputs cannot measure; leave out this output"
+            )
         felt: Mask = np.logical_and(lin.D.any(axis=1), D.any(axis=0))
         if felt.any():
             raise InputError(
@@ -167,18 +176,23 @@ class LinearController(OutputSensing, Feedback):
         self.system = System(
             controller.A, B, C, D, dt, lin.output_names, lin.input_names
         )
-        self.dt: float = dt
         self.sign = 1.0  # `system` contains the sign from here on
+        self.windup = NOT_CORRECTED
+        if self.anti_windup is not None:
+            hint = " (nz, nu): states of the controller and inputs of the model"
+            self.windup = shaped(
+                "anti_windup", self.anti_windup, (nz, len(lin.u0)), hint
+            )
+
+    @property
+    def dt(self) -> float:
+        """Sampling time [s]; 0 in continuous time."""
+        return self.sample_time
 
     @property
     def notes(self) -> tuple[str, ...]:
         """Note on the momentum that wheels gain while they hold the robot at the point."""
         return wheel_notes(self.lin)
-
-    @property
-    def sample_time(self) -> float:
-        """Sampling time [s]; 0 in continuous time."""
-        return self.dt
 
     @property
     def sensors(self) -> tuple[str, ...]:
@@ -191,19 +205,6 @@ class LinearController(OutputSensing, Feedback):
         acting = self.system.B.any(axis=0) | self.system.D.any(axis=0)
         return tuple(compress(self.lin.state_names, self.lin.C[acting].any(axis=0)))
 
-    def linear_law(self) -> System:
-        """Return the controller."""
-        system: System = self.system
-        return system
-
-    def closed_loop(self) -> tuple[Array, float] | None:
-        """Return the closed-loop matrix of model and controller, and dt [s]."""
-        return self.loop, self.dt
-
-    def loop_around(self, sample: float) -> Callable[[LinearModel], Array] | None:
-        """Return the function from a sampled model to its closed-loop matrix."""
-        return self.sampled(sample).loop_with
-
     def loop_notes(self, held: float = 0.0) -> tuple[str, ...]:
         """Return notes on unstable poles of the linear loop and of the controller by itself."""
         hint = "; if it was designed for negative feedback, set sign=-1 (--negative-feedback)"
@@ -212,90 +213,11 @@ class LinearController(OutputSensing, Feedback):
             "controller by itself", self.system.A, self.dt, ""
         )
 
-    def held_for(self, seconds: float) -> Policy:
-        """Return the controller, sampled if it is continuous."""
-        return self.sampled(seconds)
-
-    def prediction(self, lin: LinearModel, state: StateMap) -> Predictor | None:
-        """Return the predictor of the closed loop with the model `lin`."""
-        if not self.dt:
-            both, gains, offset = self.around(lin)
-            return both, lambda e: offset + gains @ e
-        terms = self.terms()
-        z: Array = np.zeros(len(terms.A))
-
-        def command(e: Array) -> Array:
-            nonlocal z
-            u, z = terms.step(z, lambda u: lin.y0 + lin.C @ e + lin.D @ (u - lin.u0))
-            return u
-
-        return lin, command
-
-    def form(self, robot: Robot) -> OutputForm:
-        """Return the matrices of the controller, which are the same at all times."""
-        return OutputForm(self.bind(robot), self.terms, None)
-
     def __repr__(self) -> str:
         (nu, ny), dt = self.system.D.shape, self.dt
         time = f"dt={dt:g} s" if dt else "continuous"
         nz = len(self.system.A)
         return f"{type(self).__name__}('{self.lin.robot}', nz={nz}, ny={ny}, nu={nu}, {time})"
-
-    def terms(self, _: float = 0.0) -> Sample:
-        """Return the matrices and offsets, which are the same at all times."""
-        (A, B, C, D, *_), lin = self.system, self.lin
-        return Sample(A, B, C, D, lin.u0, lin.y0)
-
-    def bind(self, robot: Robot) -> Loop:
-        """Return policy(t, q, v) -> u for a robot; each call returns a policy with its own z.
-
-        Raises
-        ------
-        InputError
-            If the robot has other states, inputs or outputs than the model. Masses may differ.
-        """
-        lin = self.lin
-        terms = self.terms()
-        state = self.state_map(robot)
-        require_fit(lin, robot, state, sensed=True)
-        always = terms.step, Measuring(state, lin.q), state.read(lin.q, lin.v)
-        return Loop(state, self.dt, terms.B.shape, lambda _: always, self.noise)
-
-    def around(self, lin: LinearModel) -> tuple[LinearModel, Array, Array]:
-        """Return the model with the controller's states added, and K and u of the law u + K e."""
-        A, B, C, D, u0, y0, *_ = self.terms()
-        apart = lin.y0 - y0
-        none = np.zeros((len(lin.A), len(A)))
-        both = replace(
-            lin,
-            A=np.block([[lin.A, none], [B @ lin.C, A]]),
-            B=np.vstack((lin.B, B @ lin.D)),
-            f0=np.concatenate((lin.f0, B @ apart)),
-            x0=np.concatenate((lin.x0, np.zeros(len(A)))),
-        )
-        return both, np.hstack((D @ lin.C, C)), u0 + D @ apart
-
-    @cached_property
-    def loop(self) -> Array:
-        """Closed-loop matrix (nx + nz, nx + nz) of the states of model and controller."""
-        lin = self.lin
-        if self.dt and not lin.dt:
-            lin = lin.discretize(self.dt)
-        return self.loop_with(lin)
-
-    def loop_with(self, lin: LinearModel) -> Array:
-        """Return the closed-loop matrix of the controller and another model with its signals."""
-        both, K, _ = self.around(lin)
-        loop: Array = both.A + both.B @ K
-        return loop
-
-    def sampled(self, dt: float) -> LinearController:
-        """Return the controller sampled at dt [s]; a sampled controller is unchanged."""
-        system = self.system
-        if system.dt or not len(system.A):
-            return self
-        A, B = held_exponential(system.A, system.B, dt)
-        return replace(self, system=system._replace(A=A, B=B, dt=dt))
 
 
 class OutputFeedback(LinearController):
@@ -340,6 +262,10 @@ class OutputFeedback(LinearController):
         )
         super().__init__(compensator, lin, noise=noise)
         self.compensator = compensator
+        known = self.lin.state_names
+        if self.lin.added and {*compensator.state_names} <= {*known}:
+            # The estimate contains earlier commands, as they are after limits are applied.
+            self.windup = self.lin.B[[*map(known.index, compensator.state_names)]]
         if not lin.dt:
             raise InputError(
                 "the model must be sampled; use lin.discretize(dt), and design the gain and the "

@@ -25,9 +25,10 @@ from fflin.base.validation import (
     whole,
 )
 from fflin.control.gain import Gain
+from fflin.control.loops import next_sample
 from fflin.control.lqr import at_fixed_point, regulator
 from fflin.control.optimal.differential_riccati import bounded_by, samples_back
-from fflin.control.policies import Deviation, Feedback, StateFeedback, next_sample
+from fflin.control.policies import Deviation, Feedback, StateFeedback
 from fflin.control.policy import BoundLaw, Command
 from fflin.control.tracking import TrajectoryFeedback
 from fflin.control.trajectory_end import rest_or_fall, steady_regulator

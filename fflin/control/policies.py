@@ -3,30 +3,41 @@
 from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass, replace
-from typing import ClassVar, NamedTuple, TypeAlias
+from typing import ClassVar, Self, TypeAlias
 
 import numpy as np
 import pinocchio as pin
 
 from fflin.base import html
 from fflin.base.errors import InputError
-from fflin.base.validation import Array, frozen, instance, shaped, vector
+from fflin.base.validation import Array, frozen, instance, shaped
 from fflin.control.channel import Law
+from fflin.control.delayed import law_with_memory
 from fflin.control.gain import Gain
+from fflin.control.loops import (
+    NOT_CORRECTED,
+    Loop,
+    PredictedLaw,
+    Sample,
+    StateMeasuring,
+)
 from fflin.control.policy import (
     BoundLaw,
     Command,
+    Form,
     Noise,
+    OutputForm,
     Policy,
     Predictor,
     Reference,
     StateForm,
+    System,
     as_policy,
     bound,
 )
-from fflin.dynamics.aba import Aba
-from fflin.dynamics.coordinates import Frame
-from fflin.dynamics.outputs import KINDS, Measuring, state_indices
+from fflin.dynamics.coordinates import Chart, Frame
+from fflin.dynamics.integrators import held_exponential
+from fflin.dynamics.outputs import Measuring
 from fflin.dynamics.state import Actuation, StateMap, selection
 from fflin.dynamics.state_rows import readout
 from fflin.kernel.allocation import nearest
@@ -35,7 +46,6 @@ from fflin.linear.holding import held_if_possible, wheel_notes
 from fflin.linear.model import LinearModel, gain_map
 from fflin.linear.trajectory import Trajectory
 from fflin.robot.fields import input_limits, limits_of
-from fflin.robot.outputs import Gyroscope
 from fflin.robot.robot import Robot
 
 # Function of t, q and v that returns the reference inputs u*, and the error e relative to the
@@ -66,9 +76,14 @@ class Feedback(Policy):
         """Return the function of t, q, v that returns the reference inputs u* and the error e."""
         lin = self.lin
         state = self.state_map(robot)
-        S = selection(lin.state_names, state.names)
-        near = S.T @ lin.x0
-        return lambda _, q, v: (lin.u0, S @ state.read(q, v, near=near) - lin.x0)
+        S, x0 = self._robot_part(state)
+        near = S.T @ x0
+        return lambda _, q, v: (lin.u0, S @ state.read(q, v, near=near) - x0)
+
+    def _robot_part(self, state: StateMap) -> tuple[Array, Array]:
+        """Return the matrix that selects the model's states of a robot, and their values x0."""
+        names = self.lin.robot_states
+        return selection(names, state.names), self.lin.x0[: len(names)]
 
 
 class OutputSensing(Policy):
@@ -90,9 +105,215 @@ class OutputSensing(Policy):
         return noisy
 
 
+class LinearLaw(Feedback):
+    r"""Linear law with a state z, from measured outputs or states to the inputs.
+
+    .. math:: \dot z = A z + B (y - y_0) + E (u_a - u),\qquad u - u_0 = C z + D (y - y_0)
+
+    Here :math:`u_a` are the inputs after limits are applied. For a sampled law, the first equation
+    gives the next z. If `senses_outputs` is false, y is the state x of the model. Subclasses set
+    `system`, which contains A to D, and `windup`, which is E (nz, nu) or empty.
+    """
+
+    system: System
+    windup: Array = NOT_CORRECTED
+    noise: Noise | None = None
+
+    @property
+    def is_gain(self) -> bool:
+        """Whether the law is a gain of the states, without memory."""
+        return not (self.senses_outputs or len(self.system.A))
+
+    def bind(self, robot: Robot) -> Command:
+        """Return policy(t, q, v) -> u for a robot; each call returns a policy with its own z.
+
+        Raises
+        ------
+        InputError
+            If the robot has other states, inputs or measured outputs than the model. Masses may
+            differ.
+        """
+        if self.is_gain:
+            state = self.state_map(robot)
+            return readout(state, *self._gain_terms(state))
+        return self._loop(robot)
+
+    def form(self, robot: Robot) -> Form | None:
+        """Return the law as data for the compiled loop."""
+        if self.is_gain:
+            K, offset, x0 = self._gain_terms(self.state_map(robot))
+            return StateForm(offset[None], K[None], x0, {})
+        if self.noise is not None and not self.senses_outputs:
+            return None
+        terms = self._terms_of(self.state_map(robot))
+        return OutputForm(self._loop(robot), lambda _: terms, None)
+
+    def _gain_terms(self, state: StateMap) -> tuple[Array, Array, Array]:
+        """Return K and offset of the law u = offset - K x for a robot's full state x, and x0."""
+        lin = self.lin
+        K = -self.system.D
+        S, x0 = self._robot_part(state)
+        return K @ S, lin.u0 + K @ x0, S.T @ x0
+
+    def _loop(self, robot: Robot) -> Loop:
+        """Return the command of a law with memory or of measured outputs."""
+        lin = self.lin
+        state = self.state_map(robot)
+        terms = self._terms_of(state)
+        noise = self.noise
+        measure: Measuring | StateMeasuring
+        if self.senses_outputs:
+            require_fit(lin, robot, state, sensed=True)
+            measure = Measuring(state, lin.q)
+            near = state.read(lin.q, lin.v)
+        else:
+            measure = StateMeasuring(state)
+            near = terms.y0
+            noise = self._state_noise(state)
+        always = terms.step, measure, near
+        windup = (lambda _: terms.E) if terms.E.size else None
+        return Loop(
+            state,
+            self.sample_time,
+            terms.B.shape,
+            lambda _: always,
+            noise,
+            measures_state=not self.senses_outputs,
+            windup=windup,
+        )
+
+    def _state_noise(self, state: StateMap) -> Noise | None:
+        """Return the errors of a robot's full state, from the errors of the model's states."""
+        noise = self.noise
+        if noise is None:
+            return None
+        S, _ = self._robot_part(state)
+        return lambda t: S.T @ np.asarray(noise(t))
+
+    def _terms_of(self, state: StateMap) -> Sample:
+        """Return the matrices for the measured outputs, or for the full state of a robot."""
+        terms = self.terms()
+        if self.senses_outputs:
+            return terms
+        S, _ = self._robot_part(state)
+        return terms._replace(B=terms.B @ S, D=terms.D @ S, y0=S.T @ terms.y0)
+
+    @property
+    def sample_time(self) -> float:
+        """Sampling time [s]; 0 in continuous time."""
+        return self.system.dt or 0.0
+
+    def linear_law(self) -> System | None:
+        """Return the law from deviations of its sensors to u - u0."""
+        return self.system
+
+    def closed_loop(self) -> tuple[Array, float] | None:
+        """Return the closed-loop matrix of the model's state and z, and dt [s]."""
+        return self.loop, self.sample_time
+
+    def loop_around(self, sample: float) -> Callable[[LinearModel], Array] | None:
+        """Return the function from a sampled model to its closed-loop matrix."""
+        return self.sampled(sample).loop_with
+
+    def held_for(self, seconds: float) -> Policy:
+        """Return the law, sampled if it is continuous."""
+        return self.sampled(seconds)
+
+    def terms(self, _: float = 0.0) -> Sample:
+        """Return the matrices and offsets, which are the same at all times."""
+        lin = self.lin
+        A, B, C, D, *_ = self.system
+        y0 = lin.y0 if self.senses_outputs else lin.x0[: len(lin.robot_states)]
+        return Sample(A, B, C, D, lin.u0, y0, E=self.windup)
+
+    def prediction(self, lin: LinearModel, state: StateMap) -> Predictor | None:
+        """Return the predictor of the closed loop with the model `lin`."""
+        if self.is_gain:
+            K, constant, _ = self._gain_terms(state)
+            at_point = constant - K @ lin.x0
+            return lin, lambda e: at_point - K @ e
+        if not self.sample_time:
+            both, gains, offset = self.around(lin)
+            return both, lambda e: offset + gains @ e
+        C, D, y0 = self._measured(lin)
+        return lin, PredictedLaw(
+            self.terms(), lambda e, u: y0 + C @ e + D @ (u - lin.u0)
+        )
+
+    def _measured(self, lin: LinearModel) -> tuple[Array, Array, Array]:
+        """Return C, D and y0 of the values that the law measures of a model."""
+        if self.senses_outputs:
+            return lin.C, lin.D, lin.y0
+        n = len(lin.robot_states)
+        return np.eye(n, len(lin.A)), np.zeros_like(lin.B[:n]), lin.x0[:n]
+
+    def around(self, lin: LinearModel) -> tuple[LinearModel, Array, Array]:
+        """Return the model with the law's states added, and K and u of the law u + K e.
+
+        The inputs of this model are the limited inputs, which also drive the anti-windup.
+        """
+        A, B, C, D, u0, y0, _, E = self.terms()
+        measured, through, values = self._measured(lin)
+        apart = values - y0
+        gains = np.hstack((D @ measured, C))
+        offset = u0 + D @ apart
+        none = np.zeros((len(lin.A), len(A)))
+        rows = np.hstack((B @ measured, A))
+        inputs, drift = B @ through, B @ apart
+        if E.size:
+            rows = rows - E @ gains
+            inputs = inputs + E
+            drift = drift - E @ (offset - lin.u0)
+        both = replace(
+            lin,
+            A=np.vstack((np.hstack((lin.A, none)), rows)),
+            B=np.vstack((lin.B, inputs)),
+            f0=np.concatenate((lin.f0, drift)),
+            x0=np.concatenate((lin.x0, np.zeros(len(A)))),
+        )
+        return both, gains, offset
+
+    @property
+    def loop(self) -> Array:
+        """Closed-loop matrix (nx + nz, nx + nz) of the states of model and law."""
+        lin = self.lin
+        if self.sample_time and not lin.dt:
+            lin = lin.discretize(self.sample_time)
+        return self.loop_with(lin)
+
+    def loop_with(self, lin: LinearModel) -> Array:
+        """Return the closed-loop matrix of the law and another model with its signals."""
+        A, B, C, D, *_ = self.system
+        measured, through, _ = self._measured(lin)
+        loop: Array = np.block(
+            [
+                [lin.A + lin.B @ D @ measured, lin.B @ C],
+                [B @ (measured + through @ D @ measured), A + B @ through @ C],
+            ]
+        )
+        return loop
+
+    def sampled(self, dt: float) -> Self:
+        """Return the law sampled at dt [s]; a sampled law is unchanged."""
+        A, B, *_ = self.system
+        if self.sample_time or not len(A):
+            return self
+        width = B.shape[1]
+        driven = np.hstack((B, self.windup)) if self.windup.size else B
+        A, driven = held_exponential(A, driven, dt)
+        law = copy(self)
+        law.system = self.system._replace(A=A, B=driven[:, :width], dt=dt)
+        if self.windup.size:
+            law.windup = driven[:, width:]
+        return law
+
+
 @dataclass(eq=False, repr=False)
-class StateFeedback(Feedback):
+class StateFeedback(LinearLaw):
     """State feedback ``u = u0 - K (x - x0)`` about the operating point of a model.
+
+    Of a model with delayed inputs, see `LinearModel.discretize`, x contains earlier commands. The
+    law remembers them, as they are after limits are applied.
 
     The angle of a continuous joint is unwrapped, so that it differs from x0 by at most half a turn.
 
@@ -131,7 +352,13 @@ class StateFeedback(Feedback):
             _require_designed_for(K, self.lin)
             K = K.K
         self.K = frozen(shaped("K", K, about_point(self.lin).B.shape[::-1], hint))
-        self.lin = held_if_possible(self.lin)
+        self.lin = lin = held_if_possible(self.lin)
+        self.system = law_with_memory(
+            self.K, lin.A, lin.B, lin.dt, lin.state_names, lin.input_names
+        )
+        if lin.added:
+            # The law remembers the inputs after limits are applied.
+            self.windup = lin.B[len(lin.robot_states) :]
 
     def __repr__(self) -> str:
         nu, nx = self.K.shape
@@ -148,45 +375,21 @@ class StateFeedback(Feedback):
 
     @property
     def feedback_gain(self) -> Array | None:
-        """The gain K."""
-        return self.K
+        """The gain K, or None if the law also has integrals."""
+        return self.K if self.is_gain else None
 
     @property
     def sensors(self) -> tuple[str, ...]:
-        """Names of the states of the model."""
-        return self.lin.state_names
+        """Names of the states of the robot in the model."""
+        return self.lin.robot_states
 
     def with_sensor_errors(self, error: Callable[[float], Array]) -> Policy:
         """Return the feedback of states with errors."""
-        return _Erring(self, error)
-
-    def prediction(self, lin: LinearModel, state: StateMap) -> Predictor | None:
-        """Return the predictor of the closed loop with the model `lin`."""
-        K, constant, _ = self.terms(state)
-        at_point = constant - K @ lin.x0
-        return lin, lambda e: at_point - K @ e
-
-    def form(self, robot: Robot) -> StateForm:
-        """Return the gain of the full state."""
-        K, offset, x0 = self.terms(self.state_map(robot))
-        return StateForm(offset[None], K[None], x0, {})
-
-    def terms(self, state: StateMap) -> tuple[Array, Array, Array]:
-        """Return K and offset of the law u = offset - K x for a robot's full state x, and x0."""
-        lin = self.lin
-        S = selection(self.lin.state_names, state.names)
-        return self.K @ S, lin.u0 + self.K @ lin.x0, S.T @ lin.x0
-
-    def bind(self, robot: Robot) -> Command:
-        """Return policy(t, q, v) -> u for a robot.
-
-        Raises
-        ------
-        InputError
-            If the robot has other states or inputs than the model. Masses may differ.
-        """
-        state = self.state_map(robot)
-        return readout(state, *self.terms(state))
+        if self.is_gain:
+            return _Erring(self, error)
+        noisy = copy(self)
+        noisy.noise = error
+        return noisy
 
 
 def _require_designed_for(gain: Gain, lin: LinearModel) -> None:
@@ -380,6 +583,8 @@ class AllocatedPolicy(BoundLaw):
         self._command = Law(inner, names, (-free, free), np.inf)
         self._inner = inner if isinstance(inner, BoundLaw) else None
         self.advance = self._inner.advance if self._inner else None
+        if self._inner and self._inner.correct:
+            self.correct = self._correct
         self._data = robot.create_data()
         self._design_data = allocation.design.create_data()
         self._limits = input_limits(robot, limits_of(robot))
@@ -404,153 +609,30 @@ class AllocatedPolicy(BoundLaw):
         chart = state.unchecked_chart(q)
         u = self._design.in_base_axes(chart, self._command(t, q, v))
         force = self._design.columns(self._data, q) @ u
-        columns = chart.to_reference(
-            self._robot.held, self._robot.columns(self._data, q).T
-        ).T
+        columns = self._columns(self._robot, chart, q)
         M = state.project(pin.crba(state.robot.model, self._design_data, q).T)
         factor = np.linalg.cholesky(M)
         scaled = np.linalg.solve(factor, np.column_stack((columns, force)))
-        return nearest(scaled[:, :-1], scaled[:, -1], *self._limits)
+        allocated = nearest(scaled[:, :-1], scaled[:, -1], *self._limits)
+        if self.correct:
+            asked = np.linalg.solve(factor, self._columns(self._design, chart, q))
+            self._shortfall = allocated, scaled, asked
+        return allocated
 
+    def _columns(self, actuation: Actuation, chart: Chart, q: Array) -> Array:
+        """Return the generalised forces (6 + n, k) of unit inputs, in the axes of the inputs."""
+        columns = actuation.columns(self._data, q)
+        return chart.to_reference(actuation.held, columns.T).T
 
-def next_sample(t: float, last: float, dt: float) -> float:
-    """Return the time t of a sample; raise `InputError` if t is not `dt` [s] after time `last`.
+    def _correct(self, difference: Array) -> None:
+        """Tell the inner policy which of its commands are not achieved.
 
-    `last` is the time of the last sample, and negative before the first sample.
-    """
-    apart = t - last
-    if last >= 0.0 and abs(apart - dt) > 1e-6 * dt:
-        raise InputError(
-            f"the controller is called {apart:g} s after its last sample, expected "
-            f"{dt:g} s; leave out `sample`, or set `sample` to the expected value"
-        )
-    return t
-
-
-def measured_at(state: StateMap) -> tuple[list[int], list[Gyroscope]]:
-    """Return the index of each measured value, and the list of gyroscopes.
-
-    Each measured value is a state or a rate of a gyroscope. The index of a state is its index in
-    the state vector, and the indices of the gyroscope rates follow. Other sensors raise
-    `InputError`.
-    """
-    indices, gyros = list[int](), list[Gyroscope]()
-    for output in state.robot.outputs:
-        if isinstance(output, Gyroscope):
-            first = state.nx + 3 * len(gyros)
-            indices += range(first, first + 3)
-            gyros.append(output)
-        elif type(output) in KINDS:
-            raise InputError(f"a {type(output).__name__} is measured in Python")
-        else:
-            indices += state_indices(state, output)
-    return indices, gyros
-
-
-# Function of the command u that returns the outputs y.
-Measure: TypeAlias = Callable[[Array], Array]
-
-# Function of a controller's state z and a `Measure` that returns the command, and the next z or
-# dz/dt.
-Step: TypeAlias = Callable[[Array, Measure], tuple[Array, Array]]
-
-# Function of time that returns three values: the step function of a compensator, a function that
-# measures the robot's outputs, and the state near which angles are unwrapped.
-At: TypeAlias = Callable[[float], tuple[Step, Measuring, Array]]
-
-
-class Sample(NamedTuple):
-    """Control law ``u = u0 + C (z + jump) + D (y - y0)`` of a controller with state z.
-
-    ``A (z + jump) + B (y - y0)`` is the next z of a sampled controller, or dz/dt of a continuous
-    controller. `jump` is the change of z at a sample at which the reference changes.
-    """
-
-    A: Array
-    B: Array
-    C: Array
-    D: Array
-    u0: Array
-    y0: Array
-    jump: Array | float = 0.0
-
-    def step(self, z: Array, measure: Measure) -> tuple[Array, Array]:
-        """Return the command, and the next z or dz/dt."""
-        z = z + self.jump
-        u: Array = self.u0 + self.C @ z
-        if self.D.any():
-            # D acts only on outputs that do not depend on u, so `measure` can use an incomplete u.
-            u = u + self.D @ (measure(u) - self.y0)
-        return u, self.A @ z + self.B @ (measure(u) - self.y0)
-
-
-class Loop(BoundLaw):
-    """Policy that measures a robot's outputs and computes the command with a compensator.
-
-    The compensator's state z advances at each sample, or at each stage of the integrator if dt is
-    0. `sizes` contains the lengths of z and of the measured outputs y.
-    """
-
-    def __init__(
-        self,
-        state: StateMap,
-        dt: float,
-        sizes: tuple[int, int],
-        at: At,
-        noise: Noise | None = None,
-    ) -> None:
-        self.at, self.dt, self._noise, (nz, self._ny) = at, dt, noise, sizes
-        self.estimate: Array = np.zeros(nz)  # z at the next sample or stage
-        self.rates: list[Array] = [self.estimate]
-        self.stages = 0
-        self._last = -np.inf
-        self._at_rest: Array = np.zeros(state.robot.nv)
-        self._aba: Aba | None = None
-        if any(output.FEELS_ACCELERATION for output in state.robot.outputs):
-            self._aba = Aba(state)
-
-    def __call__(self, t: float, q: Array, v: Array) -> Array:
-        """Return the command at a sample or at a stage of the integrator."""
-        if self.dt:
-            self._last = next_sample(t, self._last, self.dt)
-        elif len(self.estimate) and len(self.rates) != self.stages + 1:
-            raise InputError(
-                "only fflin.simulate can integrate the states of a continuous controller; pass "
-                "the LinearController itself to fflin.simulate as the policy, or sample the "
-                "controller"
-            )
-        step, measure, near = self.at(t)
-        state = measure.state
-        x = measure.state.read(q, v, near=near)
-        noise: Array | float = 0.0
-        if self._noise is not None:
-            noise = vector(
-                "noise(t)", self._noise(t), self._ny, "one value for each output"
-            )
-
-        def measured(u: Array) -> Array:
-            a = self._at_rest
-            if aba := self._aba:
-                in_base = aba.actuation.in_base_axes(state.unchecked_chart(q), u)
-                a = aba.acceleration(q, v, in_base)
-            return np.asarray(measure(x, q, v, a) + noise)
-
-        u, after = step(self.estimate, measured)
-        if self.dt:
-            self.estimate = after
-        elif len(self.estimate):
-            self.rates.append(after)
-        return u
-
-    def advance(self, weights: Array, last: bool) -> None:
-        """Set z to a weighted sum of z at the start of the step and of dz/dt at the past stages.
-
-        `last` must be True at the last stage of a step. The state of a sampled compensator is not
-        changed. A compensator without states may be called at some of the stages only, because its
-        command may be held.
+        The difference of the achieved and the wanted generalised force is mapped to the inputs of
+        `design` whose force is nearest to it.
         """
-        if not self.dt and len(self.estimate):
-            self.estimate, self.stages = weights @ np.array(self.rates), self.stages + 1
-            if last:
-                self.rates = [self.estimate]
-                self.stages = 0
+        allocated, scaled, asked = self._shortfall
+        lack = scaled[:, :-1] @ (allocated + difference) - scaled[:, -1]
+        free = np.full(asked.shape[1], np.inf)
+        assert self._inner is not None
+        assert self._inner.correct is not None
+        self._inner.correct(nearest(asked, lack, -free, free))

@@ -130,7 +130,7 @@ def proportional(
 
 
 class OutputForm(NamedTuple):
-    """Data of a law that computes commands from measured outputs."""
+    """Data of a law with a memory that computes commands from measured outputs or states."""
 
     loop: Any  # the bound law, a `policies.Loop`
     terms: Callable[[float], Any]  # `policies.Sample` at a time [s]
@@ -194,7 +194,9 @@ class Policy(ABC):
         # describes.
         binding = _provider(cls, "bind")
         for name in _DESCRIBING:
-            if not issubclass(_provider(cls, name), binding):
+            # `issubclass` is not used, because an abstract class caches its answers, and `cls`
+            # shares the cache of its base class until it is complete.
+            if binding not in _provider(cls, name).__mro__:
                 setattr(cls, name, vars(Policy)[name])
 
     @abstractmethod
@@ -275,7 +277,7 @@ class Policy(ABC):
         """Names of the states that the law feeds back, or () if they are unknown."""
         if self.model is None:
             return ()
-        names = self.model.state_names
+        names = self.model.robot_states
         K = self.feedback_gain
         if K is None:
             return names
@@ -384,6 +386,9 @@ class BoundLaw(ABC):
 
     # Moves the memory of a continuous law by a stage of the integrator, see `Loop.advance`.
     advance: Callable[[Array, bool], None] | None = None
+    # Corrects the memory after each command by the difference (nu,) between the limited and the
+    # commanded inputs; None if the law has no such correction (anti-windup).
+    correct: Callable[[Array], None] | None = None
 
     @property
     def notes(self) -> tuple[str, ...]:

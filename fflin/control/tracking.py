@@ -12,13 +12,12 @@ from fflin.base.errors import EquilibriumError, InputError
 from fflin.base.names import by_name
 from fflin.base.validation import Array, instance
 from fflin.control.kalman import kalman
+from fflin.control.loops import Loop, Sample
 from fflin.control.policies import (
     Allocation,
     Deviation,
     Feedback,
-    Loop,
     OutputSensing,
-    Sample,
 )
 from fflin.control.policy import (
     Command,

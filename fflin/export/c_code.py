@@ -24,7 +24,7 @@ from fflin.base.errors import FileError, InputError, MissingPackageError, listed
 from fflin.base.record import content_digest, reading
 from fflin.base.validation import Array, frozen
 from fflin.base.writing import as_path, failing, read_file, write_atomically
-from fflin.control.policies import Loop, Measure
+from fflin.control.loops import Loop, Measure
 from fflin.control.policy import Command, Policy
 from fflin.dynamics.coordinates import Frame, frame_of
 from fflin.dynamics.outputs import Measuring

@@ -14,7 +14,8 @@ from fflin.base.rotation import conjugate, quaternion_product
 from fflin.base.validation import Array, Indices, instance
 from fflin.control.gain import Gain, model_of
 from fflin.control.kalman import Compensator
-from fflin.control.policies import Sample, StateFeedback
+from fflin.control.loops import Sample
+from fflin.control.policies import StateFeedback
 from fflin.control.policy import Command, OutputForm, PathForm, Policy, StateForm, bound
 from fflin.control.tracking import TrajectoryFeedback
 from fflin.control.tvlqr import GainSchedule
@@ -159,6 +160,11 @@ def _law_of(given: Design, robot: Robot) -> Law:
             title, policy, state, _samples(form.policy, state), {}, robot
         )
     lin = policy.model
+    if isinstance(form, OutputForm) and form.loop.measures_state:
+        raise InputError(
+            f"this {title} has a memory, which C code of state feedback does not support yet; "
+            "write the C code of an OutputFeedback"
+        )
     if isinstance(form, OutputForm) and not form.samples and lin:
         return _output_law(
             title,

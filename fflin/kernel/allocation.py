@@ -57,19 +57,25 @@ class LeastSquares(
     """
 
 
-class Allocation(namedtuple("Allocation", "asking giving point work problem")):
+class Allocation(namedtuple("Allocation", "asking giving point work problem back")):
     """Allocation of commands for the inputs of the robot `asking` to the inputs of `giving`.
 
     The two robots differ only in their inputs. `point` holds q and inputs: first the inputs
     of `asking`, later the inputs of `giving`. `work` is work space. If `problem` has no inputs,
-    nothing is allocated.
+    nothing is allocated. `back` is the problem of `write_difference`: it finds the inputs of
+    `asking` for a given force.
     """
 
 
 LEAST_SQUARES = Struct(LeastSquares, columns=LANED, state=INDICES, order=INDICES)
 _ROBOTS = {"asking": MECHANICS, "giving": MECHANICS}
 ALLOCATION = Struct(
-    Allocation, **_ROBOTS, point=POINT, work=LANED, problem=LEAST_SQUARES
+    Allocation,
+    **_ROBOTS,
+    point=POINT,
+    work=LANED,
+    problem=LEAST_SQUARES,
+    back=LEAST_SQUARES,
 )
 
 
@@ -202,17 +208,55 @@ def allocate(allocation, point, commanded):
         for index in range(count):
             store(work_point.pushing, index, 1.0 if index == unit else 0.0)
         _write_force(work, giving, work_point, columns, unit * size)
-    # Replace each force f by D^-1/2 L^-T f, whose squared norm is f^T M^-1 f.
     for column in range(count + 1):
-        solve_inwards(work, tree, columns, column * size)
-        for k in range(size):
-            pivot = load(work, tree.offsets.scaled + tree.row[k] + tree.depth[k])
-            at = column * size + k
-            store(columns, at, load(columns, at) * root(pivot))
+        _scale(work, tree, columns, column * size)
     for lane in range(vec.lane_count(point.u)):
         solve(problem, size, lane)
         for index in range(count):
             vec.poke(point.u, index, lane, problem.x[index])
+
+
+@called
+def write_difference(allocation, point, commanded):
+    """Replace a command by the difference of the applied and the commanded inputs of `asking`.
+
+    `point.u` contains the applied inputs of `giving`. Call this function after `allocate`, whose
+    scaled forces it uses. With an allocation, the difference is the input of `asking` whose force
+    is nearest to the difference of the achieved and the wanted force.
+    """
+    count = len(allocation.problem.least)
+    inputs = len(commanded)
+    if count == 0:
+        for index in range(inputs):
+            store(commanded, index, load(point.u, index) - load(commanded, index))
+        return
+    work, asking, back = allocation.work, allocation.asking, allocation.back
+    work_point, tree = allocation.point, asking.tree
+    achieved = allocation.problem.columns
+    size = len(tree.row)
+    write_columns(work, tree)
+    for unit in range(inputs):
+        for index in range(inputs):
+            store(work_point.pushing, index, 1.0 if index == unit else 0.0)
+        _write_force(work, asking, work_point, back.columns, unit * size)
+        _scale(work, tree, back.columns, unit * size)
+    for k in range(size):
+        lack = -load(achieved, count * size + k)
+        for index in range(count):
+            lack = lack + load(point.u, index) * load(achieved, index * size + k)
+        store(back.columns, inputs * size + k, lack)
+    for lane in range(vec.lane_count(commanded)):
+        solve(back, size, lane)
+        for index in range(inputs):
+            vec.poke(commanded, index, lane, back.x[index])
+
+
+def _scale(work, tree, columns, at):
+    """Replace a force f in `columns` by D^-1/2 L^-T f, whose squared norm is f^T M^-1 f."""
+    solve_inwards(work, tree, columns, at)
+    for k in range(len(tree.row)):
+        pivot = load(work, tree.offsets.scaled + tree.row[k] + tree.depth[k])
+        store(columns, at + k, load(columns, at + k) * root(pivot))
 
 
 def _write_force(work, robot, point, columns, at):

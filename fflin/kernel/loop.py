@@ -11,9 +11,17 @@ import numpy as np
 
 from fflin.kernel import forward
 from fflin.kernel import vectors as vec
-from fflin.kernel.allocation import allocate
+from fflin.kernel.allocation import allocate, write_difference
 from fflin.kernel.forward import MECHANICS, MOMENTUM_REFERENCE, POINT
-from fflin.kernel.policies import LAW, NOTHING, PATH, command, error, read_state
+from fflin.kernel.policies import (
+    LAW,
+    NOTHING,
+    PATH,
+    command,
+    correct,
+    error,
+    read_state,
+)
 from fflin.kernel.tree import FLAG, FLAGS, INDICES, LANED, REAL, REALS, WHOLE, Struct
 from fflin.kernel.vectors import Entries, angle, below, chosen, load, root, store
 
@@ -300,6 +308,17 @@ def _move(robot, method, point, stage):
         vec.displace(robot.tree, point.q, along, point.q)
 
 
+def _ask(work, robot, law, channel, point, t, step, stage):
+    """Write the command of the policy to `point.u`, and correct the memory of the policy."""
+    count = step // max(channel.sample, 1)
+    command(work, robot, law, point, t, count, stage)
+    allocate(law.allocation, point, law.u)
+    if len(law.filter.E) > 0:
+        limit(channel, point.u)
+        write_difference(law.allocation, point, law.u)
+        correct(law, count, stage)
+
+
 def advance(words, clock, last, every, rows, work):
     """Advance eight runs; `words` are the 64-bit words of `ARGUMENTS`, see `_advance`."""
     _advance(ARGUMENTS(words), clock, last, every, rows, work)
@@ -344,16 +363,7 @@ def _advance(arguments, clock, last, every, rows, work):
             t = step * h + method.nodes[stage]
             if law.kind != NOTHING and (channel.sample == 0 or stage == 0):
                 if is_asked(channel, step):
-                    command(
-                        work,
-                        robot,
-                        law,
-                        point,
-                        t,
-                        step // max(channel.sample, 1),
-                        stage,
-                    )
-                    allocate(law.allocation, point, law.u)
+                    _ask(work, robot, law, channel, point, t, step, stage)
                 transmit(channel, step, point.nu, point.u)
             forward.apply_faults(
                 robot.faults, robot.triads, step * h, h, point.u, point.pushing

@@ -220,11 +220,12 @@ class Grid(namedtuple("Grid", "joint first values stride K offset at")):
     """
 
 
-class Filter(namedtuple("Filter", "A B C D u0 y0 jump z rates")):
+class Filter(namedtuple("Filter", "A B C D u0 y0 jump E z rates")):
     """Linear controller u = u0 + C z + D dy with dy = y - y0.
 
-    z (nz,) is the controller state. Before each evaluation, `jump` is added to z. All arrays except
-    `z` and `rates` have one vector or matrix per sample, like `Law.origin`.
+    z (nz,) is the controller state. Before each evaluation, `jump` is added to z. After each
+    evaluation, E (applied - commanded) is added to the next z or to dz/dt, unless E is empty. All
+    arrays except `z` and `rates` have one vector or matrix per sample, like `Law.origin`.
 
     - In discrete time, A z + B dy is the next z, and `rates` (nz,) is work space.
     - In continuous time, A z + B dy is dz/dt. `rates` (1 + s, nz) stores z at the beginning of the
@@ -405,3 +406,23 @@ def _filter(controller, y, u, row, stage):
         )
     if not along:
         vec.copy(controller.rates, 0, controller.z, 0, size)
+
+
+@called
+def correct(law, count, stage):
+    """Add E du to a controller's next z or dz/dt (anti-windup); `law.u` contains du.
+
+    du is the difference of the limited and the commanded inputs. `count` and `stage` are the
+    arguments of `command`.
+    """
+    controller = law.filter
+    size = len(controller.z)
+    row = min(count, len(law.origin) // 7 - 1)
+    along = len(controller.rates) > size
+    for index in range(size):
+        change = _times(controller.E, row * size + index, law.u)
+        if along:
+            at = (1 + stage) * size + index
+            store(controller.rates, at, load(controller.rates, at) + change)
+        else:
+            store(controller.z, index, load(controller.z, index) + change)

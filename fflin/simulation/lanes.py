@@ -18,7 +18,7 @@ from fflin.base.process import Progress
 from fflin.base.rotation import rotation_matrix
 from fflin.base.validation import Array, Indices, Mask, shaped, vector
 from fflin.control.channel import channel_of
-from fflin.control.policies import Sample, measured_at
+from fflin.control.loops import Sample, measured_at
 from fflin.control.policy import Form, OutputForm, PathForm, Policy, StateForm
 from fflin.control.tracking import AT_THE_END, TrajectoryFeedback
 from fflin.dynamics.state import StateMap
@@ -28,6 +28,7 @@ from fflin.kernel.limits import Task, reason_against
 from fflin.kernel.tree import LANES, batch_tree, empty, laid_out, work_space
 from fflin.robot.fields import input_limits, limits_of
 from fflin.robot.joints import ROOT, find_frame
+from fflin.robot.outputs import Gyroscope
 from fflin.robot.robot import Robot
 from fflin.simulation.plan import Plan, Times
 from fflin.simulation.plant import Plant
@@ -121,11 +122,14 @@ def task_of(plan: Plan) -> Task:
         return task
     times = plan.times
     dt = form.loop.dt
+    measurements = ""
+    if not form.loop.measures_state:
+        measurements = _measurement_error(plant.state)
     return replace(
         task,
         own_sample_time=dt > 0.0 and abs(times.sample * times.dt - dt) > 1e-6 * dt,
         noise_at_stages=policy.measurement_noise is not None and not times.sample,
-        measurements=_measurement_error(plant.state),
+        measurements=measurements,
     )
 
 
@@ -552,7 +556,7 @@ def _linear(law: policies.Law, form: StateForm, state: StateMap) -> policies.Law
 def _filtered(
     law: policies.Law, plan: Plan, form: OutputForm, asking: Plant
 ) -> policies.Law:
-    """Return the law of a compensator.
+    """Return the law of a compensator, or of a state feedback with a memory.
 
     The law commands the inputs of the plant `asking`. Along a trajectory, the law contains the
     matrices of the compensator for each sample.
@@ -575,7 +579,9 @@ def _filtered(
         key: np.concatenate([getattr(term, key).ravel() for term in terms])
         for key in Sample._fields
     }
-    measured, gyros = measured_at(state)
+    measured, gyros = list(range(state.nx)), list[Gyroscope]()
+    if not loop.measures_state:
+        measured, gyros = measured_at(state)
     frames = [find_frame(asking.robot.model, gyro.frame) for gyro in gyros]
     axes = mechanics_of(plan.plant).tree.axes
     turns = [axes[f.joint - ROOT].T @ f.placement.rotation for f in frames]
@@ -607,6 +613,7 @@ def _allocation(
     size = plant.state.nx // 2
     least, most = input_limits(plant.robot, limits_of(plant.robot))
     inputs = max(len(robot.actuation.names) for robot in (asking, plant))
+    free = np.full(len(asking.actuation.names), np.inf)
     point = empty(forward.POINT)._replace(
         q=np.zeros(plant.robot.nq), pushing=np.zeros(inputs)
     )
@@ -616,6 +623,7 @@ def _allocation(
         point=point,
         work=np.zeros(max(asks.tree.offsets.size, giving.tree.offsets.size)),
         problem=allocation.least_squares(least, most, size),
+        back=allocation.least_squares(-free, free, size),
     )
 
 

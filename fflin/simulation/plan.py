@@ -29,6 +29,7 @@ from fflin.base.validation import (
     whole,
 )
 from fflin.control.channel import (
+    Correction,
     Inputs,
     Law,
     Saturation,
@@ -251,16 +252,25 @@ class Plan:
             setattr(other, name, value)
         return other
 
-    def applied(self, law: Inputs, speeds: Inputs) -> Inputs:
+    def applied_by(self, law: Law) -> Inputs:
+        """Return a function f(step, t, q, v) that computes the inputs (nu,) of a step.
+
+        See `applied`.
+        """
+        return self.applied(law, lambda t, q, v: v[self.wheels], law.correct)
+
+    def applied(
+        self, law: Inputs, speeds: Inputs, correct: Correction | None = None
+    ) -> Inputs:
         """Return a function f(step, *point) that computes the inputs (nu,) of a step.
 
         f calls ``law(*point)`` for the command, and ``speeds(*point)`` for the speeds of the wheels
         whose speed is limited. The actuator channel changes the command: limits, sample and hold,
-        delay and thruster pulses.
+        delay and thruster pulses. f calls `correct` after each command, see `channelled`.
         """
         times = self.times
         return channelled(
-            law, speeds, self.limits, self.initial, times.sample, times.delays
+            law, speeds, self.limits, self.initial, times.sample, times.delays, correct
         )
 
 

@@ -16,6 +16,7 @@ from fflin.base.names import group_of
 from fflin.base.process import LONG_RUN
 from fflin.base.rotation import conjugate
 from fflin.base.validation import Array, ArrayLike, instance
+from fflin.control.loops import PredictedLaw
 from fflin.control.policy import BoundLaw, Command, Policy, Predictor
 from fflin.control.tvlqr import GainSchedule
 from fflin.dynamics.coordinates import Frame
@@ -509,7 +510,9 @@ def predict(plan: Plan, foresees: Predictor, x: Array, steps: int) -> Array:
     x0, u0 = lin.x0, lin.u0
     # Indices in x of the wheel speeds that have limits.
     wheel_rows = plan.plant.state.nx // 2 + plan.limits.wheels.row
-    applied = plan.applied(foresees[1], speeds=lambda e: (x0 + e)[wheel_rows])
+    law = foresees[1]
+    correct = law.correct if isinstance(law, PredictedLaw) else None
+    applied = plan.applied(law, lambda e: (x0 + e)[wheel_rows], correct)
     rows: list[Array] = []
     e: Array = np.concatenate((x[0], np.zeros(len(x0) - x.shape[1]))) - x0
 

@@ -8,9 +8,11 @@ import fflin
 H = 0.1  # sampling time [s]
 
 
-def satellite(inputs=(fflin.BaseTorque(), fflin.BaseForce())):
+def satellite(inputs=None):
     """Return a rigid satellite and its model, a double integrator in each coordinate."""
-    robot = fflin.load("cubesat", inputs=list(inputs))
+    robot = fflin.load(
+        "cubesat", inputs=inputs or [fflin.BaseTorque(), fflin.BaseForce()]
+    )
     return robot, fflin.linearize(robot)
 
 
@@ -120,7 +122,7 @@ DELAYS = [0.07, 0.1, {"tau_b": 0.15, "F_b": 0.27}]
 
 
 @pytest.mark.parametrize("delay", DELAYS)
-@pytest.mark.parametrize("make", [compensator])
+@pytest.mark.parametrize("make", [compensator, state_feedback])
 def test_laws_of_a_delayed_model_fly_with_its_delay(make, delay):
     """From 1e-8, the nonlinear motion is that of the sampled linear loop."""
     robot, lin = satellite()
@@ -142,7 +144,7 @@ def test_laws_of_a_delayed_model_fly_with_its_delay(make, delay):
 
 
 @pytest.mark.compiled
-@pytest.mark.parametrize("make", [compensator])
+@pytest.mark.parametrize("make", [compensator, state_feedback])
 def test_both_engines_fly_delayed_laws(make):
     robot, lin = satellite()
     law = make(lin.discretize(H, DELAYS[-1]))
@@ -156,7 +158,7 @@ def test_both_engines_fly_delayed_laws(make):
 
 
 @pytest.mark.compiled
-@pytest.mark.parametrize("make", [compensator])
+@pytest.mark.parametrize("make", [compensator, state_feedback])
 def test_campaigns_fly_delayed_laws(make):
     """The drawn delay changes the delays of all inputs."""
     robot, lin = satellite()
@@ -170,3 +172,95 @@ def test_campaigns_fly_delayed_laws(make):
     ]
     one, other = (campaign.largest for campaign in campaigns)
     assert one == pytest.approx(other, rel=1e-9, abs=1e-12)
+
+
+@pytest.mark.parametrize("make", [compensator, state_feedback])
+def test_the_law_remembers_the_inputs_after_limits(make):
+    """The motion is that of the sampled model, whose inputs and memory are clipped."""
+    robot, lin = satellite()
+    late = lin.discretize(H, 0.15)
+    law = make(late)
+    most = 1e-9
+    x0 = 1e-8 * np.random.default_rng(6).normal(size=12)
+    motion = fflin.simulate(robot, law, x0=x0, duration=4.0, limits=most)
+    plant = np.append(x0, np.zeros(12))
+    K = fflin.lqr(late).K
+    terms = law.terms()
+    z = np.zeros(len(terms.A))
+    cut = 0
+    for k in range(40):
+        at = k * round(H / motion.step)
+        assert motion.x[at] == pytest.approx(plant[:12], abs=1e-14)
+        if make is state_feedback:
+            commanded = -K @ plant
+        else:
+            commanded, z = terms.step(z, lambda _, x=plant: x[:12])
+        u = np.clip(commanded, -most, most)
+        cut += (u != commanded).sum()
+        if make is compensator:
+            known = law.compensator.state_names
+            rows = [late.state_names.index(name) for name in known]
+            z = z + late.B[rows] @ (u - commanded)
+        plant = late.A @ plant + late.B @ u
+    assert cut > 20
+
+
+def test_allocated_commands_of_a_delayed_law():
+    """Inputs in another order give the same motion."""
+    design, _ = satellite()
+    pushed, _ = satellite([fflin.BaseForce(), fflin.BaseTorque()])
+    late = fflin.linearize(design).discretize(H, 0.15)
+    law = state_feedback(late)
+    x0 = 0.01 * np.random.default_rng(7).normal(size=12)
+    direct = fflin.simulate(design, law, x0=x0, duration=3.0)
+    allocated = fflin.simulate(
+        pushed, fflin.Allocation(law, design), x0=x0, duration=3.0
+    )
+    assert allocated.x == pytest.approx(direct.x, abs=1e-10)
+    different = fflin.linearize(design).discretize(H, {"tau_b": 0.15})
+    with pytest.raises(fflin.InputError, match="different delays"):
+        fflin.simulate(
+            pushed,
+            fflin.Allocation(state_feedback(different), design),
+            x0=x0,
+            duration=3.0,
+        )
+
+
+def test_accelerometers_that_feel_delayed_inputs_are_refused():
+    robot = fflin.load(
+        "cubesat",
+        inputs=[fflin.BaseForce()],
+        outputs=[fflin.FullState(), fflin.Accelerometer("base")],
+    )
+    late = fflin.linearize(robot).discretize(H, 0.15)
+    system = np.zeros((3, len(late.output_names)))
+    with pytest.raises(fflin.InputError, match="accelerometer"):
+        fflin.LinearController(system, late)
+
+
+def test_an_explicit_delay_replaces_that_of_the_model():
+    robot, lin = satellite()
+    law = state_feedback(lin.discretize(H, 0.15))
+    x0 = 0.01 * np.random.default_rng(8).normal(size=12)
+    default, same, other = (
+        fflin.simulate(robot, law, x0=x0, duration=2.0, **given)
+        for given in ({}, {"delay": 0.15}, {"delay": 0.05})
+    )
+    assert (default.x == same.x).all()
+    assert not np.allclose(default.x, other.x)
+
+
+def test_the_default_step_is_accurate_for_the_delayed_loop():
+    """A flexible mode shortens the step, as without a delay."""
+    arm = fflin.load("planar_detumble", stiffness=1e5)
+    lin = fflin.linearize(arm)
+    x0 = np.zeros(18)
+    x0[6] = 0.01
+    steps = []
+    for delay in (0.0, 0.05):
+        late = lin.discretize(H, delay)
+        law = fflin.StateFeedback(late, fflin.lqr(late))
+        steps.append(fflin.simulate(arm, law, x0=x0, duration=1.0).step)
+    assert steps[0] < 0.01
+    assert steps[1] == pytest.approx(steps[0])
