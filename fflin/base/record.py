@@ -26,7 +26,7 @@ import zlib
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
-from dataclasses import Field, dataclass, field, fields
+from dataclasses import MISSING, Field, dataclass, field, fields
 from errno import ENOMEM
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -421,8 +421,11 @@ class Design(Result):
             record, verified = read_record(source)
             if text(record["kind"]) != name:
                 raise ValueError(f"the file contains: {text(record['kind'])}")
+            # A field with a default may be missing in a file of an older version.
             values = {
-                item.name: _value(item, record[item.name]) for item in _saved(cls)
+                item.name: _value(item, record[item.name])
+                for item in _saved(cls)
+                if item.name in record or _is_required(item)
             }
             require_possible(values, getattr(cls, "_SHAPES", ""))
             return cls(**given, **values, verified=verified)
@@ -485,6 +488,11 @@ def _saved(cls: type[Design]) -> list[Field[object]]:
         item for item in fields(cls) if item.name != "verified" and item.name[0] != "_"
     )
     return [item for item in saved if item.type != "Robot"]
+
+
+def _is_required(item: Field[object]) -> bool:
+    """Return whether a field has no default."""
+    return item.default is MISSING and item.default_factory is MISSING
 
 
 def _value(item: Field[object], raw: object) -> Any:

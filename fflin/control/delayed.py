@@ -1,5 +1,7 @@
 """State feedback of models with delayed inputs, which contains its earlier commands."""
 
+import numpy as np
+
 from fflin.base.names import without_past
 from fflin.base.validation import Array
 from fflin.control.policy import System, proportional
@@ -17,21 +19,30 @@ def law_with_memory(
     dt: float,
     states: tuple[str, ...],
     inputs: tuple[str, ...],
+    integrals: tuple[str, ...] = (),
 ) -> System:
     r"""Return the feedback u - u0 = -K (x - x0) as a system from the states of the robot.
 
-    The last states of a model with delayed inputs are earlier commands z, which the law remembers:
+    Some states of a model with delayed inputs are earlier commands. The law remembers them, and
+    the states in `integrals`, as its state z:
 
-    .. math:: u - u_0 = -K_x (x - x_0) - K_z z, \qquad z_{+} = A_z z + B_z (u - u_0)
+    .. math:: u - u_0 = -K_x (x - x_0) - K_z z, \qquad
+              z_{+} = A_z z + A_{zx} (x - x_0) + B_z (u - u_0)
 
     A and B are the matrices of the model with the state names `states`.
     """
-    measured = without_past(states)
-    n = len(measured)
-    if n == len(states):
+    measured = [x for x in without_past(states) if x not in integrals]
+    if len(measured) == len(states):
         return proportional(K, dt, states, inputs)
-    K_x, K_z = K[:, :n], K[:, n:]
-    A_z, B_z = A[n:, n:], B[n:]
+    x = [states.index(name) for name in measured]
+    z = [i for i in range(len(states)) if i not in x]
+    K_x, K_z, B_z = K[:, x], K[:, z], B[z]
     return System(
-        A_z - B_z @ K_z, -B_z @ K_x, -K_z, -K_x, dt, inputs=measured, outputs=inputs
+        A[np.ix_(z, z)] - B_z @ K_z,
+        A[np.ix_(z, x)] - B_z @ K_x,
+        -K_z,
+        -K_x,
+        dt,
+        inputs=tuple(measured),
+        outputs=inputs,
     )

@@ -9,6 +9,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from fflin.analysis.ranks import DECAY
 from fflin.base import html, svg
@@ -21,7 +22,7 @@ from fflin.control.delayed import is_delayed, law_with_memory
 from fflin.control.optimal.disk import Loop, as_continuous, disk_gain, disk_phase
 from fflin.control.optimal.largest_gain import gain_crossings, largest_gain
 from fflin.control.optimal.riccati import Solution, rates_of
-from fflin.control.policy import Policy
+from fflin.control.policy import Policy, System
 from fflin.dynamics.coordinates import frame_of
 from fflin.dynamics.state import StateMap, selection
 from fflin.linear.fit import require_same
@@ -102,6 +103,11 @@ class Gain(ModelDesign):
         P, Q and N are zero for states that are not fed back.
     placement : ndarray (7,)
         Pose of the model's reference: position [m] and quaternion x, y, z, w.
+    integrals : tuple of str (k,)
+        Names of the integrals, which are the last entries of `state_names`; empty without integral
+        action. All matrices then belong to the model with the integrals as further states, as in
+        python-control: ``u = u0 - K [x - x0; xi]``. The integrals xi follow ``d(xi)/dt = H (x -
+        x0)``, or ``xi + dt H (x - x0)`` is the next xi of a sampled model.
     urdf_sha256 : str
         SHA-256 of the URDF of the robot that the gain was designed for, see `Robot`.
 
@@ -135,6 +141,7 @@ class Gain(ModelDesign):
     weights: str
     regulated: tuple[str, ...]
     placement: Vector
+    integrals: tuple[str, ...] = ()
     # The model for which the gain was designed; saved files do not contain it.
     _lin: LinearModel | None = field(default=None, repr=False, compare=False)
 
@@ -142,6 +149,10 @@ class Gain(ModelDesign):
         super().__post_init__()
         states = self.regulated or self.state_names
         require_known("state", states, self.state_names)
+        if self.state_names[self._size :] != self.integrals:
+            raise InputError(
+                f"the last states are not the integrals {listed(self.integrals)}"
+            )
         if not 0 < len(self.poles) <= len(states):
             raise InputError(
                 f"{len(self.poles)} poles for {len(states)} regulated states"
@@ -192,7 +203,13 @@ class Gain(ModelDesign):
         """Return one line with the control law, its size, its frame and its sampling time."""
         nu, nx = self.K.shape
         time = f"sampled at {self.dt:g} s" if self.dt else "continuous"
-        head = f"{self.robot}: u = u0 - K (x - x0), {nx} states, {nu} inputs"
+        law = f"u = u0 - K (x - x0), {nx} states"
+        if self.integrals:
+            law = (
+                f"u = u0 - K [x - x0; xi], {self._size} states, "
+                f"{len(self.integrals)} integrals xi"
+            )
+        head = f"{self.robot}: {law}, {nu} inputs"
         return f"{head}, frame {self.frame}, {time}"
 
     def _figures(self) -> str:
@@ -233,12 +250,86 @@ class Gain(ModelDesign):
         return notes
 
     @property
+    def _size(self) -> int:
+        """Number of states of the robot's model, without the integrals."""
+        return len(self.state_names) - len(self.integrals)
+
+    @property
+    def model_states(self) -> tuple[str, ...]:
+        """Names of the states of the robot's model, without the integrals."""
+        return self.state_names[: self._size]
+
+    @property
+    def K_x(self) -> Array:
+        """Gain (nu, nx) of the states of the robot's model."""
+        return self.K[:, : self._size]
+
+    @property
+    def K_i(self) -> Array:
+        """Gain (nu, k) of the integrals."""
+        return self.K[:, self._size :]
+
+    @property
+    def H(self) -> Array:
+        """Matrix (k, nx) whose product with x - x0 is integrated."""
+        rows: Array = self.A[self._size :, : self._size]
+        return rows / (self.dt or 1.0)
+
+    @property
+    def _without_integrals(self) -> StaticLoop:
+        """The loop of the regulated states without integrals, with inputs scaled by R."""
+        names = [name for name in self.regulated if name not in self.integrals]
+        S = selection(names or self.model_states, self.state_names)
+        factor = np.linalg.cholesky(self.R)
+        return static_loop(
+            S @ self.closed_loop @ S.T, S @ self.B, self._H_of(S), factor, self.dt
+        )
+
+    def _H_of(self, S: Array) -> Array:
+        """Return H for the states that S selects."""
+        rows: Array = self.A[self._size :] @ S.T
+        return rows / (self.dt or 1.0)
+
+    @property
+    def integral_rates(self) -> Values:
+        """Rates [1/s] at which the integrals decay if they are slower than the loop.
+
+        They are the eigenvalues of ``G K_i``, where G is the static gain of the loop without
+        integrals, from the inputs to the integrated signals.
+        """
+        if not self.integrals:
+            return np.zeros(0, complex)
+        static = self._without_integrals.gain @ np.linalg.cholesky(self.R).T
+        rates: Values = np.linalg.eigvals(static @ self.K_i).astype(complex)
+        return rates
+
+    @property
+    def anti_windup(self) -> Array:
+        r"""Gain (k, nu) that corrects the integrals if limits change the commands.
+
+        ``anti_windup (u_applied - u)`` is added to d(xi)/dt, or to the next xi of a sampled model.
+        The gain is :math:`-K_i^+ / T_a`, with the pseudoinverse in the metric R. :math:`T_a` is the
+        slowest time constant of the loop without integrals.
+        """
+        K_i = self.K_i
+        if not K_i.size:
+            return np.zeros((0, 0))
+        weighted = K_i.T @ self.R
+        inverse = np.linalg.solve(weighted @ K_i, weighted)
+        rate = 1.0 / self._without_integrals.time
+        if self.dt:
+            rate = -math.expm1(-rate * self.dt)
+        return -rate * inverse
+
+    @property
     def closed_loop(self) -> Array:
         """Closed-loop matrix A - B K (nx, nx)."""
         return self.A - self.B @ self.K
 
     def to_control(self) -> ControlSystem:
-        """Return -K as a `control.StateSpace` from x - x0 to u - u0, with signal names.
+        """Return the law as a `control.StateSpace` from x - x0 to u - u0, with signal names.
+
+        The law is -K; integrals are states of the system.
 
         Raises
         ------
@@ -248,9 +339,28 @@ class Gain(ModelDesign):
             If two signals differ only by a dot or an underscore, because python-control has no dots
             in names.
         """
-        return state_space(
-            ([], [], [], -self.K), self.dt, (), self.state_names, self.input_names
-        )
+        if not self.integrals:
+            return state_space(
+                ([], [], [], -self.K), self.dt, (), self.state_names, self.input_names
+            )
+        names = self.integrals, self.model_states, self.input_names
+        return state_space(tuple(self.integral_law()[:4]), self.dt, *names)
+
+    def integral_law(self) -> System:
+        """Return the law from x - x0 to u - u0, whose states are the integrals.
+
+        Earlier commands, if the model contains them, are also states of the law.
+        """
+        if is_delayed(self.state_names):
+            names = self.state_names, self.input_names
+            return law_with_memory(
+                self.K, self.A, self.B, self.dt, *names, self.integrals
+            )
+        k = len(self.integrals)
+        A = np.eye(k) if self.dt else np.zeros((k, k))
+        B = self.A[self._size :, : self._size]
+        names = self.model_states, self.input_names
+        return System(A, B, -self.K_i, -self.K_x, self.dt, *names)
 
     def to(self, tool: str) -> ToolGain:
         """Return the gain, u0 and reference in another tool's coordinates, see `LinearModel.to`.
@@ -264,6 +374,11 @@ class Gain(ModelDesign):
         """
         from fflin.linear.exchange import tool_gain
 
+        if self.integrals:
+            raise InputError(
+                "the gain has integrals, which have no coordinates in other tools; convert the "
+                "gain of lqr without integral_action, or use gain.to_control()"
+            )
         if self._lin is None:
             raise InputError(
                 "the gain was read from a file, which does not contain the model; design the "
@@ -276,6 +391,35 @@ class Gain(ModelDesign):
         """Gain and phase margins at the inputs, computed at first access."""
         disk = min(1.0 / largest_gain(*asymmetry(self))[0], 2.0)
         return Margins(disk, disk_gain(disk), disk_phase(disk))
+
+
+class StaticLoop(NamedTuple):
+    """Loop at low frequency: static gain (k, nu), and its slowest time constant [s].
+
+    The gain is from the inputs, scaled by the inverse of `factor`, to the integrated signals.
+    """
+
+    gain: Array
+    terms: Array  # (k,) sizes of the terms that the rows of `gain` are computed from
+    time: float
+
+
+def static_loop(
+    loop: Array, B: Array, H: Array, factor: Array, dt: float
+) -> StaticLoop:
+    """Return the static gain of a closed loop from its scaled inputs to H x.
+
+    `factor` (nu, nu) is the lower Cholesky factor of a weight of the inputs. The inputs are scaled
+    such that this weight is the identity.
+    """
+    one = np.eye(len(loop)) if dt else np.zeros_like(loop)
+    driven = np.linalg.solve(factor, B.T).T
+    held = np.linalg.solve(one - loop, driven)
+    gain = H @ held
+    delayed = H @ np.linalg.solve(one - loop, held)
+    times = np.linalg.eigvals(delayed @ np.linalg.pinv(gain))
+    terms = np.abs(H) @ np.linalg.norm(held, axis=1)
+    return StaticLoop(gain, terms, float(np.abs(times).max()) * (dt or 1.0))
 
 
 def gain_matrix(gain: object) -> object:
@@ -304,9 +448,10 @@ def model_of(gain: Gain, robot: Robot, made: str, reference: pin.SE3) -> LinearM
 
     frame = frame_of(robot, gain.frame)
     state = StateMap(robot, reference=reference, frame=frame)
-    require_same(made, state, "state", gain.state_names, gain.state_units)
+    count = len(gain.model_states)
+    require_same(made, state, "state", gain.model_states, gain.state_units[:count])
     require_same(made, state, "input", gain.input_names, gain.input_units)
-    q, v = state.to_pinocchio(gain.x0)
+    q, v = state.to_pinocchio(gain.x0[:count])
     return linearize(robot, q, v, gain.u0, frame=frame, reference=reference)
 
 
@@ -318,13 +463,28 @@ def make_gain(
     R: Array,
     N: Array,
     weights: str = "as given",
+    *,
+    integrals: Integrals | None = None,
 ) -> Gain:
     """Return the gain of `lin` from the Riccati solution of `part`.
 
     `part` is `lin`, or a model with only some of the states of `lin`. The gain of the other states
-    is zero.
+    is zero. With `integrals`, the solution and the weights are of the extended model.
     """
     S = selection(part.state_names, lin.state_names)
+    more: dict[str, object] = {}
+    names: tuple[str, ...] = ()
+    if integrals is not None:
+        names = integrals.names
+        S = block_diag(S, np.eye(len(names)))
+        more = {
+            "A": integrals.A,
+            "B": integrals.B,
+            "x0": np.concatenate((lin.x0, np.zeros(len(names)))),
+            "state_names": (*lin.state_names, *names),
+            "state_units": (*lin.state_units, *integrals.units),
+            "integrals": names,
+        }
     return Gain._of(
         solution,
         lin,
@@ -334,9 +494,19 @@ def make_gain(
         R=R,
         N=S.T @ N,
         weights=weights,
-        regulated=part.state_names,
+        regulated=(*part.state_names, *names),
         _lin=lin,
+        **more,
     )
+
+
+class Integrals(NamedTuple):
+    """Names and units of integrals, and A and B of the model with the integrals as states."""
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    A: Array
+    B: Array
 
 
 def cautions(gain: Gain) -> list[str]:
@@ -528,9 +698,9 @@ def _remembered_asymmetry(gain: Gain, S: Array, scale: Array) -> Loop:
     A, B = S @ gain.A @ S.T, S @ gain.B
     names = gain.regulated or gain.state_names
     law = law_with_memory(gain.K @ S.T, A, B, gain.dt, names, gain.input_names)
-    n = len(law.inputs)
-    D = np.hstack((law.D, np.zeros((len(B.T), len(A) - n))))
-    memory = np.hstack((law.B, np.zeros((len(law.A), len(A) - n))))
+    measured = selection(law.inputs, names)
+    D = law.D @ measured
+    memory = law.B @ measured
     F = np.block([[A + B @ D, B @ law.C], [memory, law.A]])
     G = np.vstack((B, np.zeros((len(law.A), len(B.T))))) / scale
     H = scale[:, None] * np.hstack((D, law.C))

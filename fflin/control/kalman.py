@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -194,6 +194,9 @@ class Compensator(ModelDesign):
         estimator.
     y0, u0 : ndarray
         Outputs and inputs at the operating point.
+    E : ndarray (nz, nu), or empty
+        Gain of the anti-windup: ``E (u_applied - u)`` is added to dz/dt, or to the next z of a
+        sampled compensator, if limits change the command. Empty without integral action.
     dt : float
         Sampling time [s]; 0 for continuous time.
     state_names, input_names, output_names : tuple of str
@@ -216,6 +219,7 @@ class Compensator(ModelDesign):
     y0: Vector
     u0: Vector
     output_names: tuple[str, ...]
+    E: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     def _report(self) -> str:
         """Return the report with the sizes and the poles of the closed loop."""
@@ -392,6 +396,11 @@ def lqg(gain: Gain, estimator: Estimator) -> Compensator:
     For a sampled model, xh is the prediction from earlier samples, so that one sampling time is
     available for the computation.
 
+    If the gain has integrals, the compensator integrates the measured outputs, and the integrals
+    are its last states: u - u0 = -K xh - K_i xi. A constant disturbance then leaves no error in
+    these outputs, although it leaves an error in the estimate. If limits change the commands, the
+    filter uses the limited inputs, and the integrals are corrected as in `StateFeedback`.
+
     Parameters
     ----------
     gain : Gain
@@ -405,8 +414,8 @@ def lqg(gain: Gain, estimator: Estimator) -> Compensator:
     Raises
     ------
     InputError
-        If gain and estimator belong to different models, or the gain feeds back a state that the
-        estimator does not estimate.
+        If gain and estimator belong to different models, the gain feeds back a state that the
+        estimator does not estimate, or an integrated signal is not measured.
 
     Examples
     --------
@@ -420,30 +429,69 @@ def lqg(gain: Gain, estimator: Estimator) -> Compensator:
     e = instance(
         "estimator", estimator, Estimator, "an Estimator, as fflin.kalman returns it"
     )
+    nx = len(gain.model_states)
     if gain.dt != e.dt or not (
-        np.array_equal(gain.A, e.A) and np.array_equal(gain.B, e.B)
+        np.array_equal(gain.A[:nx, :nx], e.A) and np.array_equal(gain.B[:nx], e.B)
     ):
         raise InputError(
             "the gain and the estimator belong to different models; use one model for both"
         )
     names = e.estimated or e.state_names
-    if missing := [name for name in gain.regulated if name not in names]:
+    regulated = [name for name in gain.regulated if name not in gain.integrals]
+    if missing := [name for name in regulated if name not in names]:
         raise InputError(
             f"the gain feeds back {listed(missing)}, which the estimator does not estimate; use "
             "the same wheel_speeds= for both designs"
         )
     S = selection(names, e.state_names)
+    K = gain.K_x
+    A: Array = S @ (e.A - e.B @ K - e.L @ (e.C - e.D @ K)) @ S.T
+    B: Array = S @ e.L
+    C: Array = -K @ S.T
+    E = np.zeros((0, 0))
+    if gain.integrals:
+        driven = S @ (e.B - e.L @ e.D)
+        A, B, C = _with_integrals(gain, e, A, B, driven)
+        E = np.vstack((driven, gain.anti_windup))
     return Compensator._of(
         e,
-        A=S @ (e.A - e.B @ gain.K - e.L @ (e.C - e.D @ gain.K)) @ S.T,
-        B=S @ e.L,
-        C=-gain.K @ S.T,
+        A=A,
+        B=B,
+        C=C,
+        E=E,
         poles=np.concatenate((gain.poles, e.poles)),
-        state_names=names,
+        state_names=(*names, *gain.integrals),
         input_names=e.output_names,
         output_names=e.input_names,
         verified=gain.verified and e.verified,
     )
+
+
+def _with_integrals(
+    gain: Gain, e: Estimator, A: Array, B: Array, driven: Array
+) -> tuple[Array, Array, Array]:
+    """Return A, B and C of a compensator with the integrals of measured outputs as last states.
+
+    A and B are without integrals, and `driven` is the effect of the inputs on the estimate.
+    """
+    k = len(gain.integrals)
+    H, measured = gain.H, e.C[~e.D.any(axis=1)]
+    # combination of outputs whose value is H (x - x0)
+    rows = np.linalg.lstsq(measured.T, H.T, rcond=None)[0].T
+    lack = np.abs(rows @ measured - H).max(axis=1) > 1e-9 * np.abs(H).max()
+    if lack.any():
+        name = gain.integrals[int(lack.argmax())].removeprefix("integral.")
+        raise InputError(
+            f"the gain integrates {name}, which the outputs do not measure; add an output that "
+            "measures it, or leave it out of integral_action"
+        )
+    combined = np.zeros((k, len(e.C)))
+    combined[:, ~e.D.any(axis=1)] = rows
+    corner = np.eye(k) if gain.dt else np.zeros((k, k))
+    A = np.block([[A, -driven @ gain.K_i], [np.zeros((k, len(A))), corner]])
+    B = np.vstack((B, (gain.dt or 1.0) * combined))
+    S = selection(e.estimated or e.state_names, e.state_names)
+    return A, B, np.hstack((-gain.K_x @ S.T, -gain.K_i))
 
 
 @in_one_thread

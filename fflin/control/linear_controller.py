@@ -260,7 +260,8 @@ class OutputFeedback(LinearController):
             Compensator,
             "a Compensator, as fflin.lqg returns it",
         )
-        super().__init__(compensator, lin, noise=noise)
+        windup = compensator.E if compensator.E.size else None
+        super().__init__(compensator, lin, noise=noise, anti_windup=windup)
         self.compensator = compensator
         known = self.lin.state_names
         if self.lin.added and {*compensator.state_names} <= {*known}:

@@ -2,8 +2,10 @@
 
 import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from fflin.analysis.controllability import require_stabilizable, require_weighed
 from fflin.analysis.reduction import regulated_part
@@ -15,8 +17,10 @@ from fflin.base.errors import (
     listed,
 )
 from fflin.base.validation import Array, ArrayLike, dimension, instance
+from fflin.control import integral
 from fflin.control.default_weights import pace_of
-from fflin.control.gain import Gain, cautions, make_gain
+from fflin.control.gain import Gain, Integrals, cautions, make_gain
+from fflin.control.integral import Integrated
 from fflin.control.optimal.riccati import (
     Riccati,
     Solution,
@@ -25,7 +29,14 @@ from fflin.control.optimal.riccati import (
     solved,
     structured,
 )
-from fflin.control.weights import Rule, Weight, cost_weights, rule_weights, weight
+from fflin.control.weights import (
+    Rule,
+    Weight,
+    cost_weights,
+    integrated,
+    rule_weights,
+    weight,
+)
 from fflin.dynamics.state import selection
 from fflin.linear.holding import held, is_held
 from fflin.linear.model import LinearModel
@@ -42,6 +53,7 @@ def lqr(
     *,
     weights: Rule | None = None,
     wheel_speeds: bool | None = None,
+    integral_action: Integrated | None = None,
 ) -> Gain:
     r"""Return the linear quadratic regulator of a model about a fixed point.
 
@@ -102,6 +114,14 @@ def lqr(
         keys of `weights` in `Robot.replace`: ``q``, ``r`` and ``bryson`` replace single weights of
         the ``rule``. For a sampled model, the rule defines the continuous-time cost, which
         `sampled_cost` converts.
+    integral_action : sequence of str, mapping or array_like (k, nx), optional
+        Signals that are also integrated, so that a constant disturbance leaves no error in them:
+        names or groups of states or outputs, such as ``["q_b"]``, {name: weight}, or a matrix H
+        whose product with x - x0 is integrated. By default, the integrals are about three times
+        slower than the loop; ``gain.weights`` states their rates. The weights of a mapping are for
+        the integral over time of each signal. If no Q and R are given, the entry ``integral`` of
+        `weights`, or of the robot's `weights`, is the default. `Gain` describes the result, and
+        ``StateFeedback(lin, gain)`` flies it.
     wheel_speeds : bool, optional
         Whether to regulate the wheel speeds to their values at the operating point. By default,
         wheel speeds are regulated if inputs other than the wheels can change them. If True,
@@ -120,7 +140,8 @@ def lqr(
         lists the nonzero entries of f0 and the forces that no input balances.
     StabilizabilityError
         If a mode neither decays by itself nor can be stabilised by the inputs; the message names
-        the mode.
+        the mode. Also if constant inputs cannot change a combination of the integrated signals;
+        the message names the combination.
     InputError
         If a weight has a wrong size, is not positive (semi)definite, or is zero for a mode that
         does not decay by itself.
@@ -150,8 +171,20 @@ def lqr(
     ((9, 18), True)
     >>> fflin.lqr(lin, {"q_b": 100.0, "r_b": 10.0, "q_m": 10.0}, 1.0).margin > 0
     True
+    >>> fflin.lqr(lin, integral_action=["q_b"]).integrals
+    ('integral.q_b.x', 'integral.q_b.y', 'integral.q_b.z')
     """
-    gain = regulator(lin, Q, R, N, weights=weights, wheel_speeds=wheel_speeds)
+    if integral_action is None and Q is None and R is None and N is None:
+        integral_action = integrated(lin, weights)
+    gain = regulator(
+        lin,
+        Q,
+        R,
+        N,
+        weights=weights,
+        wheel_speeds=wheel_speeds,
+        integral_action=integral_action,
+    )
     _caution(gain)
     return gain
 
@@ -170,6 +203,7 @@ def regulator(
     *,
     weights: Rule | None = None,
     wheel_speeds: bool | None = None,
+    integral_action: Integrated | None = None,
 ) -> Gain:
     """Return the same gain as `lqr`, without the warnings about margins and thrusters.
 
@@ -189,7 +223,56 @@ def regulator(
         S = selection(part.state_names, lin.state_names)
         Q, cross = S @ Q @ S.T, S @ cross
     solution = _solve(part, Q, R, cross)
-    return make_gain(lin, part, solution, Q, R, cross, rule)
+    if integral_action is None:
+        return make_gain(lin, part, solution, Q, R, cross, rule)
+    action = integral.integral_action(lin, integral_action)
+    S = selection(part.state_names, lin.state_names)
+    H = _regulated_columns(lin, part, action)
+    solution, Q_i, pace = integral.with_integrals(
+        part, solution, (Q, R, cross), action, H
+    )
+    _warn_of_residual(solution)
+    integrals = Integrals(
+        action.state_names,
+        action.state_units,
+        *integral.extended(lin.A, lin.B, H @ S, lin.dt),
+    )
+    none = np.zeros((len(H), len(R)))
+    gain = make_gain(
+        lin,
+        part,
+        solution,
+        block_diag(Q, Q_i),
+        R,
+        np.vstack((cross, none)),
+        rule,
+        integrals=integrals,
+    )
+    rates = np.abs(gain.integral_rates)
+    least, most = f"{rates.min():.3g}", f"{rates.max():.3g}"
+    decay = least if least == most else f"{least} to {most}"
+    text = (
+        f"the integrals of {listed(action.names)} decay at {decay} 1/s, the loop without them at "
+        f"{pace:.3g} 1/s"
+    )
+    return replace(gain, weights=f"{rule}; {text}")
+
+
+def _regulated_columns(
+    lin: LinearModel, part: LinearModel, action: integral.IntegralAction
+) -> Array:
+    """Return H (k, nr) of the regulated states; raise an error if it contains other states."""
+    S = selection(part.state_names, lin.state_names)
+    H: Array = action.H @ S.T
+    other = np.abs(action.H - H @ S) > 1e-12 * np.abs(action.H).max()
+    if other.any():
+        row, column = np.argwhere(other)[0]
+        raise StabilizabilityError(
+            f"integral action on {action.names[row]} is not possible, because it contains "
+            f"{lin.state_names[column]}, which is not regulated; leave it out, or give inputs that "
+            "control it"
+        )
+    return H
 
 
 def acceleration_lqr(lin: LinearModel, Qp: Weight, Qv: Weight, Ra: Weight) -> Gain:
@@ -391,11 +474,16 @@ def _solve(lin: LinearModel, Q: Array, R: Array, N: Array) -> Solution:
             f"no stabilising solution of the Riccati equation was found: {error}; scale the "
             "weights, for example with bryson, or use acceleration_lqr for double integrators"
         ) from None
+    _warn_of_residual(solution)
+    return solution
+
+
+def _warn_of_residual(solution: Solution) -> None:
+    """Warn if the residual of the Riccati equation is large."""
     if solution.residual > _COARSE:
         warnings.warn(
             f"the relative residual of the Riccati equation is {solution.residual:.0e}, so the "
             "gain is inaccurate: the weights are badly scaled; scale them, for example with bryson",
             FflinWarning,
-            stacklevel=4,
+            stacklevel=5,
         )
-    return solution

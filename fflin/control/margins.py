@@ -265,14 +265,10 @@ def _law_of(policy: Policy | Gain, lin: LinearModel, sample: float | None) -> Sy
     """
     outputs = False
     if isinstance(policy, Gain):
-        law = law_with_memory(
-            policy.K,
-            policy.A,
-            policy.B,
-            policy.dt,
-            policy.state_names,
-            policy.input_names,
-        )
+        names = policy.state_names, policy.input_names
+        law = law_with_memory(policy.K, policy.A, policy.B, policy.dt, *names)
+        if policy.integrals:
+            law = policy.integral_law()
     else:
         given = as_policy(policy)
         if sample:

@@ -222,7 +222,7 @@ class LinearLaw(Feedback):
     def terms(self, _: float = 0.0) -> Sample:
         """Return the matrices and offsets, which are the same at all times."""
         lin = self.lin
-        A, B, C, D, *_ = self.system
+        A, B, C, D = self.system[:4]
         y0 = lin.y0 if self.senses_outputs else lin.x0[: len(lin.robot_states)]
         return Sample(A, B, C, D, lin.u0, y0, E=self.windup)
 
@@ -324,7 +324,9 @@ class StateFeedback(LinearLaw):
         are fed back. If its point is not a fixed point, but inputs can hold the robot there, u0 is
         these inputs, as in `lqr`.
     K : array_like (nu, nx) or Gain
-        Gain.
+        Gain. A `Gain` with integral action gives ``u = u0 - K (x - x0) - K_i xi``, with integrals
+        xi that are zero at the start. If limits change the commands, ``Gain.anti_windup`` corrects
+        the integrals.
 
     Raises
     ------
@@ -346,11 +348,15 @@ class StateFeedback(LinearLaw):
     K: Array
 
     def __post_init__(self) -> None:
-        hint = " (nu, nx); give the gain that was designed for this model"
-        K = self.K
-        if isinstance(K, Gain):
-            _require_designed_for(K, self.lin)
-            K = K.K
+        hint = (
+            " (nu, nx); give the gain that was designed for this model. A gain with integral "
+            "action must be given itself, not its matrix gain.K"
+        )
+        gain = self.K
+        K = gain
+        if isinstance(gain, Gain):
+            _require_designed_for(gain, self.lin)
+            K = gain.K_x
         self.K = frozen(shaped("K", K, about_point(self.lin).B.shape[::-1], hint))
         self.lin = lin = held_if_possible(self.lin)
         self.system = law_with_memory(
@@ -359,6 +365,12 @@ class StateFeedback(LinearLaw):
         if lin.added:
             # The law remembers the inputs after limits are applied.
             self.windup = lin.B[len(lin.robot_states) :]
+        self.integrals: tuple[str, ...] = ()
+        if isinstance(gain, Gain) and gain.integrals:
+            self.integrals = gain.integrals
+            self.system = gain.integral_law()
+            past = self.windup.reshape(-1, len(lin.u0))
+            self.windup = np.vstack((past, gain.anti_windup))
 
     def __repr__(self) -> str:
         nu, nx = self.K.shape
@@ -395,12 +407,12 @@ class StateFeedback(LinearLaw):
 def _require_designed_for(gain: Gain, lin: LinearModel) -> None:
     """Raise `InputError` if a gain was designed for a model with other signals or another point."""
     same = {
-        "states": gain.state_names == lin.state_names,
+        "states": gain.model_states == lin.state_names,
         "inputs": gain.input_names == lin.input_names,
         "sampling time": bool(np.isclose(gain.dt, lin.dt)),
         "frame": gain.frame == lin.frame,
-        "point": gain.x0.shape == lin.x0.shape
-        and bool(np.allclose(gain.x0, lin.x0, atol=1e-9)),
+        "point": len(gain.model_states) == len(lin.x0)
+        and bool(np.allclose(gain.x0[: len(lin.x0)], lin.x0, atol=1e-9)),
         "reference": bool(np.allclose(gain.placement, lin.placement, atol=1e-9)),
     }
     different = [name for name, agrees in same.items() if not agrees]

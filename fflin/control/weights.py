@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -413,7 +413,7 @@ def rule_weights(
     source = lin.generator or lin.undelayed
     if not isinstance(given, Mapping):
         given = {"rule": given}
-    require_known("part of weights", given, ("rule", "q", "r", "bryson"))
+    require_known("part of weights", given, ("rule", "q", "r", "bryson", "integral"))
     robot_weights = lin.weights if given.get("rule") is None else {}
     name = robot_weights.get("rule", given.get("rule"))
     terms: Array = np.zeros(sum(source.B.shape))
@@ -453,6 +453,14 @@ def rule_weights(
         return state_weight("Q", Q, lin), R, None, rule
     delays = dict(zip(input_keys(lin), lin.delay.tolist(), strict=True))
     return (*sampled_cost(source, lin.dt, Q, R, delay=delays), rule)
+
+
+def integrated(lin: LinearModel, given: Rule | None) -> Any:
+    """Return the integrated signals of `given` or of the robot's weights, or None."""
+    own = given.get("integral") if isinstance(given, Mapping) else None
+    if own is None and isinstance(lin, LinearModel):
+        own = lin.weights.get("integral")
+    return own
 
 
 def _limited_wheels(lin: LinearModel, wheels: Indices) -> Indices:

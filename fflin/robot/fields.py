@@ -276,9 +276,10 @@ def _state(what: str, value: object, robot: RobotData) -> dict[str, object]:
 
 
 def _weights(value: object, robot: RobotData) -> dict[str, object]:
-    """Return the checked weights of `lqr`: the rule, and the mappings q, r and bryson.
+    """Return the checked weights of `lqr`: the rule, the mappings q, r and bryson, and `integral`.
 
-    The keys of the mappings are names, groups or patterns of states and inputs.
+    The keys of the mappings are names, groups or patterns of states and inputs. `integral` contains
+    names of states or outputs, or a mapping {name: weight of the integral}.
     """
     states, inputs = state_keys(robot.joint_names), input_keys_of(robot)
     both = (*states, *inputs)
@@ -287,7 +288,7 @@ def _weights(value: object, robot: RobotData) -> dict[str, object]:
         "r": ("input", inputs),
         "bryson": ("state or input", both),
     }
-    given = _parts("weights", value, ("rule", *kinds))
+    given = _parts("weights", value, ("rule", *kinds, "integral"))
     require_known("rule of weights", [str(given.get("rule", RULES[0]))], RULES)
     weights: dict[str, dict[str, float]] = {}
     for part, (kind, names) in kinds.items():
@@ -304,8 +305,34 @@ def _weights(value: object, robot: RobotData) -> dict[str, object]:
                 raise InputError(message)
     indices = by_name("state or input", weights["bryson"], both)
     warn_of_degrees(robot, {both[i]: size for i, size in indices.items()})
-    rule = {"rule": given["rule"]} if "rule" in given else {}
-    return rule | {part: entries for part, entries in weights.items() if entries}
+    checked: dict[str, object] = {}
+    if "rule" in given:
+        checked["rule"] = given["rule"]
+    checked |= {part: entries for part, entries in weights.items() if entries}
+    if given.get("integral"):
+        checked["integral"] = _integrated(given["integral"])
+    return checked
+
+
+def _integrated(value: object) -> object:
+    """Return the signals that `lqr` integrates: a tuple of names, or a mapping {name: weight}.
+
+    The names are checked by `lqr`, because the outputs of a robot may have any names.
+    """
+    if isinstance(value, Mapping):
+        weights = numbers("integral", value, "name", "weight of the integral of")
+        for name, weight in weights.items():
+            if weight <= 0.0:
+                raise InputError(
+                    f"weight of the integral of '{name}' is {weight:g}, expected more than 0"
+                )
+        return weights
+    names = (value,) if isinstance(value, str) else value
+    if not isinstance(names, Sequence) or not all(isinstance(x, str) for x in names):
+        raise InputError(
+            f"integral in weights is {value!r}, expected names such as ['q_b'], or {{name: weight}}"
+        )
+    return tuple(names)
 
 
 def checked_names(what: str, value: object, bare: RobotData) -> tuple[str, ...]:

@@ -151,9 +151,11 @@ class Robot(RobotData):
             no spring and no position limits. Such a joint need not be named if it spins at the
             operating point.
         weights : mapping
-            Default weights of `lqr` under its keywords ``rule``, ``q``, ``r`` and ``bryson``.
-            ``rule`` is "urdf" or "identity". ``q`` and ``r`` are weights, and ``bryson`` contains
-            largest values: {state, input, group or pattern: value}.
+            Default weights of `lqr` under the keys ``rule``, ``q``, ``r``, ``bryson`` and
+            ``integral``. ``rule`` is "urdf" or "identity". ``q`` and ``r`` are weights, and
+            ``bryson`` contains largest values: {state, input, group or pattern: value}.
+            ``integral`` contains the signals that `lqr` also integrates, as its argument
+            ``integral_action``: names of states or outputs, or {name: weight}.
         point : mapping
             Default operating point of commands such as `fflin linearize`, `fflin check` and
             `fflin lqr`. Functions ignore `point`, because their arguments define the operating

@@ -20,7 +20,7 @@ class Integrating(LinearLaw):
 
     def __init__(self, lin, dt, windup=True):
         self.lin = lin
-        nx, nu = lin.B.shape
+        nx = len(lin.A)
         nz = nx // 2
         K = coarse(fflin.lqr(lin.discretize(dt) if dt else lin).K)
         picked = np.eye(nz, nx)

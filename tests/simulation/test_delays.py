@@ -118,11 +118,16 @@ def state_feedback(late):
     return fflin.StateFeedback(late, fflin.lqr(late))
 
 
+def integral_feedback(late):
+    """Return the state feedback with integral action of a model with delayed inputs."""
+    return fflin.StateFeedback(late, fflin.lqr(late, integral_action=["q_b"]))
+
+
 DELAYS = [0.07, 0.1, {"tau_b": 0.15, "F_b": 0.27}]
 
 
 @pytest.mark.parametrize("delay", DELAYS)
-@pytest.mark.parametrize("make", [compensator, state_feedback])
+@pytest.mark.parametrize("make", [compensator, state_feedback, integral_feedback])
 def test_laws_of_a_delayed_model_fly_with_its_delay(make, delay):
     """From 1e-8, the nonlinear motion is that of the sampled linear loop."""
     robot, lin = satellite()
@@ -144,7 +149,7 @@ def test_laws_of_a_delayed_model_fly_with_its_delay(make, delay):
 
 
 @pytest.mark.compiled
-@pytest.mark.parametrize("make", [compensator, state_feedback])
+@pytest.mark.parametrize("make", [compensator, state_feedback, integral_feedback])
 def test_both_engines_fly_delayed_laws(make):
     robot, lin = satellite()
     law = make(lin.discretize(H, DELAYS[-1]))
@@ -264,3 +269,37 @@ def test_the_default_step_is_accurate_for_the_delayed_loop():
         steps.append(fflin.simulate(arm, law, x0=x0, duration=1.0).step)
     assert steps[0] < 0.01
     assert steps[1] == pytest.approx(steps[0])
+
+
+def test_integral_action_of_a_delayed_law():
+    """The integrals remove the error under a constant torque; the poles are those of the gain."""
+    robot, lin = satellite()
+    late = lin.discretize(H, 0.15)
+    gain = fflin.lqr(late, integral_action=["q_b"])
+    assert gain.state_names[12:15] == (
+        "past_1.tau_b.x",
+        "past_2.tau_b.x",
+        "past_1.tau_b.y",
+    )
+    law = fflin.StateFeedback(late, gain)
+    poles = np.linalg.eigvals(law.closed_loop()[0])
+    for pole in gain.poles[np.abs(gain.poles) > 0.05]:
+        assert np.abs(poles - pole).min() < 1e-6
+    assert fflin.margins(law, late).disk == pytest.approx(
+        fflin.margins(gain, late).disk
+    )
+    torque = {"tau_b": (1e-6, 0.0, 0.0)}
+    errors = [
+        np.abs(
+            fflin.simulate(
+                robot,
+                feedback,
+                x0=np.zeros(12),
+                duration=200.0,
+                dt=0.05,
+                disturbance=torque,
+            ).x[-1, :3]
+        ).max()
+        for feedback in (law, state_feedback(late))
+    ]
+    assert errors[0] < 1e-3 * errors[1]
