@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass, replace
-from typing import ClassVar, Self, TypeAlias
+from typing import Any, ClassVar, Self, TypeAlias
 
 import numpy as np
 import pinocchio as pin
@@ -345,7 +345,7 @@ class StateFeedback(LinearLaw):
     """
 
     lin: LinearModel
-    K: Array
+    K: Any  # array (nu, nx) once the policy is made
 
     def __post_init__(self) -> None:
         hint = (

@@ -24,12 +24,12 @@ from fflin.base.errors import FileError, InputError, MissingPackageError, listed
 from fflin.base.record import content_digest, reading
 from fflin.base.validation import Array, frozen
 from fflin.base.writing import as_path, failing, read_file, write_atomically
-from fflin.control.loops import Loop, Measure
-from fflin.control.policy import Command, Policy
+from fflin.control.loops import Loop, Measure, next_sample
+from fflin.control.policy import BoundLaw, Command, Policy
 from fflin.dynamics.coordinates import Frame, frame_of
 from fflin.dynamics.outputs import Measuring
 from fflin.dynamics.state import StateMap
-from fflin.export.laws import CASES, Law, law_of, measured
+from fflin.export.laws import CASES, Case, Law, law_of, measured
 from fflin.linear.fit import require_same, require_turns
 from fflin.robot.robot import Robot
 
@@ -65,7 +65,8 @@ def write_c(
       velocities. ``NAME_step`` computes the state in the same way as `StateMap`, then the inputs
       from the state.
     - For an output feedback, the arguments are the outputs y, and the controller memory, which the
-      caller allocates.
+      caller allocates. A state feedback with integral action also has this memory. If the inputs
+      saturate at `limits`, the integrals are corrected as in `simulate`.
     - For gains along a trajectory, the sample number is an additional argument.
 
     Parameters
@@ -326,6 +327,8 @@ class CLaw(Policy):
         )
         at = [*range(7 + n), *range(7 + room, 13 + n + room)]
         samples = self._about["kind"] == "samples"
+        if self._about["memory"]:
+            return _Remembering(self, world, given, at, u)
 
         def policy(t: float, q: Array, v: Array) -> Array:
             given[at] = measured(world, q, v)
@@ -358,6 +361,26 @@ class CLaw(Policy):
                 f"the C code of '{self.name}' returned INVALID at t = {t:g} s: an argument was not "
                 "finite or too large"
             )
+
+
+class _Remembering(BoundLaw):
+    """Command of the C code of a state law with a memory."""
+
+    def __init__(
+        self, law: CLaw, world: StateMap, given: Any, at: list[int], u: Any
+    ) -> None:
+        self._law, self._world, self._given, self._at = law, world, given, at
+        self._memory: Any = np.zeros(law._about["memory"], law._real)
+        self._u = u
+        self._last = -np.inf
+
+    def __call__(self, t: float, q: Array, v: Array) -> Array:
+        """Return the inputs (nu,) of a sample, and advance the memory."""
+        self._last = next_sample(t, self._last, self._law.dt)
+        self._given[self._at] = measured(self._world, q, v)
+        self._law._call(t, self._memory.ctypes, self._given.ctypes, self._u.ctypes)
+        command: Array = self._u.astype(float)
+        return command
 
 
 def _compiled(source: Path, compiler: str) -> ctypes.CDLL:
@@ -407,16 +430,10 @@ def _texts(law: Law, name: str, real: str) -> tuple[str, dict[str, str]]:
     bounds = error * np.max([case.scale for case in law.cases], axis=0)
     sizes = [f"{x:.2e} {unit}" for x, unit in zip(bounds, units, strict=False)]
     array = partial(_array, real=real)
-    vectors = []
-    for case in law.cases:
-        out = case.out.copy()
-        out[: len(names)] = np.clip(out[: len(names)], tables["low"], tables["high"])
-        numbers = map(array, (case.given, out, error * case.scale))
-        status = int((out != case.out).any())
-        vectors.append(f"{{{case.sample}UL, {', '.join(numbers)}, {status}}}")
+    vectors = [_vector(case, law, error, array) for case in law.cases]
     outs = [
         *map(_plain, names),
-        *(f"next z[{k}]" for k in range(len(out) - len(names))),
+        *(f"next z[{k}]" for k in range(law.memory)),
     ]
     of_type = _DOUBLE if real == "double" else _FLOAT
     signal = "x" if state else "y"
@@ -444,15 +461,21 @@ def _texts(law: Law, name: str, real: str) -> tuple[str, dict[str, str]]:
         "row": "0",
         f"{kind}_list": _listed(signal, *law.signals),
         "vectors": "{\n" + ",\n".join(vectors) + "}",
-        "ins": len(case.given),
+        "ins": len(law.cases[0].given),
         "outs": len(outs),
         "out_names": ",\n".join(f'    "{out_name}"' for out_name in outs),
     }
+    words |= dict.fromkeys(("windup", "windup_next", "windup_comment"), "")
+    if tables["E"].size:
+        words["windup"] = _filled("windup.c", words)
+        words["windup_next"] = _filled("windup_next.c", words)
+        words["windup_comment"] = "\n * plus E times the change of u by the limits"
     if state:
         words |= _state_words(law, state)
         words["interpolation"] = (
             _filled("interpolation.c", words) if "axis_size" in tables else ""
         )
+        words |= _memory_words(words, law.memory, str(words["sample_given"]))
     else:
         nz = len(tables["A"])
         words |= {"states": nz, "states_max": max(nz, 1), "outputs": len(tables["y0"])}
@@ -469,7 +492,7 @@ def _texts(law: Law, name: str, real: str) -> tuple[str, dict[str, str]]:
         "signals": {"input": law.inputs, kind: law.signals},
         "nq": robot.nq,
         "u0": tables["u0"][0].tolist(),
-        "memory": 0 if state else len(tables["A"]),
+        "memory": law.memory,
         "reference": None,
         "point": None,
     }
@@ -480,6 +503,21 @@ def _texts(law: Law, name: str, real: str) -> tuple[str, dict[str, str]]:
     about["sha256"] = digest_of(about, header.encode(), source.encode())
     code = {".h": header, ".c": source, "_test.c": _filled("test.c", words)}
     return title, {**code, ".json": json.dumps(about, indent=1) + "\n"}
+
+
+def _vector(case: Case, law: Law, error: float, array: Callable[[Array], str]) -> str:
+    """Return the C initialiser of a test case, whose results are within the limits of the law."""
+    tables = law.tables
+    nu = len(tables["low"])
+    out = case.out.copy()
+    out[:nu] = np.clip(out[:nu], tables["low"], tables["high"])
+    cut = (out - case.out)[:nu]
+    scale = case.scale.copy()
+    if tables["E"].size:
+        out[nu:] += tables["E"] @ cut
+        scale[nu:] += np.abs(tables["E"]) @ scale[:nu]
+    numbers = map(array, (case.given, out, error * scale))
+    return f"{{{case.sample}UL, {', '.join(numbers)}, {int(cut.any())}}}"
 
 
 def _state_words(law: Law, state: StateMap) -> dict[str, object]:
@@ -519,6 +557,38 @@ def _state_words(law: Law, state: StateMap) -> dict[str, object]:
             "gains_between": f", K interpolated linearly over {joints}, constant outside",
         }
     return words
+
+
+def _memory_words(
+    words: dict[str, object], memory: int, sample: str
+) -> dict[str, object]:
+    """Return {placeholder: text} for the memory of a state law; empty texts without memory."""
+    keys = ("interface", "comment", "argument", "tables", "start", "local", "feedback")
+    texts: dict[str, object] = {
+        **dict.fromkeys((f"memory_{key}" for key in (*keys, "next", "run")), ""),
+        "run_step": f"return {words['name']}_step({sample}&m, out);",
+    }
+    if not memory:
+        return texts
+    name, upper = words["name"], words["NAME"]
+    words = words | {"memory": memory}
+    texts |= {
+        "memory_interface": _filled("memory_interface.h", words),
+        "memory_comment": ", and the memory is unchanged.\n * Call once every sample time. The "
+        "inputs also contain C z of the memory z. Then the next z is\n * A z + B (x - x0)"
+        f"{words['windup_comment']}",
+        "memory_argument": f"{name}_memory *memory, ",
+        "memory_local": f", next[{upper}_MEMORY_MAX]",
+        "memory_run": f"    {name}_memory memory;\n    int status;\n\n"
+        f"    {name}_start(&memory);\n    for (i = 0; i < {upper}_MEMORY; i++) {{\n"
+        "        memory.z[i] = *in++;\n    }\n",
+        "run_step": f"status = {name}_step(&memory, {sample}&m, out);\n"
+        f"    for (i = 0; i < {upper}_MEMORY; i++) {{\n"
+        f"        out[{upper}_INPUTS + i] = memory.z[i];\n    }}\n    return status;",
+    }
+    for part in ("tables", "start", "feedback", "next"):
+        texts[f"memory_{part}"] = _filled(f"memory_{part}.c", words)
+    return texts
 
 
 def _filled(template: str, words: dict[str, object]) -> str:

@@ -14,12 +14,13 @@ from fflin.base.rotation import conjugate, quaternion_product
 from fflin.base.validation import Array, Indices, instance
 from fflin.control.gain import Gain, model_of
 from fflin.control.kalman import Compensator
-from fflin.control.loops import Sample
+from fflin.control.loops import NOT_CORRECTED, Sample
 from fflin.control.policies import StateFeedback
 from fflin.control.policy import Command, OutputForm, PathForm, Policy, StateForm, bound
 from fflin.control.tracking import TrajectoryFeedback
 from fflin.control.tvlqr import GainSchedule
 from fflin.dynamics.state import StateMap
+from fflin.dynamics.state_rows import readout
 from fflin.linear.fit import Signals, signals_of
 from fflin.linear.model import LinearModel
 from fflin.robot.fields import chosen_limits, input_limits
@@ -52,7 +53,8 @@ class Law:
     A state law is ``u = u0 - K (x - x0)``. Its tables K, x0, u0 and `reference` have one row for
     all samples, or one row for each sample. If there is a table `axis_points`, it contains a grid
     of joint positions. K then has one row for each grid point, and is interpolated. An output law
-    is ``u = u0 + C z + D (y - y0)``. The next controller state z is ``A z + B (y - y0)``.
+    is ``u = u0 + C z + D (y - y0)``. The next controller state z is ``A z + B (y - y0)``. A state
+    law with memory has ``C z`` as a further term, and the next z is ``A z + B (x - x0)``.
     """
 
     title: str
@@ -62,8 +64,10 @@ class Law:
     dt: float
     robot: Robot
     lin: LinearModel | None
-    # Tables of the C code, by name. Every law has the tables u0, low, high and continuous.
+    # Tables of the C code, by name. Every law has the tables u0, low, high, continuous and E, the
+    # gain of the anti-windup, which may be empty.
     tables: dict[str, Array]
+    memory: int  # number of entries of the memory z
     # bound on the number of rounded operations between an argument and a result
     operations: float
     cases: list[Case]
@@ -145,11 +149,12 @@ def _law_of(given: Design, robot: Robot) -> Law:
     if isinstance(policy, GainSchedule):
         policy = TrajectoryFeedback(policy.trajectory(robot), policy)
     if isinstance(policy, Gain):
+        gain = policy
         made = f"the gain was designed for '{policy.robot}'"
         model = policy._lin or model_of(
             policy, robot, made, pin.XYZQUATToSE3(policy.placement)
         )
-        policy = StateFeedback(model, policy.K)
+        policy = StateFeedback(model, gain)
     form = policy.form(robot)
     if isinstance(form, StateForm) and policy.model:
         dt = given.dt if isinstance(given, Gain) else policy.sample_time
@@ -160,11 +165,8 @@ def _law_of(given: Design, robot: Robot) -> Law:
             title, policy, state, _samples(form.policy, state), {}, robot
         )
     lin = policy.model
-    if isinstance(form, OutputForm) and form.loop.measures_state:
-        raise InputError(
-            f"this {title} has a memory, which C code of state feedback does not support yet; "
-            "write the C code of an OutputFeedback"
-        )
+    if isinstance(form, OutputForm) and form.loop.measures_state and lin:
+        return _memory_law(title, policy, form.terms(0.0), robot)
     if isinstance(form, OutputForm) and not form.samples and lin:
         return _output_law(
             title,
@@ -197,6 +199,44 @@ def _state_law(
     )
 
 
+def _memory_law(title: str, policy: Policy, terms: Sample, robot: Robot) -> Law:
+    """Convert a state feedback with a memory, such as integrals, about the point of a model."""
+    lin = policy.model
+    assert lin is not None
+    frame, reference = policy.axes
+    state = StateMap(robot, reference=reference, frame=frame)
+    tables = {
+        "reference": lin.placement[None],
+        "x0": terms.y0[None],
+        "u0": lin.u0[None],
+        "K": -terms.D[None],
+    }
+    dt = policy.sample_time
+    return _law_of_states(
+        title, policy, state, tables, {}, robot, dt=dt, lin=lin, terms=terms
+    )
+
+
+def _memory_case(
+    random: np.random.Generator, terms: Sample, case: Case, dx: Array, size: Array
+) -> Case:
+    """Return the test case of a law with memory at a random memory z.
+
+    `case` is the test case of its gain K alone, and dx = x - x0. `size` (nx,) are the sums of the
+    magnitudes of the terms in dx.
+    """
+    z = random.normal(scale=10.0 ** random.uniform(-4, 0), size=len(terms.A))
+    after = terms.A @ z + terms.B @ dx
+    scale = case.scale + np.abs(terms.C) @ np.abs(z)
+    of_next = np.abs(terms.A) @ np.abs(z) + np.abs(terms.B) @ size
+    return Case(
+        case.sample,
+        np.concatenate((z, case.given)),
+        np.concatenate((case.out + terms.C @ z, after)),
+        np.concatenate((scale, of_next)),
+    )
+
+
 def _law_of_states(
     title: str,
     policy: Policy,
@@ -207,10 +247,24 @@ def _law_of_states(
     *,
     dt: float | None = None,
     lin: LinearModel | None = None,
+    terms: Sample | None = None,
 ) -> Law:
-    """Return the law with tables of K, x0, u0 and `reference`, whose gain may have a grid."""
+    """Return the law with tables of K, x0, u0 and `reference`, whose gain may have a grid.
+
+    The memory of the law, if it has one, follows `terms`.
+    """
     dt = policy.sample_time if dt is None else dt
-    cases = list(_state_cases(state, bound(policy, robot), dt, tables, axes))
+    memory = 0
+    if terms is None:
+        command = bound(policy, robot)
+        tables["E"] = NOT_CORRECTED
+    else:
+        _require_sampled(dt)
+        memory = len(terms.A)
+        offset = tables["u0"][0] + tables["K"][0] @ terms.y0
+        command = readout(state, tables["K"][0], offset, terms.y0)
+        tables |= {key: getattr(terms, key) for key in "ABCE"}
+    cases = list(_state_cases(state, command, dt, tables, axes, terms))
     tables["in_reference_axes"] = np.array(state.axes)
     tables["continuous"] = np.array(
         [joint.unbounded for joint in robot.joints], dtype=bool
@@ -230,8 +284,9 @@ def _law_of_states(
         robot=robot,
         lin=lin,
         tables=tables,
-        operations=state.nx + 32.0 + 8.0 * sum(cells),
+        operations=state.nx + 32.0 + 8.0 * sum(cells) + 2.0 * memory,
         cases=cases,
+        memory=memory,
     )
 
 
@@ -241,8 +296,11 @@ def _state_cases(
     dt: float,
     tables: dict[str, Array],
     axes: Mapping[str, Array],
+    terms: Sample | None,
 ) -> Iterator[Case]:
     """Yield test cases at random states, with the results that the policy computes.
+
+    With `terms`, the law also has a memory, and `policy` is its gain alone.
 
     Some states are close to half a turn from the reference or the target. If K is interpolated,
     some states are at the ends of the grid or beyond.
@@ -284,6 +342,7 @@ def _state_cases(
         given = measured(world, q, v)
         given[7 : 7 + n] += 2.0 * np.pi * turns
         u = np.asarray(policy(row * dt, q, v))
+        displaced = state.read(q, v, near=x0)
         # The next lines sum the magnitudes of the terms in each entry of x - x0.
         omega, v = given[7 + n : 10 + n], given[10 + n : 13 + n]
         pose = [1.0] * 3 + [float(norm(given[4:7]) + norm(about[:3]))] * 3
@@ -291,7 +350,11 @@ def _state_cases(
         joints = np.abs(given[7 : 7 + n]), np.abs(given[13 + n :])
         size = np.abs(x0) + np.hstack((pose, joints[0], rates, joints[1]))
         K = np.abs(tables["K"]).max(axis=0) if axes else np.abs(tables["K"][row])
-        yield Case(row, given, u, np.abs(u0) + K @ size)
+        case = Case(row, given, u, np.abs(u0) + K @ size)
+        if terms is not None:
+            dx = displaced - x0
+            case = _memory_case(random, terms, case, dx, size)
+        yield case
 
 
 def _samples(policy: TrajectoryFeedback, state: StateMap) -> dict[str, Array]:
@@ -329,7 +392,7 @@ def _compensator_law(given: Compensator, robot: Robot) -> Law:
     known = dict(zip(sensed[0] + asked[0], sensed[1] + asked[1], strict=True))
     return _output_law(
         type(given).__name__,
-        Sample(given.A, given.B, given.C, none, given.u0, given.y0),
+        Sample(given.A, given.B, given.C, none, given.u0, given.y0, E=given.E),
         inputs=(
             given.output_names,
             tuple(known.get(x, "unknown") for x in given.output_names),
@@ -344,6 +407,15 @@ def _compensator_law(given: Compensator, robot: Robot) -> Law:
     )
 
 
+def _require_sampled(dt: float) -> None:
+    """Raise `InputError` if a controller with memory is continuous."""
+    if not dt:
+        raise InputError(
+            "the controller is continuous, expected a sampled controller; use "
+            "LinearController.sampled(dt), or design the controller for lin.discretize(dt)"
+        )
+
+
 def _output_law(
     title: str,
     terms: Sample,
@@ -355,14 +427,11 @@ def _output_law(
     lin: LinearModel | None,
 ) -> Law:
     """Return the law of a controller with constant matrices."""
-    if not dt and len(terms.A):
-        raise InputError(
-            "the controller is continuous, expected a sampled controller; use "
-            "LinearController.sampled(dt), or design the controller for lin.discretize(dt)"
-        )
+    if len(terms.A):
+        _require_sampled(dt)
     angles = {f"q_m.{joint.name}" for joint in robot.joints if joint.unbounded}
     continuous = np.array([name in angles for name in signals[0]])
-    tables = {key: getattr(terms, key) for key in ("A", "B", "C", "D", "y0")}
+    tables = {key: getattr(terms, key) for key in ("A", "B", "C", "D", "E", "y0")}
     tables |= {"u0": terms.u0[None], "continuous": continuous}
     return Law(
         title=title,
@@ -374,6 +443,7 @@ def _output_law(
         lin=lin,
         tables=tables,
         operations=float(len(terms.A) + len(signals[0]) + 16),
+        memory=len(terms.A),
         cases=list(_output_cases(terms, np.flatnonzero(continuous))),
     )
 

@@ -22,7 +22,7 @@ static const ${name}_real u0[1][${NAME}_INPUTS] = $u0;
 static const ${name}_real y0[${NAME}_OUTPUTS] = $y0;
 static const ${name}_real low[${NAME}_INPUTS] = $low;
 static const ${name}_real high[${NAME}_INPUTS] = $high;
-
+$windup
 /* 1 for each output that is the angle of a continuous joint, else 0. */
 static const int continuous[${NAME}_OUTPUTS] = $continuous;
 
@@ -76,7 +76,7 @@ int ${name}_step(${name}_memory *memory, const ${name}_real y[${NAME}_OUTPUTS],
         for (j = 0; j < ${NAME}_OUTPUTS; j++) {
             next[i] += B[i][j] * dy[j];
         }
-        if (!is_finite(next[i])) {
+$windup_next        if (!is_finite(next[i])) {
             status = ${NAME}_INVALID;
         }
     }

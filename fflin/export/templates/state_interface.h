@@ -15,7 +15,7 @@ typedef struct {
     ${name}_real joint_rates[${NAME}_JOINTS_MAX];
 } ${name}_measured;
 
-/* Write the state x. q_b is the vector part of the quaternion relative to the reference, with
+${memory_interface}/* Write the state x. q_b is the vector part of the quaternion relative to the reference, with
  * scalar part >= 0; the angle of a continuous joint is within half a turn of its target.
  * The status is OK or INVALID. If it is INVALID, x is zero.
 $state_list
@@ -23,7 +23,7 @@ $state_list
 int ${name}_state(${sample_argument}const ${name}_measured *measured, ${name}_real x[${NAME}_STATES]);
 
 /* Write the inputs u = u0 - K (x - x0)$gains_between.$sample_comment
- * If the status is INVALID, u is u0 within the limits.
+ * If the status is INVALID, u is u0 within the limits${memory_comment}.
 $input_list
  */
-int ${name}_step(${sample_argument}const ${name}_measured *measured, ${name}_real u[${NAME}_INPUTS]);
+int ${name}_step(${memory_argument}${sample_argument}const ${name}_measured *measured, ${name}_real u[${NAME}_INPUTS]);

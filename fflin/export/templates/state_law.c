@@ -25,7 +25,7 @@ static const ${name}_real K[$gains][${NAME}_INPUTS][${NAME}_STATES] = $K;
 
 static const ${name}_real low[${NAME}_INPUTS] = $low;
 static const ${name}_real high[${NAME}_INPUTS] = $high;
-
+$memory_tables$windup
 /* 1 if omega_b (or v_b) is in reference axes, 0 if it is in base axes. */
 static const int in_reference_axes[2] = $in_reference_axes;
 
@@ -132,11 +132,11 @@ static void feed_back(int gain, ${name}_real weight, const ${name}_real dx[${NAM
         u[i] -= weight * sum;
     }
 }
-$interpolation
-int ${name}_step(${sample_argument}const ${name}_measured *measured, ${name}_real u[${NAME}_INPUTS])
+$memory_start$interpolation
+int ${name}_step(${memory_argument}${sample_argument}const ${name}_measured *measured, ${name}_real u[${NAME}_INPUTS])
 {
     const unsigned long row = $row;
-    ${name}_real x[${NAME}_STATES];
+    ${name}_real x[${NAME}_STATES]${memory_local};
     int i, status = state_at(row, measured, x);
 
     for (i = 0; i < ${NAME}_INPUTS; i++) {
@@ -147,11 +147,11 @@ int ${name}_step(${sample_argument}const ${name}_measured *measured, ${name}_rea
             x[i] -= x0[row][i];
         }
         $feedback
-        for (i = 0; i < ${NAME}_INPUTS; i++) {
+$memory_feedback        for (i = 0; i < ${NAME}_INPUTS; i++) {
             if (!is_finite(u[i])) {
                 status = ${NAME}_INVALID;
             }
         }
     }
-$limiting
+$memory_next$limiting
 }

@@ -3,7 +3,7 @@ static int run(const vector *given, ${name}_real out[$outs])
     ${name}_measured m = {{0}, {0}, {0}, {0}, {0}, {0}};
     const ${name}_real *in = given->in;
     int i;
-
+$memory_run
     for (i = 0; i < 4; i++) {
         m.attitude[i] = *in++;
     }
@@ -22,5 +22,5 @@ static int run(const vector *given, ${name}_real out[$outs])
     for (i = 0; i < ${NAME}_JOINTS; i++) {
         m.joint_rates[i] = *in++;
     }
-    return ${name}_step($sample_given&m, out);
+    ${run_step}
 }
