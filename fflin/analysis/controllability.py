@@ -198,7 +198,7 @@ def controllability(lin: LinearModel | LinearTrajectory) -> Controllability:
     """
     if isinstance(lin, LinearTrajectory):
         return _along(lin)
-    lin = mechanics.checked(lin)
+    lin = mechanics.of_robot(lin)
     if not lin.is_equilibrium():
         return _in_motion(lin)
     conserved, size = mechanics.conserved(lin), np.tile(np.sqrt(lin.M.diagonal()), 2)
@@ -466,7 +466,11 @@ def _by_second_order(
 
 
 def require_stabilizable(lin: LinearModel) -> None:
-    """Raise `StabilizabilityError` if there are states that the inputs cannot stabilise."""
+    """Raise `StabilizabilityError` if there are states that the inputs cannot stabilise.
+
+    A delay of the inputs makes no difference.
+    """
+    lin = lin.undelayed
     missed = "the inputs cannot stabilise {}; add inputs"
     if len(lin.A) < 2 * len(lin.M):  # the model has wheel speeds without wheel angles
         robot = lin._robot
@@ -561,7 +565,11 @@ def _patterns(lin: LinearModel, joints: Sequence[str]) -> list[str]:
 
 
 def require_detectable(lin: LinearModel) -> None:
-    """Raise `DetectabilityError` if there are unobservable motions that do not decay."""
+    """Raise `DetectabilityError` if there are unobservable motions that do not decay.
+
+    Earlier commands, which are states of a model with delayed inputs, are known.
+    """
+    lin = lin.undelayed
     missed = "the outputs do not observe {}, whose motion does not decay by itself; add outputs"
     if len(lin.A) < 2 * len(lin.M):
         report = _reached(

@@ -12,7 +12,7 @@ import numpy as np
 from fflin.analysis import ranks
 from fflin.base.errors import FflinWarning, InputError
 from fflin.base.validation import Array, Indices, Values, instance
-from fflin.linear.model import LinearModel
+from fflin.linear.model import LinearModel, refuse_delayed
 
 # K or D counts as not symmetric if its relative asymmetry exceeds this. D counts as indefinite if
 # it has eigenvalues of both signs whose moduli exceed this fraction of the largest modulus.
@@ -41,6 +41,7 @@ def checked(lin: LinearModel) -> LinearModel:
     """
     instance("lin", lin, LinearModel, "a fflin.LinearModel")
     lin.require_unchanged()
+    refuse_delayed(lin, "this analysis")
     nx = len(lin.A)
     if lin.M.shape != (nx // 2, nx // 2) or nx % 2:
         raise InputError(
@@ -64,6 +65,11 @@ def checked(lin: LinearModel) -> LinearModel:
             stacklevel=3,
         )
     return lin
+
+
+def of_robot(lin: LinearModel) -> LinearModel:
+    """Return the model without delays of its inputs, checked; see `checked`."""
+    return checked(instance("lin", lin, LinearModel, "a fflin.LinearModel").undelayed)
 
 
 def rate_matrix(lin: LinearModel) -> Array:

@@ -126,7 +126,7 @@ def observability(lin: LinearModel | LinearTrajectory) -> Observability:
     """
     if isinstance(lin, LinearTrajectory):
         return _along(lin)
-    lin = mechanics.checked(lin)
+    lin = mechanics.of_robot(lin)
     if not lin.is_equilibrium():
         return _in_motion(lin)
     nv = len(lin.M)

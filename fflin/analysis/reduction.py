@@ -7,6 +7,7 @@ from typing import ClassVar, TypeAlias, TypeVar
 
 import numpy as np
 import pinocchio as pin
+from scipy.linalg import block_diag
 
 from fflin.analysis import mechanics, moving_points
 from fflin.analysis.ranks import (
@@ -26,7 +27,7 @@ from fflin.base.validation import Array, Indices, Mask, frozen
 from fflin.dynamics.coordinates import ANGULAR, LINEAR
 from fflin.dynamics.state import StateMap, selection
 from fflin.linear.files import given
-from fflin.linear.model import LinearModel
+from fflin.linear.model import Delay, LinearModel
 from fflin.robot.joints import frame_index
 from fflin.robot.robot import Robot
 from fflin.robot.rotors import motor_of
@@ -90,6 +91,25 @@ class ReducedModel(LinearModel):
     notes: tuple[str, ...]
     # `margin` is the certainty of rank decisions, not the disk margin that titles show.
     _untitled: ClassVar[frozenset[str]] = frozenset({"margin"})
+
+    def discretize(self, dt: float, delay: Delay = 0.0) -> LinearModel:
+        """Return the discrete-time model, see `LinearModel.discretize`.
+
+        Of a model with delayed inputs, `T` and `S` also map the commands on their way.
+        """
+        sampled = super().discretize(dt, delay)
+        count = len(sampled.added)
+        if not count:
+            return sampled
+        assert isinstance(sampled, ReducedModel)
+        none = np.zeros((len(self.momenta), count))
+        return replace(
+            sampled,
+            T=block_diag(self.T, np.eye(count)),
+            S=block_diag(self.S, np.eye(count)),
+            momenta=np.hstack((self.momenta, none)),
+            coordinates=np.hstack((self.coordinates, none)),
+        )
 
     def _report(self) -> str:
         """Return the title, the numbers of states and conserved momenta, and the notes."""
@@ -387,6 +407,16 @@ def regulated_part(lin: LinearModel, wheel_speeds: bool | None = None) -> Linear
     # The model omits the `removed_wheels`. For every other wheel, it omits the angle if the angle
     # affects no other state, so the model may have fewer positions than rates. It also omits the
     # coordinates of the base position on which no input acts, and their rates.
+    if lin.added:
+        part = regulated_part(lin.undelayed, wheel_speeds)
+        if part is lin.undelayed:
+            return lin
+        return selected(
+            lin,
+            (*part.state_names, *lin.added),
+            part.M,
+            partial(regulated_part, wheel_speeds=wheel_speeds),
+        )
     base = unpushed_positions(lin)
     if not (len(base) or wheel_inputs(lin) or lin.wheels):
         return lin

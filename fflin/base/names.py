@@ -25,6 +25,20 @@ def group_of(name: str) -> str:
     return name.partition(".")[0] if "." in name else ""
 
 
+# Name of a state that is an earlier command of an input, such as past_2.tau_b.x.
+_PAST = re.compile(r"past_[0-9]+\.", re.ASCII)
+
+
+def past_name(samples: int, name: str) -> str:
+    """Return the name of the state that is the command of an input some samples ago."""
+    return f"past_{samples}.{name}"
+
+
+def without_past(states: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the names of states without those of earlier commands."""
+    return tuple(name for name in states if not _PAST.match(name))
+
+
 def input_keys(model: Any) -> tuple[str, ...]:
     """Return the names GROUP.ENTRY of the inputs of a model.
 

@@ -403,9 +403,12 @@ class Dispersions:
         return ActuatorFaults(1.0 + gain, bias, until, np.concatenate(turn, axis=1))
 
     def delays(self, drawn: Array) -> Array:
-        """Return the total delays (N,) of the inputs, in integration steps."""
-        late = self._of("delay", drawn)[:, 0] / self._times.dt
-        steps: Array = np.maximum(0.0, np.rint(self._times.delay + late))
+        """Return the total delays (N, k) in integration steps, with the columns of `Times.delays`.
+
+        The drawn delay changes the delay of every input.
+        """
+        late = self._of("delay", drawn)[:, :1] / self._times.dt
+        steps: Array = np.maximum(0.0, np.rint(np.array(self._times.delays) + late))
         return steps
 
     def in_lanes(self, drawn: Array) -> dict[str, Array]:
@@ -445,7 +448,7 @@ class Dispersions:
             if "noise" in self._kinds:
                 runs["seed"] = self._of("seed", drawn)[:, 0]
         if "delay" in self._kinds:
-            runs["delay"] = self.delays(drawn)[:, None]
+            runs["delay"] = self.delays(drawn)
         return runs
 
     def one(self, drawn: Array) -> tuple[Plant, Policy | None, Array, Array]:

@@ -312,7 +312,8 @@ class CampaignJob:
         """Return the plan of the run with the drawn values (k,)."""
         plan, (plant, policy, q, v) = self.plan, self.dispersions.one(drawn)
         law = law_of(policy, plant, plan.limits, plan.times)
-        times = plan.times._replace(delay=int(self.dispersions.delays(drawn[None])[0]))
+        delays = self.dispersions.delays(drawn[None])[0].astype(int).tolist()
+        times = plan.times._replace(delays=tuple(delays))
         return plan.replace(plant=plant, q=q, v=v, policy=policy, law=law, times=times)
 
     @np.errstate(over="ignore", invalid="ignore")  # a run that diverges overflows

@@ -2,7 +2,7 @@
 
 import math
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
@@ -187,16 +187,17 @@ class Law:
 
 
 def channel_of(
-    limits: Saturation, initial: Array, sample: int, delay: int
+    limits: Saturation, initial: Array, sample: int, delays: Sequence[int]
 ) -> rules.Channel:
-    """Return the kernel's channel for limits, a sample time [steps] and a delay [steps].
+    """Return the kernel's channel for limits, a sample time [steps] and delays [steps].
 
+    There is one delay for all inputs, or one for each input.
     Until the first command arrives, the channel applies the inputs `initial` (nu,), saturated at
     their limits.
     """
     slots = 1
     if sample:
-        slots = delay // sample + 1
+        slots = max(delays) // sample + 1
     fresh = {key: np.zeros(len(limits.pulses.at)) for key in ("left", "level", "end")}
     channel = rules.Channel(
         **limits._replace(pulses=limits.pulses._replace(**fresh))._asdict(),
@@ -204,8 +205,8 @@ def channel_of(
         pending=np.zeros(slots * len(initial)),
         slots=slots,
         sample=sample,
-        delay=np.array([float(delay)]),
-        fresh=np.zeros(1),
+        delay=np.array(delays, dtype=float),
+        fresh=np.zeros(len(delays)),
     )
     rules.limit(channel, channel.held)
     return channel
@@ -217,7 +218,7 @@ def channelled(
     limits: Saturation,
     initial: Array,
     sample: int,
-    delay: int,
+    delays: Sequence[int],
     correct: Correction | None = None,
 ) -> Inputs:
     """Return f(step, *point), which sends a command through a channel and returns inputs (nu,).
@@ -230,7 +231,7 @@ def channelled(
     if not (sample or limits.cuts or correct):
         return lambda _, *point: law(*point)
     within = limits._replace(wheels=limits.wheels._replace(row=np.arange(wheels)))
-    channel = channel_of(within, initial, sample, delay)
+    channel = channel_of(within, initial, sample, delays)
 
     def applied(step: int, *point: object) -> Array:
         if rules.is_asked(channel, step):

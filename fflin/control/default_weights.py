@@ -82,6 +82,15 @@ class Pace(NamedTuple):
     held: float = _HELD
 
 
+def pace_of(lin: LinearModel) -> Pace:
+    """Return the nominal pace for a model.
+
+    On average, an input acts h/2 later than the state from which it is computed, with the sampling
+    time h. A delay tau adds to this time, and so counts like 2 tau of hold time.
+    """
+    return Pace(hold=lin.dt + 2.0 * float(lin.delay.max(initial=0.0)))
+
+
 class Limit(NamedTuple):
     """Bandwidth [rad/s], with a description of the limit or unstable mode that determines it."""
 

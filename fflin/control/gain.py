@@ -18,6 +18,7 @@ from fflin.base.names import group_of, input_keys, with_units
 from fflin.base.record import Design
 from fflin.base.tables import cut, folded, grid, matrix, signals
 from fflin.base.validation import Array, Mask, Poles, Values, Vector
+from fflin.control.delayed import is_delayed, law_with_memory
 from fflin.control.optimal.disk import Loop, as_continuous, disk_gain, disk_phase
 from fflin.control.optimal.largest_gain import gain_crossings, largest_gain
 from fflin.control.optimal.riccati import Solution, rates_of
@@ -346,7 +347,15 @@ class Gain(ModelDesign):
         return state_space(tuple(self.integral_law()[:4]), self.dt, *names)
 
     def integral_law(self) -> System:
-        """Return the law from x - x0 to u - u0, whose states are the integrals."""
+        """Return the law from x - x0 to u - u0, whose states are the integrals.
+
+        Earlier commands, if the model contains them, are also states of the law.
+        """
+        if is_delayed(self.state_names):
+            names = self.state_names, self.input_names
+            return law_with_memory(
+                self.K, self.A, self.B, self.dt, *names, self.integrals
+            )
         k = len(self.integrals)
         A = np.eye(k) if self.dt else np.zeros((k, k))
         B = self.A[self._size :, : self._size]
@@ -672,9 +681,29 @@ def asymmetry(gain: Gain) -> Loop:
     """
     S = _regulated(gain)
     scale = np.sqrt(gain.R.diagonal())
+    if is_delayed(gain.state_names):
+        return _remembered_asymmetry(gain, S, scale)
     F = S @ gain.closed_loop @ S.T
     G = S @ gain.B / scale
     H = -scale[:, None] * gain.K @ S.T
+    return as_continuous(F, G, H, 0.5 * np.eye(len(H)), gain.dt)
+
+
+def _remembered_asymmetry(gain: Gain, S: Array, scale: Array) -> Loop:
+    """Return the loop of `asymmetry` for a model with delayed inputs.
+
+    The law remembers its own commands, and not the changed inputs, which are on their way in the
+    plant.
+    """
+    A, B = S @ gain.A @ S.T, S @ gain.B
+    names = gain.regulated or gain.state_names
+    law = law_with_memory(gain.K @ S.T, A, B, gain.dt, names, gain.input_names)
+    measured = selection(law.inputs, names)
+    D = law.D @ measured
+    memory = law.B @ measured
+    F = np.block([[A + B @ D, B @ law.C], [memory, law.A]])
+    G = np.vstack((B, np.zeros((len(law.A), len(B.T))))) / scale
+    H = scale[:, None] * np.hstack((D, law.C))
     return as_continuous(F, G, H, 0.5 * np.eye(len(H)), gain.dt)
 
 
@@ -688,7 +717,7 @@ def _may_be_fragile(gain: Gain) -> bool:
 
     Both conditions below exclude it, and are quicker than the margin itself.
     """
-    if guaranteed_margin(gain) >= _FRAGILE:
+    if guaranteed_margin(gain) >= _FRAGILE and not is_delayed(gain.state_names):
         return False
     F, G, H, D = asymmetry(gain)
     bound = 1.0 / _FRAGILE

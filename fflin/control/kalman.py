@@ -41,7 +41,7 @@ from fflin.control.optimal import differential_riccati as riccati
 from fflin.control.optimal.riccati import solve
 from fflin.control.trajectory_end import steady_end
 from fflin.control.tvlqr import FilterSchedule, asks_steady, sample_time
-from fflin.control.weights import Weight, weight
+from fflin.control.weights import Weight, padded, state_weight, weight
 from fflin.dynamics.integrators import HEAVY, LIGHT, held_cost
 from fflin.dynamics.state import selection
 from fflin.linear.linear_trajectory import LinearTrajectory, along, transitions
@@ -297,7 +297,8 @@ def kalman(
         names of outputs.
     G : array_like (nx, nw), optional
         Input matrix of the disturbance; W is then (nw, nw). With ``G=lin.B``, the disturbance
-        acts at the inputs, and the keys of a mapping W are names of inputs.
+        acts at the inputs, and the keys of a mapping W are names of inputs. Delays of the inputs do
+        not delay it.
     wheel_speeds : bool, optional
         As in `lqr`.
 
@@ -378,7 +379,7 @@ def _estimated_part(
     measure the base position and the disturbance pushes the base. `disturbed` (nx, nw) maps the
     disturbance to the state.
     """
-    positions = unpushed_positions(lin)
+    positions = unpushed_positions(lin.undelayed)
     if len(positions) and not (wheel_inputs(lin) or lin.wheels):
         measured = lin.C[:, positions].any(axis=0).all()
         pushed = disturbed[positions + len(lin.M)].any(axis=1).all()
@@ -629,15 +630,21 @@ def disturbance(
     """Return the intensity W (nw, nw) and the input matrix G (.., nx, nw) of the disturbance."""
     nx = len(model.state_names)
     if G is None:
-        return weight("W", W, model.state_names), np.eye(nx)
+        return state_weight("W", W, model), np.eye(nx)
     knots: tuple[int, ...] = ()
     hint = ": one column for each disturbance"
     if dimension("G", G) == model.A.ndim == 3:
         knots = model.A.shape[:1]
         hint = ": one matrix for each knot, with one column for each disturbance"
     shape = *knots, nx, max((1, *np.shape(G))[-1], 1)
-    through = shaped("G", G, shape, hint)
+    through = shaped("G", G if knots else padded(G, model), shape, hint)
     names = tuple(f"w_{i + 1}" for i in range(through.shape[-1]))
-    if np.array_equal(through, model.B):
+    at_inputs = np.array_equal(through, model.B)
+    if isinstance(model, LinearModel) and model.added:
+        undelayed = np.asarray(padded(model.undelayed.B, model))
+        if at_inputs:
+            through = undelayed
+        at_inputs = np.array_equal(through, undelayed)
+    if at_inputs:
         names = input_keys(model)
     return weight("W", W, names), through

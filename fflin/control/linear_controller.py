@@ -148,6 +148,11 @@ class LinearController(OutputSensing, LinearLaw):
         B[:, columns] = controller.B
         C[rows] = self.sign * controller.C
         D[np.ix_(rows, columns)] = self.sign * controller.D
+        if lin.added and lin.C[:, len(lin.robot_states) :].any():
+            raise InputError(
+                "an output of the model feels delayed inputs directly, such as an accelerometer, "
+                "which a law with delayed inputs cannot measure; leave out this output"
+            )
         felt: Mask = np.logical_and(lin.D.any(axis=1), D.any(axis=0))
         if felt.any():
             raise InputError(
@@ -258,6 +263,10 @@ class OutputFeedback(LinearController):
         windup = compensator.E if compensator.E.size else None
         super().__init__(compensator, lin, noise=noise, anti_windup=windup)
         self.compensator = compensator
+        known = self.lin.state_names
+        if self.lin.added and {*compensator.state_names} <= {*known}:
+            # The estimate contains earlier commands, as they are after limits are applied.
+            self.windup = self.lin.B[[*map(known.index, compensator.state_names)]]
         if not lin.dt:
             raise InputError(
                 "the model must be sampled; use lin.discretize(dt), and design the gain and the "

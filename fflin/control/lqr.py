@@ -18,7 +18,7 @@ from fflin.base.errors import (
 )
 from fflin.base.validation import Array, ArrayLike, dimension, instance
 from fflin.control import integral
-from fflin.control.default_weights import Pace
+from fflin.control.default_weights import pace_of
 from fflin.control.gain import Gain, Integrals, cautions, make_gain
 from fflin.control.integral import Integrated
 from fflin.control.optimal.riccati import (
@@ -212,7 +212,7 @@ def regulator(
     lin = at_fixed_point(lin)
     rule = "as given"
     if Q is None and R is None and N is None:
-        Q, R, N, rule = rule_weights(lin, weights, Pace(hold=lin.dt), wheel_speeds)
+        Q, R, N, rule = rule_weights(lin, weights, pace_of(lin), wheel_speeds)
     elif weights is not None or Q is None or R is None:
         raise InputError(
             "give either both Q and R, or only weights='urdf' or 'identity'"

@@ -21,6 +21,7 @@ from fflin.base.validation import (
     number,
     positive,
 )
+from fflin.control.delayed import law_with_memory
 from fflin.control.gain import Gain
 from fflin.control.optimal.channel_limits import (
     Crossing,
@@ -36,7 +37,7 @@ from fflin.control.optimal.disk import (
     largest_structured_gain,
 )
 from fflin.control.optimal.largest_gain import largest_gain
-from fflin.control.policy import Policy, System, as_policy, proportional
+from fflin.control.policy import Policy, System, as_policy
 from fflin.dynamics.delays import HeldSystem, split
 from fflin.linear.model import LinearModel
 
@@ -135,7 +136,7 @@ class Margins(FrozenArrays, Reported):
     dt : float
         Sampling time [s]; 0 in continuous time.
     delay : float
-        Delay of all inputs [s] with which the margins were computed.
+        Largest delay of an input [s] with which the margins were computed.
 
     Examples
     --------
@@ -216,7 +217,7 @@ def margins(
         Model of the robot with which the loop is closed. A continuous model may be given for a
         sampled law.
     delay : float, optional
-        Delay [s] of all inputs.
+        Delay [s] of all inputs. A delay of the model, see `LinearModel.discretize`, is added.
     sample : float, optional
         Sampling time [s] with which a continuous law is executed.
     at : {"inputs", "outputs"}, optional
@@ -265,7 +266,7 @@ def _law_of(policy: Policy | Gain, lin: LinearModel, sample: float | None) -> Sy
     outputs = False
     if isinstance(policy, Gain):
         names = policy.state_names, policy.input_names
-        law = proportional(policy.K, policy.dt, *names)
+        law = law_with_memory(policy.K, policy.A, policy.B, policy.dt, *names)
         if policy.integrals:
             law = policy.integral_law()
     else:
@@ -393,6 +394,8 @@ class _Closed:
     def margins(self) -> Margins:
         """Return the margins of all channels."""
         delays = np.full(self.plant.B.shape[1], self.delay)
+        if self.is_continuous_plant:
+            delays += self.lin.delay
         loop = self.closed(self.with_delays(delays))
         if not all(np.isfinite(matrix).all() for matrix in loop):
             raise InputError(
@@ -413,7 +416,7 @@ class _Closed:
                 at=self.at,
                 robot=self.lin.robot,
                 dt=self.dt,
-                delay=self.delay,
+                delay=float(delays.max(initial=0.0)),
             )
         system = as_continuous(*loop, self.dt)
         grid = self._grid()
@@ -439,7 +442,7 @@ class _Closed:
             at=self.at,
             robot=self.lin.robot,
             dt=self.dt,
-            delay=self.delay,
+            delay=float(delays.max(initial=0.0)),
         )
 
     def _own_rates(self) -> Array:

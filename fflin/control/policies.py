@@ -12,6 +12,7 @@ from fflin.base import html
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, frozen, instance, shaped
 from fflin.control.channel import Law
+from fflin.control.delayed import law_with_memory
 from fflin.control.gain import Gain
 from fflin.control.loops import (
     NOT_CORRECTED,
@@ -33,7 +34,6 @@ from fflin.control.policy import (
     System,
     as_policy,
     bound,
-    proportional,
 )
 from fflin.dynamics.coordinates import Chart, Frame
 from fflin.dynamics.integrators import held_exponential
@@ -76,9 +76,14 @@ class Feedback(Policy):
         """Return the function of t, q, v that returns the reference inputs u* and the error e."""
         lin = self.lin
         state = self.state_map(robot)
-        S = selection(lin.state_names, state.names)
-        near = S.T @ lin.x0
-        return lambda _, q, v: (lin.u0, S @ state.read(q, v, near=near) - lin.x0)
+        S, x0 = self._robot_part(state)
+        near = S.T @ x0
+        return lambda _, q, v: (lin.u0, S @ state.read(q, v, near=near) - x0)
+
+    def _robot_part(self, state: StateMap) -> tuple[Array, Array]:
+        """Return the matrix that selects the model's states of a robot, and their values x0."""
+        names = self.lin.robot_states
+        return selection(names, state.names), self.lin.x0[: len(names)]
 
 
 class OutputSensing(Policy):
@@ -147,8 +152,8 @@ class LinearLaw(Feedback):
         """Return K and offset of the law u = offset - K x for a robot's full state x, and x0."""
         lin = self.lin
         K = -self.system.D
-        S = selection(lin.state_names, state.names)
-        return K @ S, lin.u0 + K @ lin.x0, S.T @ lin.x0
+        S, x0 = self._robot_part(state)
+        return K @ S, lin.u0 + K @ x0, S.T @ x0
 
     def _loop(self, robot: Robot) -> Loop:
         """Return the command of a law with memory or of measured outputs."""
@@ -182,7 +187,7 @@ class LinearLaw(Feedback):
         noise = self.noise
         if noise is None:
             return None
-        S = selection(self.lin.state_names, state.names)
+        S, _ = self._robot_part(state)
         return lambda t: S.T @ np.asarray(noise(t))
 
     def _terms_of(self, state: StateMap) -> Sample:
@@ -190,7 +195,7 @@ class LinearLaw(Feedback):
         terms = self.terms()
         if self.senses_outputs:
             return terms
-        S = selection(self.lin.state_names, state.names)
+        S, _ = self._robot_part(state)
         return terms._replace(B=terms.B @ S, D=terms.D @ S, y0=S.T @ terms.y0)
 
     @property
@@ -218,7 +223,7 @@ class LinearLaw(Feedback):
         """Return the matrices and offsets, which are the same at all times."""
         lin = self.lin
         A, B, C, D = self.system[:4]
-        y0 = lin.y0 if self.senses_outputs else lin.x0
+        y0 = lin.y0 if self.senses_outputs else lin.x0[: len(lin.robot_states)]
         return Sample(A, B, C, D, lin.u0, y0, E=self.windup)
 
     def prediction(self, lin: LinearModel, state: StateMap) -> Predictor | None:
@@ -239,7 +244,8 @@ class LinearLaw(Feedback):
         """Return C, D and y0 of the values that the law measures of a model."""
         if self.senses_outputs:
             return lin.C, lin.D, lin.y0
-        return np.eye(len(lin.A)), np.zeros_like(lin.B), lin.x0
+        n = len(lin.robot_states)
+        return np.eye(n, len(lin.A)), np.zeros_like(lin.B[:n]), lin.x0[:n]
 
     def around(self, lin: LinearModel) -> tuple[LinearModel, Array, Array]:
         """Return the model with the law's states added, and K and u of the law u + K e.
@@ -306,6 +312,9 @@ class LinearLaw(Feedback):
 class StateFeedback(LinearLaw):
     """State feedback ``u = u0 - K (x - x0)`` about the operating point of a model.
 
+    Of a model with delayed inputs, see `LinearModel.discretize`, x contains earlier commands. The
+    law remembers them, as they are after limits are applied.
+
     The angle of a continuous joint is unwrapped, so that it differs from x0 by at most half a turn.
 
     Parameters
@@ -350,12 +359,18 @@ class StateFeedback(LinearLaw):
             K = gain.K_x
         self.K = frozen(shaped("K", K, about_point(self.lin).B.shape[::-1], hint))
         self.lin = lin = held_if_possible(self.lin)
-        self.system = proportional(self.K, lin.dt, lin.state_names, lin.input_names)
+        self.system = law_with_memory(
+            self.K, lin.A, lin.B, lin.dt, lin.state_names, lin.input_names
+        )
+        if lin.added:
+            # The law remembers the inputs after limits are applied.
+            self.windup = lin.B[len(lin.robot_states) :]
         self.integrals: tuple[str, ...] = ()
         if isinstance(gain, Gain) and gain.integrals:
             self.integrals = gain.integrals
             self.system = gain.integral_law()
-            self.windup = gain.anti_windup
+            past = self.windup.reshape(-1, len(lin.u0))
+            self.windup = np.vstack((past, gain.anti_windup))
 
     def __repr__(self) -> str:
         nu, nx = self.K.shape
@@ -391,8 +406,8 @@ class StateFeedback(LinearLaw):
 
     @property
     def sensors(self) -> tuple[str, ...]:
-        """Names of the states of the model."""
-        return self.lin.state_names
+        """Names of the states of the robot in the model."""
+        return self.lin.robot_states
 
     def with_sensor_errors(self, error: Callable[[float], Array]) -> Policy:
         """Return the feedback of states with errors."""

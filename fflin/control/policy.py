@@ -277,7 +277,7 @@ class Policy(ABC):
         """Names of the states that the law feeds back, or () if they are unknown."""
         if self.model is None:
             return ()
-        names = self.model.state_names
+        names = self.model.robot_states
         K = self.feedback_gain
         if K is None:
             return names

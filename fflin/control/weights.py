@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -27,10 +28,11 @@ from fflin.base.validation import (
     shaped,
 )
 from fflin.control.default_weights import Pace, default_weights
+from fflin.dynamics.delays import HeldSystem, split
 from fflin.dynamics.integrators import held_cost
 from fflin.dynamics.state import selection
 from fflin.linear.linear_trajectory import LinearTrajectory
-from fflin.linear.model import LinearModel
+from fflin.linear.model import Delay, LinearModel, delays_of
 from fflin.robot.fields import require_chart, warn_of_degrees
 from fflin.robot.rotors import motor_of
 
@@ -205,15 +207,57 @@ def require_semidefinite(
             ) from None
 
 
+def robot_states(model: LinearModel | LinearTrajectory) -> tuple[str, ...]:
+    """Return the names of the states of a model, without commands on their way."""
+    if isinstance(model, LinearModel):
+        return model.robot_states
+    return model.state_names
+
+
+def padded(values: ArrayLike, model: LinearModel | LinearTrajectory) -> ArrayLike:
+    """Return an array (k, ..) with zero rows for the states that are not states of the robot.
+
+    An array whose length is not the number of the robot's states is returned as it is.
+    """
+    own = len(robot_states(model))
+    more = len(model.state_names) - own
+    if not more or np.shape(values)[:1] != (own,):
+        return values
+    array = np.asarray(values, dtype=float)
+    return np.concatenate((array, np.zeros((more, *array.shape[1:]))))
+
+
+def state_weight(
+    what: str, value: Weight, model: LinearModel | LinearTrajectory
+) -> Array:
+    """Return a weight (nx, nx) on the states of a model, as `weight` does.
+
+    Commands on their way get no weight, unless the weight is a matrix or a diagonal that contains
+    them.
+    """
+    names = robot_states(model)
+    whole = model.state_names
+    whole_given = (
+        not isinstance(value, Mapping)
+        and dimension(what, value) > 0
+        and len(np.asarray(value)) == len(whole)
+    )
+    if names == whole or whole_given:
+        return weight(what, value, whole)
+    matrix: Array = np.zeros((len(whole), len(whole)))
+    matrix[: len(names), : len(names)] = weight(what, value, names)
+    return matrix
+
+
 def cost_weights(
     model: LinearModel | LinearTrajectory, Q: Weight, R: Weight, N: ArrayLike | None
 ) -> tuple[Array, Array, Array]:
     """Check the weights Q, R and N, and return them as matrices; N is zero by default."""
-    Q = weight("Q", Q, model.state_names)
+    Q = state_weight("Q", Q, model)
     R = weight("R", R, input_keys(model), definite=True)
-    cross = (
-        np.zeros((len(Q), len(R))) if N is None else shaped("N", N, (len(Q), len(R)))
-    )
+    cross: Array = np.zeros((len(Q), len(R)))
+    if N is not None:
+        cross = shaped("N", padded(N, model), cross.shape)
     if cross.any():
         with np.errstate(over="ignore", invalid="ignore"):
             reduced = Q - cross @ np.linalg.solve(R, cross.T)
@@ -232,7 +276,13 @@ class SampledCost(NamedTuple):
 
 
 def sampled_cost(
-    lin: LinearModel, dt: float, Q: Weight, R: Weight, N: ArrayLike | None = None
+    lin: LinearModel,
+    dt: float,
+    Q: Weight,
+    R: Weight,
+    N: ArrayLike | None = None,
+    *,
+    delay: Delay = 0.0,
 ) -> SampledCost:
     r"""Return discrete-time weights whose summed cost equals a continuous-time cost.
 
@@ -248,6 +298,10 @@ def sampled_cost(
     integral is computed over a short step by van Loan's method, and the step is then doubled until
     it equals h.
 
+    With a `delay`, the weights are for ``lin.discretize(dt, delay)``. The integral then contains
+    the inputs that act, and Q_d also weights the commands on their way. The cost of the inputs
+    themselves counts when they are commanded.
+
     Parameters
     ----------
     lin : LinearModel
@@ -258,6 +312,8 @@ def sampled_cost(
         Weights of the integral.
     N : array_like (nx, nu), optional
         Cross weight of the integral.
+    delay : float or mapping, optional
+        Delay of the inputs [s], as in `LinearModel.discretize`.
 
     Returns
     -------
@@ -288,6 +344,9 @@ def sampled_cost(
     h = positive("dt", dt, "s")
     Q, R, cross = cost_weights(lin, Q, R, N)
     nx = len(Q)
+    delays = np.array(delays_of(lin, delay, h))
+    if any(split(each, h).samples for each in delays.tolist()):
+        return _delayed_cost(HeldSystem(lin.A, lin.B, h, delays), Q, R, cross)
     W = np.block([[Q, cross], [cross.T, R]])
     F = np.zeros_like(W)
     F[:nx] = np.hstack((lin.A, lin.B))
@@ -297,6 +356,32 @@ def sampled_cost(
             f"dt is {h:g} s, within which the model overflows; give a shorter dt"
         )
     return SampledCost(total[:nx, :nx], total[nx:, nx:], total[:nx, nx:])
+
+
+def _delayed_cost(held: HeldSystem, Q: Array, R: Array, N: Array) -> SampledCost:
+    """Return the weights (10.1) for a model (10.9) whose inputs arrive after delays.
+
+    Between the times at which commands arrive, the inputs are constant.
+    """
+    nx, nu = N.shape
+    h, size = held.h, held.size
+    W = np.block([[Q, N], [N.T, np.zeros_like(R)]])
+    F = np.zeros_like(W)
+    F[:nx] = np.hstack((held.A, held.B))
+    total: Array = np.zeros((size + nu, size + nu))
+    total[size:, size:] = h * R
+    rests = [delay.rest for delay in held.delays if delay.samples]
+    for begin, end in pairwise(sorted({0.0, *rests, h})):
+        start = np.vstack(
+            (np.hstack(held.after(begin)), np.hstack(held.applied(begin)))
+        )
+        total += start.T @ held_cost(F, W, end - begin) @ start
+    if not np.isfinite(total).all():
+        raise InputError(
+            f"dt is {h:g} s, within which the model overflows; give a shorter dt"
+        )
+    total = 0.5 * (total + total.T)
+    return SampledCost(total[:size, :size], total[size:, size:], total[:size, size:])
 
 
 def _diagonal(
@@ -325,24 +410,24 @@ def rule_weights(
     # If a sampled model has a known continuous model, the rule gives a cost for the continuous
     # model. This cost is then converted to a sampled cost with held inputs. If neither `given` nor
     # the robot names a rule, the rule is "urdf".
-    source = lin.generator or lin
+    source = lin.generator or lin.undelayed
     if not isinstance(given, Mapping):
         given = {"rule": given}
     require_known("part of weights", given, ("rule", "q", "r", "bryson", "integral"))
     robot_weights = lin.weights if given.get("rule") is None else {}
     name = robot_weights.get("rule", given.get("rule"))
-    terms: Array = np.zeros(sum(lin.B.shape))
+    terms: Array = np.zeros(sum(source.B.shape))
     if name is None or name == "urdf":
         Q, R, rule, terms = _of_regulated(source, pace, wheel_speeds)
     elif name == "identity":
-        nx, nu = lin.B.shape
+        nx, nu = source.B.shape
         Q = np.eye(nx)
         R = np.eye(nu)
         rule = "1 for every state and every input (identity)"
     else:
         raise unknown("rule of weights", str(name), ("urdf", "identity"))
-    if weights := _weights_of(lin, robot_weights, of_robot=True) | _weights_of(
-        lin, given
+    if weights := _weights_of(source, robot_weights, of_robot=True) | _weights_of(
+        source, given
     ):
         # By Bryson's rule, each signal with a largest value from the user costs 1 at this value.
         # To match this scale, Q and R of the rule are multiplied by a common factor, which does not
@@ -365,8 +450,9 @@ def rule_weights(
         if terms.any():
             rule += " (these figures are for this rule alone)"
     if source.dt == lin.dt:
-        return Q, R, None, rule
-    return (*sampled_cost(source, lin.dt, Q, R), rule)
+        return state_weight("Q", Q, lin), R, None, rule
+    delays = dict(zip(input_keys(lin), lin.delay.tolist(), strict=True))
+    return (*sampled_cost(source, lin.dt, Q, R, delay=delays), rule)
 
 
 def integrated(lin: LinearModel, given: Rule | None) -> Any:

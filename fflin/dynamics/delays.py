@@ -1,6 +1,7 @@
 """Exact sampling of linear systems whose inputs arrive late."""
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -10,6 +11,10 @@ from fflin.dynamics.integrators import held_exponential
 # A delay that differs from a multiple of the sampling time by less than this fraction of it counts
 # as the multiple.
 _ROUNDING = 1e-9
+
+
+# Function of A (n, n), B (n, k) and a time [s] that returns the two matrices of a step.
+Hold: TypeAlias = Callable[[Array, Array, float], tuple[Array, Array]]
 
 
 class Delay(NamedTuple):
@@ -52,10 +57,20 @@ class HeldSystem:
         Sampling time [s].
     delays : ndarray (nu,)
         Delays [s], at least 0.
+    hold : callable, optional
+        Function of A, B and a time [s] that returns the matrices of a step with held inputs. The
+        default is exact.
     """
 
-    def __init__(self, A: Array, B: Array, h: float, delays: Array) -> None:
-        self.A, self.B, self.h = A, B, h
+    def __init__(
+        self,
+        A: Array,
+        B: Array,
+        h: float,
+        delays: Array,
+        hold: Hold = held_exponential,
+    ) -> None:
+        self.A, self.B, self.h, self._hold = A, B, h, hold
         self.delays = [split(float(delay), h) for delay in delays]
         counts = [delay.samples for delay in self.delays]
         ends = len(A) + np.cumsum([0, *counts])
@@ -71,7 +86,7 @@ class HeldSystem:
         nx, nu = B.shape
         of_states = np.zeros((nx, self.size))
         of_commands = np.zeros((nx, nu))
-        of_states[:, :nx], held = held_exponential(A, B, s)
+        of_states[:, :nx], held = self._hold(A, B, s)
         for index, (samples, rest) in enumerate(self.delays):
             if not samples:
                 of_commands[:, index] = held[:, index]
@@ -79,9 +94,9 @@ class HeldSystem:
             column = B[:, index : index + 1]
             # The oldest command acts until the time `rest`, and the next command from then on.
             oldest = self.first[index] + samples - 1
-            _, by_oldest = held_exponential(A, column, min(rest, s))
+            _, by_oldest = self._hold(A, column, min(rest, s))
             time_left = max(s - rest, 0.0)
-            transition, by_next = held_exponential(A, column, time_left)
+            transition, by_next = self._hold(A, column, time_left)
             of_states[:, oldest] = (transition @ by_oldest)[:, 0]
             if samples == 1:
                 of_commands[:, index] = by_next[:, 0]

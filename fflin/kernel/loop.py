@@ -68,9 +68,11 @@ class Channel(
     - `low`, `high` (nu,): limits of the commands.
     - `held` (nu,): the latest command that has arrived. `pending` (slots, nu): the commands of the
       latest samples. Some of these commands may not have arrived yet, because of the delay.
-    - `sample`: number of steps per sample, 0 for continuous commands. `delay` (1,): delay in steps.
-    - `fresh` (1,): 1 in a step in which a command arrives, else 0. Until the first command
-      arrives, `fresh` is 1 at the start of each sample, so that the initial inputs are pulsed too.
+    - `sample`: number of steps per sample, 0 for continuous commands.
+    - `delay` (1,) or (nu,): delay of all inputs, or of each input, in steps.
+    - `fresh`, of the same length: 1 in a step in which a command arrives, else 0. Until the first
+      command arrives, `fresh` is 1 at the start of each sample, so that the initial inputs are
+      pulsed too.
     """
 
 
@@ -121,17 +123,21 @@ def transmit(channel: Channel, step: int, nu: Entries, u: Entries) -> None:
     # thruster, write the present thrust instead.
     if channel.sample > 0:
         any_fresh = False
+        # Each delay belongs to `width` inputs, which are all inputs or a single one.
+        delays = len(channel.delay)
+        width = count // delays
         for lane in range(vec.lane_count(channel.delay)):
-            since = step - int(vec.peek(channel.delay, 0, lane))
-            arrives = since >= 0 and since % channel.sample == 0
-            if arrives:
-                first = (since // channel.sample) % channel.slots * count
-                for index in range(count):
-                    value = vec.peek(channel.pending, first + index, lane)
-                    vec.poke(channel.held, index, lane, value)
-            fresh = arrives or (since < 0 and step % channel.sample == 0)
-            vec.poke(channel.fresh, 0, lane, 1.0 if fresh else 0.0)
-            any_fresh = any_fresh or fresh
+            for late in range(delays):
+                since = step - int(vec.peek(channel.delay, late, lane))
+                arrives = since >= 0 and since % channel.sample == 0
+                if arrives:
+                    first = (since // channel.sample) % channel.slots * count
+                    for index in range(late * width, (late + 1) * width):
+                        value = vec.peek(channel.pending, first + index, lane)
+                        vec.poke(channel.held, index, lane, value)
+                fresh = arrives or (since < 0 and step % channel.sample == 0)
+                vec.poke(channel.fresh, late, lane, 1.0 if fresh else 0.0)
+                any_fresh = any_fresh or fresh
         if any_fresh:
             _begin_pulses(channel, step, channel.held)
         vec.copy(channel.held, 0, u, 0, count)
@@ -164,8 +170,9 @@ def _begin_pulses(channel, step, u):
     """
     pulses = channel.pulses
     sample = channel.sample
-    fresh = load(channel.fresh, 0)
+    width = len(channel.low) // len(channel.delay)
     for index in range(len(pulses.at)):
+        fresh = load(channel.fresh, pulses.at[index] // width)
         most, least = load(pulses.most, index), load(pulses.least, index)
         command = load(u, pulses.at[index])
         wanted = chosen(most, command, most, command) * pulses.time + load(

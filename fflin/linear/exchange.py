@@ -17,7 +17,7 @@ from fflin.dynamics.integrators import held_exponential
 from fflin.dynamics.state import StateMap
 from fflin.linear.fit import require_fit
 from fflin.linear.linearization import linearize
-from fflin.linear.model import LinearModel, StateSpace
+from fflin.linear.model import LinearModel, StateSpace, refuse_delayed
 from fflin.linear.tool_coordinates import (
     STEPPING,
     Jacobians,
@@ -134,6 +134,7 @@ def transform(
     True
     """
     instance("lin", lin, LinearModel, "a fflin.LinearModel").require_unchanged()
+    refuse_delayed(lin, f"the conversion to {tool}")
     require_fit(lin, robot, StateMap(robot, frame=lin.frame))
     sampled = lin.dt
     whole = lin.generator

@@ -66,10 +66,12 @@ _ARRAYS: dict[str, tuple[str, ...]] = {
     "reference": ("placement",),
     "drift": ("drift",),
     "limits": ("limit",),
+    "delay": ("late",),
 }
 _NAMES = [f"{signal}_{field}" for field in ("names", "units") for signal in _SIGNALS]
-_LISTS = (*_NAMES, "locked", "ignorable", "wheels", "limit_names")
-_OPTIONAL = ("wheels",)  # lists that files of earlier versions lack
+_LISTS = (*_NAMES, "locked", "ignorable", "wheels", "limit_names", "added")
+# Lists and arrays that files of earlier versions lack.
+_OPTIONAL = ("wheels", "added", "delay")
 _TEXTS = (
     "frame",
     "robot",
@@ -113,7 +115,8 @@ def write_model(path: Path, entries: Record, *, checksummed: bool) -> None:
         return
     record.require_finite(entries)
     names = {signal: entries[f"{signal}_names"] for signal in _SIGNALS}
-    names["velocity"] = names["state"][-len(entries["M"]) :]
+    robot_states = names["state"][: len(names["state"]) - len(entries["added"])]
+    names["velocity"] = robot_states[-len(entries["M"]) :]
     rest, tables = dict(entries), dict[str, list[list[object]]]()
     for key in _MATRICES:
         rows, columns = (names[dimension] for dimension in _ARRAYS[key])
@@ -155,10 +158,14 @@ def read_model(
         if fields["frame"] not in get_args(Frame):
             raise ValueError(f"unknown frame '{fields['frame']}'")
         sizes = {signal: len(fields[f"{signal}_names"]) for signal in _SIGNALS}
-        sizes |= {"velocity": sizes["state"] // 2, "coordinate": -1, "placement": 7}
+        velocities = (sizes["state"] - len(fields.get("added", ()))) // 2
+        sizes |= {"velocity": velocities, "coordinate": -1, "placement": 7}
         sizes["drift"] = sizes["state"] if np.size(entries["drift"]) else 0
+        sizes["late"] = sizes["input"]
         sizes["limit"] = len(limit_names := fields.pop("limit_names"))
         for key, dimensions in _ARRAYS.items():
+            if key in _OPTIONAL and key not in entries:
+                continue
             array = np.array(entries[key], dtype=float)
             if not np.isfinite(array).all():
                 raise ValueError(f"{key} has entries that are not finite")
@@ -171,6 +178,9 @@ def read_model(
         ):
             raise ValueError("its weights are not a table")
         drift, limits = fields.pop("drift"), fields.pop("limits").tolist()
+        delays = fields.pop("delay", np.zeros(0))
+        if delays.any():
+            fields["_delays"] = tuple(delays.tolist())
         fields |= {
             "moving": bool(fields["moving"]),
             "verified": verified,

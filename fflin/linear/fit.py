@@ -49,7 +49,10 @@ def require_fit(
     reduced model, which lacks some states of the robot, is accepted.
     """
     made = f"the model was made for '{lin.robot}'"
-    require_same(made, state, "state", lin.state_names, lin.state_units, part=not whole)
+    names = lin.robot_states
+    require_same(
+        made, state, "state", names, lin.state_units[: len(names)], part=not whole
+    )
     require_same(made, state, "input", lin.input_names, lin.input_units)
     require_configuration_size(made, len(lin.q), robot)
     if sensed:

@@ -63,7 +63,8 @@ def held(lin: LinearModel, *, tilt: bool = True) -> LinearModel:
         robot, balanced.q, source.v, balanced.u, frame=frame, reference=reference
     )
     if lin.dt:
-        return model.discretize(lin.dt)
+        delays = dict(zip(input_keys(lin), lin.delay.tolist(), strict=True))
+        return model.discretize(lin.dt, delays)
     return model
 
 
@@ -81,6 +82,7 @@ def momentum_rate(lin: LinearModel) -> Vector:
     The axes are the axes of the angular velocity of the base: base axes in orbit. A wheel without
     an inertia gains the momentum of its torque.
     """
+    lin = lin.undelayed
     nv = len(lin.M)
     names = [f"qdot_m.{name}" for name in lin.wheels]
     at = [i for i, name in enumerate(lin.state_names[nv:]) if name in names]

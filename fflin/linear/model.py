@@ -14,7 +14,7 @@ import pinocchio as pin
 
 from fflin.base import html, svg
 from fflin.base.errors import InputError, optional_package
-from fflin.base.names import input_keys, undotted
+from fflin.base.names import by_name, input_keys, past_name, undotted
 from fflin.base.validation import (
     Array,
     ArrayLike,
@@ -22,9 +22,11 @@ from fflin.base.validation import (
     Vector,
     frozen,
     number,
+    numbers,
     positive,
 )
 from fflin.base.writing import as_path
+from fflin.dynamics.delays import HeldSystem, split
 from fflin.dynamics.integrators import held_exponential
 
 if TYPE_CHECKING:
@@ -36,6 +38,12 @@ if TYPE_CHECKING:
     from fflin.robot.robot import Robot
 
 ControlSystem: TypeAlias = "control.StateSpace"
+
+# Delay of the inputs [s]: one for all inputs, or {name, group or pattern of inputs: delay}.
+Delay: TypeAlias = float | Mapping[str, float]
+
+# A delay may have at most this many samples, because each sample adds a state for each input.
+MOST_SAMPLES = 500
 
 
 @dataclass(frozen=True)
@@ -240,6 +248,11 @@ class LinearModel(ModelHeader, StateSpace):
         Default weights of `lqr`, with the keys of `weights` in `Robot.replace`.
     mean_motion : float
         Mean motion of the robot's orbit [rad/s]; 0 without an orbit.
+    added : tuple of str
+        Names of the last states, which are not states of the robot: the earlier commands of a
+        model with delayed inputs, see `discretize`.
+    delay : ndarray (nu,)
+        Delay of each input [s].
 
     Examples
     --------
@@ -272,6 +285,8 @@ class LinearModel(ModelHeader, StateSpace):
     weights: Mapping[str, Any] = field(default_factory=dict)
     _robot: Robot | None = None  # robot of the model; None for a model from a file
     mean_motion: float = 0.0
+    added: tuple[str, ...] = ()
+    _delays: tuple[float, ...] = ()  # empty if no input is delayed
 
     def __init__(
         self, shared: Mapping[str, object] | None = None, /, **fields: object
@@ -341,7 +356,54 @@ class LinearModel(ModelHeader, StateSpace):
         source = self.generator
         if source is None:
             return self.f0 / self.dt
-        return source.f0
+        return np.append(source.f0, np.zeros(len(self.added)))
+
+    @property
+    def delay(self) -> Array:
+        """Delay (nu,) of each input [s]."""
+        if not self._delays:
+            return np.zeros(len(self.input_names))
+        return np.array(self._delays)
+
+    @property
+    def robot_states(self) -> tuple[str, ...]:
+        """Names of the states without those in `added`."""
+        return self.state_names[: len(self.state_names) - len(self.added)]
+
+    @cached_property
+    def undelayed(self) -> LinearModel:
+        """The sampled model without delays of its inputs; the model itself if it has none.
+
+        Its states are the states of the robot. Its inputs, which are constant in time, have the
+        same effect as equal commands in all samples of the delayed model.
+        """
+        if not self.added:
+            return self
+        if (source := self.generator) is not None:
+            return source.discretize(self.dt)
+        count = len(self.robot_states)
+        B = self.B[:count].copy()
+        D = self.D.copy()
+        for at, name in enumerate(self.added, count):
+            index = self.input_names.index(name.partition(".")[2])
+            B[:, index] += self.A[:count, at]
+            D[:, index] += self.C[:, at]
+        drift = self.drift
+        plain = replace(
+            self,
+            A=self.A[:count, :count],
+            B=B,
+            C=self.C[:, :count],
+            D=D,
+            f0=self.f0[:count],
+            x0=self.x0[:count],
+            state_names=self.state_names[:count],
+            state_units=self.state_units[:count],
+            drift=None if drift is None else drift[:count],
+            added=(),
+            _delays=(),
+        )
+        return replace(plain, _source=(plain.fingerprint, self))
 
     @cached_property
     def certificate(self) -> Certificate:
@@ -431,7 +493,7 @@ class LinearModel(ModelHeader, StateSpace):
         """Return the largest rate at an equilibrium: `tol`, or `tol` times mean motion in orbit."""
         return tol * min(1.0, self.mean_motion or 1.0)
 
-    def discretize(self, dt: float) -> LinearModel:
+    def discretize(self, dt: float, delay: Delay = 0.0) -> LinearModel:
         r"""Return the discrete-time model, with the input held constant between samples.
 
         .. math::
@@ -446,34 +508,61 @@ class LinearModel(ModelHeader, StateSpace):
         square of `dt` (1 % of A at 20 ms and 2 rad/s). For a motion, use
         `LinearTrajectory.discretize`.
 
+        With a delay :math:`(k - 1) h + e`, where :math:`0 < e \le h`, a command acts from this time
+        after its sample. The commands of the last k samples are further states:
+
+        .. math:: x_{+} = e^{A h} x + e^{A (h - e)}\,\Gamma(e)\,u_{-k} + \Gamma(h - e)\,u_{-(k-1)},
+                  \qquad \Gamma(s) = \int_0^s e^{A t}\,dt\,B
+
+        The state ``past_2.tau_b.x`` is the command of the input ``tau_b.x`` two samples ago.
+
         Parameters
         ----------
         dt : float
             Sampling time h [s], positive.
+        delay : float or mapping, optional
+            Delay [s] from a sample to the time from which its command acts: one for all inputs, or
+            {name, group or pattern: delay} with names of inputs. The delay may be any fraction or
+            multiple of `dt`.
 
         Returns
         -------
         LinearModel
             Discrete-time model with sampling time ``dt``. Its `certificate` is the certificate of
-            the continuous-time model.
+            the continuous-time model. Its `added` states are the commands on their way.
 
         Raises
         ------
         InputError
-            If `dt` is not positive or the model is already in discrete time.
+            If `dt` is not positive, a delay is negative or longer than 500 samples, or the model is
+            already in discrete time.
+        UnknownNameError
+            If there is no such input.
         ModelError
             If the robot's Pinocchio model (``robot.model``) was modified after the robot was
             created.
+
+        Examples
+        --------
+        >>> lin = fflin.linearize(fflin.load("planar_detumble"))
+        >>> late = lin.discretize(0.1, delay={"tau_b": 0.15})
+        >>> late.added[:2], len(late.state_names)
+        (('past_1.tau_b.x', 'past_2.tau_b.x'), 24)
+        >>> fflin.lqr(late).K.shape
+        (9, 24)
         """
         self.require_unchanged()
         dt = positive("dt", dt, "s")
         refuse_sampled(self.dt, "discretize")
+        delays = delays_of(self, delay, dt)
         Ad, held = held_exponential(self.A, np.column_stack((self.B, self.f0)), dt)
         if not (np.isfinite(Ad).all() and np.isfinite(held).all()):
             raise InputError(
                 f"dt is {dt:g} s, over which the model's response overflows; give a smaller dt"
             )
         sampled = replace(self, A=Ad, B=held[:, :-1], f0=held[:, -1], dt=dt)
+        if any(split(each, dt).samples for each in delays):
+            sampled = _delayed(self, sampled, delays)
         return replace(sampled, _source=(sampled.fingerprint, self))
 
     def to(self, tool: str, *, dt: float | None = None) -> ToolModel:
@@ -595,4 +684,61 @@ def refuse_sampled(dt: float, do: str) -> None:
         raise InputError(
             f"the model is already sampled, at dt = {dt:g} s; {do} the continuous-time model "
             "instead"
+        )
+
+
+def delays_of(lin: LinearModel, delay: Delay, dt: float) -> list[float]:
+    """Return the delay of each input [s], or raise `InputError` if one is not possible."""
+    if isinstance(delay, Mapping):
+        values = numbers("delay", delay, "input", "delay of")
+        value_at = by_name("input", values, input_keys(lin))
+        delays = [value_at.get(index, 0.0) for index in range(len(lin.input_names))]
+    else:
+        delays = [number("delay", delay)] * len(lin.input_names)
+    for name, value in zip(lin.input_names, delays, strict=True):
+        if not 0.0 <= value <= MOST_SAMPLES * dt:
+            raise InputError(
+                f"delay of {name} is {value:g} s, expected at least 0 and at most {MOST_SAMPLES} "
+                f"samples of {dt:g} s"
+            )
+    return delays
+
+
+def _delayed(
+    lin: LinearModel, sampled: LinearModel, delays: list[float]
+) -> LinearModel:
+    """Return the model `sampled` of the continuous model `lin` with delayed inputs."""
+    held = HeldSystem(lin.A, lin.B, sampled.dt, np.array(delays))
+    A, B = held.sampled()
+    C, D = held.outputs(lin.C, lin.D)
+    samples = [delay.samples for delay in held.delays]
+    inputs = np.repeat(np.arange(len(delays)), samples)
+    ago = [k for count in samples for k in range(1, count + 1)]
+    added = tuple(
+        past_name(k, lin.input_names[index])
+        for k, index in zip(ago, inputs.tolist(), strict=True)
+    )
+    nothing = np.zeros(len(added))
+    return replace(
+        sampled,
+        A=A,
+        B=B,
+        C=C,
+        D=D,
+        f0=np.append(sampled.f0, nothing),
+        x0=np.append(lin.x0, lin.u0[inputs]),
+        drift=None if lin.drift is None else np.append(lin.drift, nothing),
+        state_names=(*lin.state_names, *added),
+        state_units=(*lin.state_units, *(lin.input_units[index] for index in inputs)),
+        added=added,
+        _delays=tuple(delays),
+    )
+
+
+def refuse_delayed(lin: LinearModel, what: str) -> None:
+    """Raise `InputError` for a model with delayed inputs; `what` is the subject of the message."""
+    if lin.added:
+        raise InputError(
+            f"{what} needs a model with the states of the robot alone, but this model has "
+            f"{len(lin.added)} states of delayed inputs ({lin.added[0]}, ...); give lin.undelayed"
         )

@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 RULES = ("urdf", "identity")
 
 
-def _input_keys(robot: RobotData) -> tuple[str, ...]:
+def input_keys_of(robot: RobotData) -> tuple[str, ...]:
     """Return the name GROUP.ENTRY of each input, such as "thrust.NAME"; see `names.input_keys`."""
     pairs = ((item.GROUP, name) for item, names in robot.named_inputs for name in names)
     keys = []
@@ -67,7 +67,7 @@ def _given_limits(
     to at least 0, because a thruster never pulls.
     """
     named = robot.named_inputs
-    keys, states = _input_keys(robot), state_keys(robot.joint_names)
+    keys, states = input_keys_of(robot), state_keys(robot.joint_names)
     names = [*(name for _, entries in named for name in entries), *states]
     floors = []
     for item, entries in named:
@@ -281,7 +281,7 @@ def _weights(value: object, robot: RobotData) -> dict[str, object]:
     The keys of the mappings are names, groups or patterns of states and inputs. `integral` contains
     names of states or outputs, or a mapping {name: weight of the integral}.
     """
-    states, inputs = state_keys(robot.joint_names), _input_keys(robot)
+    states, inputs = state_keys(robot.joint_names), input_keys_of(robot)
     both = (*states, *inputs)
     kinds = {
         "q": ("state", states),

@@ -164,6 +164,12 @@ def noises(plan: Plan, size: int, step: int, last: int) -> tuple[Indices, Array]
     return at, rows
 
 
+def _largest(delays: Array) -> list[int]:
+    """Return the largest of each column of delays (N, k) in steps."""
+    largest: list[int] = delays.max(axis=0).astype(int).tolist()
+    return largest
+
+
 class Statistics:
     """Base class for statistics of eight parallel runs; this class collects none."""
 
@@ -208,8 +214,9 @@ class LaneLoop:
         runs = runs or {}
         self.lanes = lanes
         if "delay" in runs:  # provide space for the largest delay
-            largest_delay = int(runs["delay"].max())
-            plan = plan.replace(times=plan.times._replace(delay=largest_delay))
+            plan = plan.replace(
+                times=plan.times._replace(delays=tuple(_largest(runs["delay"])))
+            )
         stop = stop_conditions(plan)
         if runs:
             # `stop.sign` is the sign of q0 at the start of the plan, or 0 if q0 is not checked. The
@@ -454,7 +461,8 @@ def packed(
     size, (shift, speed) = 6 + state.robot.n, method.step_weights(h)
     mechanics = mechanics_of(plant)
     # The delay line needs no space for commands that arrive after the end of the run.
-    channel = channel_of(plan.limits, u, times.sample, min(times.delay, times.steps))
+    delays = [min(delay, times.steps) for delay in times.delays]
+    channel = channel_of(plan.limits, u, times.sample, delays)
     return loop.Arguments(
         robot=mechanics,
         method=loop.Method(
@@ -472,7 +480,7 @@ def packed(
             u=u,
         ),
         law=_law(plan, mechanics, noisy),
-        channel=channel._replace(delay=[float(times.delay)]),
+        channel=channel._replace(delay=list(map(float, times.delays))),
         # Placeholder: the values of this reference are written when a simulation starts.
         reference=forward.MomentumReference(*map(np.zeros, (12, 3, 1, forward.SUMS))),
         project=plan.project,

@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -25,6 +26,7 @@ from fflin.base.names import group_of
 from fflin.base.validation import Array, Values
 from fflin.control.channel import Law
 from fflin.control.policy import BoundLaw, Command, Policy
+from fflin.dynamics.delays import HeldSystem, Hold
 from fflin.dynamics.integrators import Integrator
 from fflin.linear.linearization import Linearizer
 from fflin.linear.model import LinearModel
@@ -185,17 +187,15 @@ class SampledLoop:
         of the robot limit the step.
         """
         dt = self.lin.dt
-        steps = max(1, math.ceil(dt / h - 1e-9))
         A, B = self.generator.A, self.generator.B
         with np.errstate(over="ignore", invalid="ignore"):
-            step = method.held(A, B, dt / steps)
-        if step is None:
-            return Demand(0.0, str)
+            if method.held(A, B, h) is None:
+                return Demand(0.0, str)
         exact_loop = self.loop(self.lin)
         if not np.abs(exact_loop).max(initial=0.0) < _STEEPEST:  # the run stops at once
             return Demand(0.0, str)
         with np.errstate(over="ignore", invalid="ignore"):
-            integrated = self.loop(self._integrated(step, steps))
+            integrated = self.loop(self._integrated(partial(_in_steps, method, h)))
         if not np.isfinite(integrated).all():
             return Demand(math.inf, lambda: "the sampled loop")
         exact, simulated = _matched(
@@ -212,13 +212,32 @@ class SampledLoop:
             float(errors[worst]), lambda: Poles("sampled loop", poles).mode(worst)
         )
 
-    def _integrated(self, step: tuple[Array, Array], steps: int) -> LinearModel:
-        """Return the sampled model of the plant from the matrices of one step."""
-        nx, nu = step[1].shape
-        extended = np.eye(nx + nu)
-        extended[:nx] = np.hstack(step)
-        sample = np.linalg.matrix_power(extended, steps)[:nx]
-        return replace(self.lin, A=sample[:, :nx], B=sample[:, nx:])
+    def _integrated(self, hold: Hold) -> LinearModel:
+        """Return the sampled model of the plant as it is integrated.
+
+        `hold` returns the matrices of the integrated motion under held inputs.
+        """
+        lin = self.lin
+        A, B = self.generator.A, self.generator.B
+        if not lin.added:
+            A, B = hold(A, B, lin.dt)
+        else:
+            A, B = HeldSystem(A, B, lin.dt, lin.delay, hold).sampled()
+        return replace(lin, A=A, B=B)
+
+
+def _in_steps(
+    method: type[Integrator], h: float, A: Array, B: Array, time: float
+) -> tuple[Array, Array]:
+    """Return the matrices of the motion of dx/dt = A x + B u over a time [s], in steps up to h."""
+    steps = max(1, math.ceil(time / h - 1e-9))
+    step = method.held(A, B, time / steps)
+    assert step is not None
+    nx, nu = step[1].shape
+    extended = np.eye(nx + nu)
+    extended[:nx] = np.hstack(step)
+    sample = np.linalg.matrix_power(extended, steps)[:nx]
+    return sample[:, :nx], sample[:, nx:]
 
 
 def _matched(one: Values, other: Values) -> tuple[Values, Values]:

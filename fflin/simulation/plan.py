@@ -15,7 +15,7 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import FflinWarning, InputError
-from fflin.base.names import group_of
+from fflin.base.names import by_name, group_of
 from fflin.base.validation import (
     Array,
     ArrayLike,
@@ -23,6 +23,7 @@ from fflin.base.validation import (
     function,
     instance,
     number,
+    numbers,
     truth,
     vector,
     whole,
@@ -50,8 +51,8 @@ from fflin.dynamics.coordinates import ORBITAL, Frame, refuse_orbit
 from fflin.dynamics.integrators import held_exponential, integrator
 from fflin.dynamics.methods import DEFAULT_METHOD
 from fflin.dynamics.state import StateMap, selection
-from fflin.linear.model import LinearModel
-from fflin.robot.fields import chosen_limits
+from fflin.linear.model import Delay, LinearModel
+from fflin.robot.fields import chosen_limits, input_keys_of
 from fflin.robot.robot import Robot
 from fflin.simulation.pace import Pace, Signal, limits_of_step
 from fflin.simulation.plant import LARGEST_TURN, Disturbance, Plant
@@ -92,7 +93,7 @@ class SimulationOptions:
     method: str = DEFAULT_METHOD
     project: bool = True
     sample: float | None = None
-    delay: float = 0.0
+    delay: Delay | None = None
     limits: Limits | None = None
     disturbance: Disturbance | None = None
     events: Sequence[Event] = ()
@@ -114,7 +115,8 @@ class Times(NamedTuple):
     every: int  # steps between recorded rows
     # steps between samples of the law; 0 if the law is evaluated at all stages
     sample: int
-    delay: int  # steps from a sample to its effect
+    # steps from a sample to the effect of its command: one for all inputs, or one for each input
+    delays: tuple[int, ...]
     notes: tuple[str, ...]  # remarks on the recorded rows, for the report
 
     @property
@@ -167,7 +169,8 @@ class Plan:
             disturbance = partial(plant.disturbing, q=self.q, v=self.v)
             limits.append(Signal.of("the disturbance", disturbance, dt, duration))
         pace = Pace(limits, self.method, duration)
-        self.times = times = times_of(options, duration, sample, pace)
+        late = delays_of(policy, plant, options.delay)
+        self.times = times = times_of(options, duration, sample, pace, late)
         if policy and times.sample:
             policy = policy.held_for(times.sample * times.dt)
         self.policy = policy
@@ -267,7 +270,7 @@ class Plan:
         """
         times = self.times
         return channelled(
-            law, speeds, self.limits, self.initial, times.sample, times.delay, correct
+            law, speeds, self.limits, self.initial, times.sample, times.delays, correct
         )
 
 
@@ -298,7 +301,9 @@ def target_of(
     """
     if target is None:
         return None
-    if not isinstance(target, LinearModel):
+    if isinstance(target, LinearModel):
+        target = target.undelayed
+    else:
         goal: Array = vector(name, target, state.nx, "a state (12 + 2n)").copy()
         state.to_pinocchio(goal)  # raises an error for an invalid attitude
         return goal
@@ -442,8 +447,40 @@ def sample_of(policy: Policy | None, sample: float | None) -> float | None:
     return _positive(f"sample_time of {policy.kind}", seconds)
 
 
+def delays_of(
+    policy: Policy | None, plant: Plant, delay: Delay | None
+) -> tuple[float, ...]:
+    """Return the delay [s] of all inputs, or of each input.
+
+    The argument `delay` takes precedence over the delay of the policy's model.
+    """
+    if isinstance(delay, Mapping):
+        keys = input_keys_of(plant.robot)
+        values = numbers("delay", delay, "input", "delay of")
+        value_at = by_name("input", values, keys)
+        return tuple(value_at.get(index, 0.0) for index in range(len(keys)))
+    if delay is not None:
+        return (number("delay", delay),)
+    lin = None if policy is None else policy.model
+    if lin is None or not lin.delay.any():
+        return (0.0,)
+    delays = lin.delay.tolist()
+    if len({*delays}) == 1:
+        return (delays[0],)
+    if lin.input_names != plant.actuation.names:
+        raise InputError(
+            f"the model of the policy has different delays of the inputs of '{lin.robot}', which "
+            "are not the inputs of the simulated robot; give delay= with one delay for all"
+        )
+    return tuple(delays)
+
+
 def step_of(
-    options: SimulationOptions, duration: float, sample: float | None, pace: Pace
+    options: SimulationOptions,
+    duration: float,
+    sample: float | None,
+    pace: Pace,
+    delays: tuple[float, ...],
 ) -> tuple[float, int, str]:
     """Return the time step [s], the number of steps, and the mode that makes the step short.
 
@@ -452,15 +489,15 @@ def step_of(
     """
     dt = options.dt
     mode = ""
-    delay = number("delay", options.delay)
+    longest = max(delays)
     if dt is None:
         dt, mode = pace.step()
-        if sample or delay:
-            dt = _part_of(sample or delay, dt, duration, delay)
+        if sample or longest:
+            dt = _part_of(sample or longest, dt, duration, *delays)
     dt = _positive("the step dt", dt)
     steps = max(1, round(duration / dt))
     if abs(steps * dt - duration) > 1e-6 * duration:
-        if sample or delay:
+        if sample or longest:
             _in_steps("duration", duration, dt)  # raises an error
         steps = int(np.ceil(duration / dt))
         dt = duration / steps
@@ -468,21 +505,27 @@ def step_of(
 
 
 def times_of(
-    options: SimulationOptions, duration: float, sample: float | None, pace: Pace
+    options: SimulationOptions,
+    duration: float,
+    sample: float | None,
+    pace: Pace,
+    delays: tuple[float, ...],
 ) -> Times:
     """Derive the times of a simulation; `sample` is the sample time [s], None if continuous."""
     every = options.every
     notes = list[str]()
-    delay = number("delay", options.delay)
-    if not 0.0 <= delay < duration:
+    for delay in delays:
+        if 0.0 <= delay < duration:
+            continue
         raise InputError(
             f"delay is {delay:g} s, expected at least 0 and less than the duration of "
             f"{duration:g} s, so that a command takes effect"
         )
-    dt, steps, mode = step_of(options, duration, sample, pace)
+    longest = max(delays)
+    dt, steps, mode = step_of(options, duration, sample, pace, delays)
     if sample is None:
-        sample = dt if delay else 0.0
-        if delay:
+        sample = dt if longest else 0.0
+        if longest:
             notes.append(
                 f"delay= without sample=: the policy is sampled every {dt:g} s, and its commands "
                 "are held"
@@ -496,7 +539,8 @@ def times_of(
     if mode:
         notes.append(f"the step is {dt:.3g} s, because {mode} requires it")
     notes += pace.remarks(dt)
-    samples, late = _in_steps("sample", sample, dt), _in_steps("delay", delay, dt)
+    samples = _in_steps("sample", sample, dt)
+    late = tuple(_late_steps(delay, delays, dt, sample, duration) for delay in delays)
     thinned = every is None and steps > _MANY_ROWS
     part = max(samples, 1)
     # If `every` is chosen automatically, rows of a sampled policy are recorded only at samples.
@@ -545,6 +589,8 @@ def _require_possible(
         )
 
 
+# Largest number of steps per sample that are tried beyond the least number.
+_MOST_PARTS = 1000
 _COUNTABLE = 2**53  # a double represents every whole number up to this one
 
 
@@ -562,18 +608,48 @@ def _in_steps(name: str, time: float, dt: float) -> int:
     return round(time / dt)
 
 
+def _late_steps(
+    delay: float, delays: tuple[float, ...], dt: float, sample: float, duration: float
+) -> int:
+    """Return a delay [s] as a number of steps of dt [s].
+
+    If it is not a whole number, raise `InputError` with the nearest step for which it is.
+    """
+    if _divides(dt, delay):
+        return round(delay / dt)
+    advice = (
+        "no step divides the sample time and the delay; the nearest delay for this step is "
+        f"{round(delay / dt) * dt:g} s"
+    )
+    parts = range(1, math.ceil(sample / dt) + _MOST_PARTS)
+    fit = [
+        sample / count
+        for count in parts
+        if all(_divides(sample / count, time) for time in (duration, *delays))
+    ]
+    if fit:
+        nearest = min(fit, key=lambda step: abs(step - dt))
+        advice = (
+            f"the nearest step that divides it is dt={nearest:.9g} (--dt {nearest:.9g})"
+        )
+    raise InputError(
+        f"delay is {delay:g} s, expected a multiple of the step dt = {dt:g} s; {advice}"
+    )
+
+
+def _divides(dt: float, time: float) -> bool:
+    """Return whether a time [s] is a whole number of steps of dt [s]."""
+    return abs(round(time / dt) * dt - time) <= 1e-6 * dt
+
+
 def _part_of(sample: float, largest: float, *times: float) -> float:
     """Return a time step of at most `largest` [s] that divides the sample time.
 
     If possible, the step also divides all `times`.
     """
     least = int(np.ceil(sample / largest))
-    steps = [sample / parts for parts in range(least, least + 1000)]
-    fit = (
-        dt
-        for dt in steps
-        if all(abs(round(t / dt) * dt - t) <= 1e-6 * dt for t in times)
-    )
+    steps = [sample / parts for parts in range(least, least + _MOST_PARTS)]
+    fit = (dt for dt in steps if all(_divides(dt, t) for t in times))
     return next(fit, steps[0])
 
 

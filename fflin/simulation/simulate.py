@@ -24,7 +24,7 @@ from fflin.dynamics.integrators import held_exponential
 from fflin.dynamics.methods import DEFAULT_METHOD
 from fflin.dynamics.state_rows import state_history
 from fflin.kernel.compiled import is_kept
-from fflin.linear.model import LinearModel
+from fflin.linear.model import Delay, LinearModel
 from fflin.robot.fields import limits_of
 from fflin.robot.robot import Robot
 from fflin.simulation.lanes import engine_of, not_compilable, recorded
@@ -69,7 +69,7 @@ def simulate(
     method: str = DEFAULT_METHOD,
     project: bool = True,
     sample: float | None = None,
-    delay: float = 0.0,
+    delay: Delay | None = None,
     limits: Limits | None = None,
     disturbance: Disturbance | None = None,
     events: Sequence[Event] = (),
@@ -130,10 +130,12 @@ def simulate(
         Sample time [s] of the policy, a multiple of dt; u is held between samples. The default is
         the sampling time of the policy's model. If this model is in continuous time, the policy is
         evaluated at every stage of every integration step.
-    delay : float
-        Time [s] from a sample until its command takes effect, a multiple of dt. Until the first
-        command takes effect, the input is u0 of the policy's model or C code, or zero for a
-        function. If `delay` is given without `sample`, the policy is sampled every dt.
+    delay : float or mapping, optional
+        Time [s] from a sample until its command takes effect, a multiple of dt: one for all inputs,
+        or {name, group or pattern: delay}. The default is the delay of the policy's model, see
+        `LinearModel.discretize`. Until the first command takes effect, the input is u0 of the
+        policy's model or C code, or zero for a function. If `delay` is given without `sample`, the
+        policy is sampled every dt.
     limits : "urdf", float, mapping or list of them, optional
         Limits at which the inputs saturate. By default, inputs do not saturate. Limits are one of
 
@@ -460,10 +462,12 @@ def predictor(plan: Plan) -> Predictor | None:
     """
     linear, policy, state = plan.options.linear, plan.policy, plan.plant.state
     lin = policy.model if policy else None
+    if lin is not None:
+        lin = lin.undelayed
     if not (linear is None or isinstance(linear, bool | np.bool_)):
         lin = instance(
             "linear", linear, LinearModel, "a fflin.LinearModel, True or False"
-        )
+        ).undelayed
         names = (state.names, plan.plant.actuation.names, state.frame)
         same = (lin.state_names, lin.input_names, lin.frame) == names and not lin.moving
         if policy and policy.senses_outputs:

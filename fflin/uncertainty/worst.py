@@ -15,6 +15,7 @@ from fflin.base.errors import InputError
 from fflin.base.process import Progress, in_one_thread
 from fflin.base.tables import folded
 from fflin.base.validation import Array, Mask, shaped
+from fflin.control.delayed import is_delayed
 from fflin.control.gain import Gain, gain_matrix, regulated_states
 from fflin.control.optimal.largest_gain import ACCURACY, gain_crossings, largest_gain
 from fflin.uncertainty.lft import LFT
@@ -126,6 +127,12 @@ def searched(
     model: Uncertain, lft: LFT, gain: object, samples: int, seed: int
 ) -> Worst:
     """Search for the worst closed loops; see `Uncertain.worst`."""
+    if isinstance(gain, Gain) and is_delayed(gain.state_names):
+        raise InputError(
+            "the gain was designed for delayed inputs, but the uncertain model is continuous and "
+            "has no delay; give a gain of the continuous model, or the samples of the set to "
+            "fflin.margins one by one"
+        )
     K = shaped("gain", gain_matrix(gain), lft.B2.T.shape, " (nu, nx)")
     kept = judged_states(lft, K, regulated_states(gain))
     lft = part_of(lft, kept)

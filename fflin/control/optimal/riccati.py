@@ -34,6 +34,11 @@ _APART = 1e-5
 # boundary, but rounding errors move the computed pole by up to this distance.
 _NEAR_BOUNDARY = 1e-6
 
+# The modes V of a sampled loop are not used if |V| |V^-1| is at least this. Powers of the loop, of
+# at most 2^_DOUBLINGS samples, then replace them.
+_INDEPENDENT = 1e10
+_DOUBLINGS = 60
+
 
 class Solution(NamedTuple):
     """Solution P of a Riccati equation, with its gain K, residual and method.
@@ -294,7 +299,7 @@ def _bilinear(equation: Riccati) -> Riccati | None:
 
 
 def _finished(
-    equation: Riccati, trial: _Trial, modes: ModalMatrix | None, method: str
+    equation: Riccati, trial: _Trial, modes: ModalMatrix | Powers | None, method: str
 ) -> Solution | None:
     K = equation.gain(trial.P)
     F = equation.A - equation.B @ K
@@ -314,8 +319,8 @@ def _finished(
 
 
 def _refined(
-    equation: Riccati, P: Array, modes: ModalMatrix | None
-) -> tuple[_Trial, ModalMatrix | None]:
+    equation: Riccati, P: Array, modes: ModalMatrix | Powers | None
+) -> tuple[_Trial, ModalMatrix | Powers | None]:
     """Refine P by Newton steps; `modes` belong to a loop near the closed loop of P, or are None."""
     enough = 0.5 * _EPS * len(P) ** 0.5
     trial = best = equation.trial(P)
@@ -325,7 +330,7 @@ def _refined(
             break
         if modes is None:
             F = equation.A - equation.B @ equation.gain(trial.P)
-            modes = ModalMatrix.of(F, equation.discrete)
+            modes = _solver_of(F, equation.discrete)
             fresh = True
         better = equation.trial(trial.P + modes.lyapunov(trial.defect))
         gain = trial.residual / max(better.residual, _TINY)
@@ -428,6 +433,44 @@ class ModalMatrix:
         values[real] = values[real].real
         values[first + 1] = values[first].conj()
         return values
+
+
+class Powers:
+    """Solver for the Lyapunov equation of a sampled loop F (n, n), from powers of F.
+
+    Unlike `ModalMatrix`, it is accurate if F has multiple poles without as many modes, such as the
+    poles at zero of delayed inputs.
+    """
+
+    def __init__(self, F: Array) -> None:
+        self.F = F
+
+    def lyapunov(self, r: Array) -> Array:
+        """Return the sum D of (F')^k r F^k over all k >= 0, so that F' D F - D = -r."""
+        D, power = r, self.F
+        for _ in range(_DOUBLINGS):
+            D = D + power.T @ D @ power
+            power = power @ power
+            if not _norm(power) > _EPS:
+                break
+        return 0.5 * (D + D.T)
+
+    def poles(self, F: Array) -> Values:
+        """Return the eigenvalues of F."""
+        return np.linalg.eigvals(F)
+
+
+def _solver_of(F: Array, discrete: bool) -> ModalMatrix | Powers:
+    """Return the modes of a loop, or its powers if the modes of a sampled loop nearly coincide."""
+    if not discrete:
+        return ModalMatrix.of(F, discrete)
+    try:
+        modes = ModalMatrix.of(F, discrete)
+    except np.linalg.LinAlgError:
+        return Powers(F)
+    if np.linalg.norm(modes.V) * np.linalg.norm(modes.inverse) < _INDEPENDENT:
+        return modes
+    return Powers(F)
 
 
 def _inverse(matrix: Array) -> Array | None:
