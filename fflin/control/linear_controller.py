@@ -18,7 +18,7 @@ from fflin.base.names import undotted
 from fflin.base.record import read_record, reading, texts
 from fflin.base.validation import Array, Mask, as_double, instance, number, shaped
 from fflin.base.writing import RECORDS, as_path, check_ending, reason
-from fflin.control.kalman import Compensator
+from fflin.control.compensator import Compensator
 from fflin.control.policies import Feedback, Loop, OutputSensing, Sample
 from fflin.control.policy import (
     Noise,

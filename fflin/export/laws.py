@@ -12,8 +12,8 @@ from numpy.linalg import norm
 from fflin.base.errors import FflinError, InputError
 from fflin.base.rotation import conjugate, quaternion_product
 from fflin.base.validation import Array, Indices, instance
+from fflin.control.compensator import Compensator
 from fflin.control.gain import Gain, model_of
-from fflin.control.kalman import Compensator
 from fflin.control.policies import Sample, StateFeedback
 from fflin.control.policy import Command, OutputForm, PathForm, Policy, StateForm, bound
 from fflin.control.tracking import TrajectoryFeedback
