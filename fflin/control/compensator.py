@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from fflin.base import html
 from fflin.base.tables import folded
 from fflin.base.validation import Array, Poles, Vector
-from fflin.control.estimator import time_of
+from fflin.control.estimator import BIAS, DISTURBANCE, added_notes, names_of, time_of
 from fflin.control.gain import (
     ModelDesign,
     folded_poles,
@@ -23,7 +23,7 @@ class Compensator(ModelDesign):
     r"""Output-feedback compensator ``d(z)/dt = A z + B (y - y0)``, ``u - u0 = C z``.
 
     For a sampled model, ``A z + B (y - y0)`` is the value of z at the next sample. The state z is
-    the estimate of x - x0.
+    the estimate of x - x0, followed by the estimated disturbances and biases, if any.
 
     Attributes
     ----------
@@ -58,11 +58,24 @@ class Compensator(ModelDesign):
     u0: Vector
     output_names: tuple[str, ...]
 
+    @property
+    def disturbances(self) -> tuple[str, ...]:
+        """Names of the states that are estimated disturbances."""
+        return names_of(DISTURBANCE, self.state_names)
+
+    @property
+    def biases(self) -> tuple[str, ...]:
+        """Names of the states that are estimated biases of outputs."""
+        return names_of(BIAS, self.state_names)
+
     def _report(self) -> str:
         """Return the report with the sizes and the poles of the closed loop."""
         poles = table_of_poles(self, "the closed loop")
         title = folded([summary_of_poles(self), self._head()])
-        return f"{title}\n\n{poles}"
+        parts = [title, poles]
+        if notes := added_notes(self.state_names):
+            parts.append(folded(notes))
+        return "\n\n".join(parts)
 
     def _html_parts(self) -> list[str]:
         return [
@@ -70,6 +83,7 @@ class Compensator(ModelDesign):
             html.paragraph(self._head()),
             poles_figure(self, "the closed loop"),
             folded_poles(self, "the closed loop"),
+            *(html.paragraph(note) for note in added_notes(self.state_names)),
         ]
 
     def _head(self) -> str:

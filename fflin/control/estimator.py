@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +19,9 @@ from fflin.control.gain import (
     table_of_poles,
 )
 from fflin.linear.model import ControlSystem, state_space
+
+# Prefixes of the names of states that are estimated disturbances and biases.
+DISTURBANCE, BIAS = "disturbance.", "bias."
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -46,7 +50,8 @@ class Estimator(ModelDesign):
     margin : float
         Distance of the poles from the stability boundary, as in `Gain`.
     A, B, C, D : ndarray
-        Matrices of the model.
+        Matrices of the model. The estimated disturbances and biases are states of this model, and
+        follow the states of the robot.
     W, V : ndarray
         Covariances of the state disturbance and of the measurement noise.
     x0, u0, y0 : ndarray
@@ -86,11 +91,23 @@ class Estimator(ModelDesign):
     output_names: tuple[str, ...]
     estimated: tuple[str, ...]
 
+    @property
+    def disturbances(self) -> tuple[str, ...]:
+        """Names of the states that are estimated disturbances."""
+        return names_of(DISTURBANCE, self.state_names)
+
+    @property
+    def biases(self) -> tuple[str, ...]:
+        """Names of the states that are estimated biases of outputs."""
+        return names_of(BIAS, self.state_names)
+
     def _report(self) -> str:
         """Return the report with the poles and the states that are not estimated."""
         parts = [folded([summary_of_poles(self), self._head()])]
         parts.append(table_of_poles(self, "A - L C"))
         parts.append(f"Riccati residual {self.residual:.1e}")
+        if extended := added_notes(self.state_names):
+            parts.append(folded(extended))
         if left := self._not_estimated():
             parts.append(folded([left]))
         return "\n\n".join(parts)
@@ -103,6 +120,7 @@ class Estimator(ModelDesign):
             html.verdict(summary_of_poles(self), self.margin > 0.0),
             html.paragraph(self._head()),
             html.paragraph(f"Riccati residual {self.residual:.1e}"),
+            *(html.paragraph(note) for note in added_notes(self.state_names)),
             html.side_by_side(poles_figure(self, "A - L C"), L),
             folded_poles(self, "A - L C"),
             html.paragraph(self._not_estimated(), "note"),
@@ -147,6 +165,21 @@ class Estimator(ModelDesign):
             0.0,
         )
         return state_space(system, self.dt, self.state_names, both, self.state_names)
+
+
+def names_of(prefix: str, names: Sequence[str]) -> tuple[str, ...]:
+    """Return the names that begin with a prefix."""
+    return tuple(name for name in names if name.startswith(prefix))
+
+
+def added_notes(names: Sequence[str]) -> list[str]:
+    """Return lines that state which states are disturbances, and which are biases."""
+    notes = []
+    for title, prefix in (("disturbances", DISTURBANCE), ("biases", BIAS)):
+        members = [name.removeprefix(prefix) for name in names_of(prefix, names)]
+        if members:
+            notes.append(f"estimated {title}: {', '.join(members)}")
+    return notes
 
 
 def time_of(dt: float) -> str:

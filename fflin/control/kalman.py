@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 import numpy as np
+from scipy.linalg import block_diag
 
 from fflin.analysis.controllability import require_detectable, require_disturbed
+from fflin.analysis.lasting_modes import require_distinguished
 from fflin.analysis.reduction import (
     outputs_of,
     regulated_part,
     unpushed_positions,
     wheel_inputs,
 )
-from fflin.base.errors import DetectabilityError
+from fflin.base.errors import DetectabilityError, InputError, listed
 from fflin.base.names import input_keys
 from fflin.base.validation import Array, ArrayLike, dimension, shaped
-from fflin.control.estimator import Estimator
+from fflin.control.augmented import AddedStates, added_states
+from fflin.control.data_sheet import Noises, Sheet, measurement_noise
+from fflin.control.estimator import BIAS, Estimator
 from fflin.control.lqr import at_fixed_point
-from fflin.control.optimal.riccati import solve
+from fflin.control.optimal.riccati import Solution, solve
 from fflin.control.weights import Weight, weight
 from fflin.dynamics.state import selection
 from fflin.linear.linear_trajectory import LinearTrajectory
@@ -26,10 +32,13 @@ from fflin.linear.model import LinearModel
 def kalman(
     lin: LinearModel,
     W: Weight,
-    V: Weight,
+    V: Noises,
     G: ArrayLike | None = None,
     *,
     wheel_speeds: bool | None = None,
+    disturbance_noise: Mapping[str, float] | None = None,
+    bias_noise: Mapping[str, Sheet] | None = None,
+    disturbance_frequency: Mapping[str, float | Sequence[float]] | None = None,
 ) -> Estimator:
     r"""Return the steady-state Kalman filter of a model about a fixed point.
 
@@ -46,6 +55,18 @@ def kalman(
     the filter estimates the base position and its rate only if outputs measure the position and the
     disturbance pushes the base.
 
+    With `disturbance_noise`, the filter also estimates slowly varying disturbances w, and with
+    `bias_noise`, slowly varying biases b of outputs. Both are random walks, which are added to the
+    state:
+
+    .. math:: \dot x = A x + B u + B_d w + \ldots,\quad y = C x + D u + D_d w + b + n,\quad
+              \dot w = A_w w + n_w,\quad \dot b = n_b
+
+    A_w is zero for a constant disturbance. For a sinusoidal disturbance of a known frequency s
+    [rad/s], two states have the matrix ``[[0, s], [-s, 0]]``, and the first of them acts on the
+    robot. For a sampled model, these equations are sampled exactly. `lqg` cancels the estimated
+    disturbances, and does not feed back the biases.
+
     Parameters
     ----------
     lin : LinearModel
@@ -54,12 +75,34 @@ def kalman(
         {name: intensity} with names of states or of their groups.
     V : array_like (ny, ny) or (ny,), float, or mapping
         Intensity of the measurement noise, positive definite, in the same forms as W, but with
-        names of outputs.
+        names of outputs. In a mapping, the name of a measured quantity, such as ``gyroscope``,
+        selects its components, and a value can be a figure of a data sheet:
+
+        - {"angle_random_walk": x} in deg/sqrt(h), for outputs in rad/s;
+        - {"velocity_random_walk": x} in m/s/sqrt(h), for outputs in m/s^2;
+        - {"noise_equivalent_angle": x} in arc seconds (one standard deviation of a sample), for
+          attitudes: outputs in rad, or parts of a quaternion such as ``q_b``.
     G : array_like (nx, nw), optional
         Input matrix of the disturbance; W is then (nw, nw). With ``G=lin.B``, the disturbance
         acts at the inputs, and the keys of a mapping W are names of inputs.
     wheel_speeds : bool, optional
         As in `lqr`.
+    disturbance_noise : mapping, optional
+        Disturbances to estimate, as {name: intensity of the random walk} in the squared unit of the
+        disturbance per second, also for a sampled model. The names are generalised forces
+        (``tau_b``, ``F_b``, ``tau_m``, with the axes of the model), or inputs and their groups. A
+        torque ``tau_b`` on a satellite with reaction wheels is an external torque.
+    bias_noise : mapping, optional
+        Outputs with a bias to estimate, as {name: intensity of the random walk} in the squared unit
+        of the output per second. The names are as in V. Values can be figures of a data sheet:
+
+        - {"bias_instability": x} in deg/h, for outputs in rad/s: the standard deviation of the
+          change of the bias within one hour;
+        - {"rate_random_walk": x} in deg/h/sqrt(h), for outputs in rad/s.
+    disturbance_frequency : mapping, optional
+        Frequencies [Hz] of the sinusoids that a disturbance contains in addition to its slowly
+        varying part, as {name: frequency or list of frequencies}. The random walk of the two states
+        of a sinusoid has the intensity in `disturbance_noise`.
 
     Returns
     -------
@@ -69,7 +112,8 @@ def kalman(
     ------
     DetectabilityError
         If a mode neither decays by itself nor can be observed from the outputs; the message names
-        the mode.
+        the mode. Also if the outputs cannot distinguish a disturbance or a bias from another state,
+        for example a bias of the only attitude sensor from the attitude.
     EquilibriumError
         If the operating point is not a fixed point.
     InputError
@@ -91,42 +135,109 @@ def kalman(
     >>> noise = {"tau_b": 0.1, "F_b": 0.1, "tau_m": 0.01}
     >>> fflin.kalman(lin, noise, 1e-4, G=lin.B).L.shape
     (18, 18)
+
+    A constant torque and the bias of a gyroscope:
+
+    >>> sensors = [fflin.BasePose(), fflin.Gyroscope("base")]
+    >>> robot = fflin.load("cubesat", inputs=[fflin.BaseTorque()], outputs=sensors)
+    >>> sampled = fflin.linearize(robot).discretize(0.25)
+    >>> noise = {
+    ...     "q_b": {"noise_equivalent_angle": 10.0},
+    ...     "r_b": 1e-4,
+    ...     "gyroscope": {"angle_random_walk": 0.1},
+    ... }
+    >>> estimator = fflin.kalman(
+    ...     sampled,
+    ...     {"omega_b": 1e-14},
+    ...     noise,
+    ...     disturbance_noise={"tau_b": 1e-14},
+    ...     bias_noise={"gyroscope": {"bias_instability": 1.0}},
+    ... )
+    >>> estimator.disturbances[0], estimator.biases[0]
+    ('disturbance.tau_b.x', 'bias.base.gyroscope.x')
     """
-    lin = at_fixed_point(lin)
-    noise, through = disturbance(lin, W, G)
-    V = weight("V", V, lin.output_names, definite=True)
-    noises = V
-    whole = lin
-    lin = _estimated_part(lin, through @ noise, wheel_speeds)
-    S = selection(lin.state_names, whole.state_names)
-    seen = outputs_of(whole, S)
-    require_detectable(lin)
-    C = np.ascontiguousarray(lin.C)
+    whole = at_fixed_point(lin)
+    noise, through = disturbance(whole, W, G)
+    sensed = measurement_noise(whole, V)
+    covariance = weight("V", sensed, whole.output_names, definite=True)
+    added = added_states(whole, disturbance_noise, bias_noise, disturbance_frequency)
+    part = _estimated_part(whole, through @ noise, wheel_speeds)
+    in_part = selection(part.state_names, whole.state_names)
+    seen = outputs_of(whole, in_part)
+    require_detectable(part)
+    _require_used(whole, added, seen)
+    A, C = added.extend(part.A, np.ascontiguousarray(part.C), in_part, seen)
+    count = len(added.names)
+    names = (*part.state_names, *added.names)
+    if count:
+        require_distinguished(names, A, C, count, added.poles)
+    # S selects the estimated states from the states of the model and the added states.
+    S = block_diag(in_part, np.eye(count))
     try:
         # NumPy's warnings are not needed, because no filter is found if W or V overflows.
         with np.errstate(over="ignore", invalid="ignore"):
-            W = S @ through @ noise @ through.T @ S.T
-            V = seen @ V @ seen.T
-            W = 0.5 * W + 0.5 * W.T
-            require_disturbed(lin, W)
-            solution = solve(lin.A.T.copy(), C.T.copy(), W, V, None, lin.dt)
+            on_states = in_part @ through @ noise @ through.T @ in_part.T
+            driving = block_diag(on_states, np.zeros((count, count)))
+            driving = driving + S @ added.W @ S.T
+            driving = 0.5 * driving + 0.5 * driving.T
+            measured = seen @ covariance @ seen.T
+            require_disturbed(names, part.dt, A, driving)
+            solution = _solved(A, C, driving, measured, part.dt, added.size)
     except np.linalg.LinAlgError as error:
         raise DetectabilityError(
             f"no stable filter was found ({error}); scale W and V, or add outputs"
         ) from None
     L = L_update = solution.K.T
-    if lin.dt:
-        L_update = np.linalg.solve(C @ solution.P @ C.T + V, C @ solution.P).T
+    if part.dt:
+        innovation = C @ solution.P @ C.T + measured
+        L_update = np.linalg.solve(innovation, C @ solution.P).T
+    A, C = added.extend(whole.A, whole.C, np.eye(len(whole.A)), np.eye(len(whole.C)))
     return Estimator._of(
         solution,
         whole,
+        A=A,
+        B=np.vstack((whole.B, np.zeros((count, whole.B.shape[1])))),
+        C=C,
+        x0=np.concatenate((whole.x0, np.zeros(count))),
+        state_names=(*whole.state_names, *added.names),
         L=S.T @ L @ seen,
         L_update=S.T @ L_update @ seen,
         P=S.T @ solution.P @ S,
-        W=S.T @ W @ S,
-        V=noises,
-        estimated=lin.state_names,
+        W=S.T @ driving @ S,
+        V=covariance,
+        estimated=names,
     )
+
+
+def _solved(A: Array, C: Array, W: Array, V: Array, dt: float, size: Array) -> Solution:
+    """Solve the Riccati equation of the filter; `size` (k,) scales the last k states."""
+    if not len(size):
+        return solve(A.T.copy(), C.T.copy(), W, V, None, dt)
+    scale = np.concatenate((np.ones(len(A) - len(size)), size))
+    solution = solve(
+        (A * scale / scale[:, None]).T.copy(),
+        (C * scale).T.copy(),
+        W / np.outer(scale, scale),
+        V,
+        None,
+        dt,
+    )
+    return solution._replace(
+        P=solution.P * np.outer(scale, scale), K=solution.K * scale
+    )
+
+
+def _require_used(lin: LinearModel, added: AddedStates, seen: Array) -> None:
+    """Raise `InputError` if a bias belongs to an output that the filter does not use."""
+    unused = np.flatnonzero(~seen.any(axis=0))
+    biased = [
+        lin.output_names[i] for i in unused if BIAS + lin.output_names[i] in added.names
+    ]
+    if biased:
+        raise InputError(
+            f"the filter does not use {listed(biased)}, which depend on states that it does not "
+            "estimate, so it cannot estimate their bias; remove them from bias_noise"
+        )
 
 
 def _estimated_part(

@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import compress
+
 import numpy as np
 
 from fflin.base.errors import InputError, listed
-from fflin.base.validation import instance
+from fflin.base.names import chosen, group_of
+from fflin.base.validation import Array, instance
 from fflin.control.compensator import Compensator
-from fflin.control.estimator import Estimator
+from fflin.control.estimator import DISTURBANCE, Estimator
 from fflin.control.gain import Gain
+from fflin.control.rejection import rejection
 from fflin.dynamics.state import selection
 
 
-def lqg(gain: Gain, estimator: Estimator) -> Compensator:
+def lqg(
+    gain: Gain,
+    estimator: Estimator,
+    *,
+    zero_error: Sequence[str] | None = None,
+) -> Compensator:
     r"""Return the LQG compensator, which feeds back the state estimate: u - u0 = -K xh.
 
     .. math:: \dot z = (A - B K - L C + L D K) z + L (y - y_0),\qquad u - u_0 = -K z
@@ -20,11 +30,26 @@ def lqg(gain: Gain, estimator: Estimator) -> Compensator:
     For a sampled model, xh is the prediction from earlier samples, so that one sampling time is
     available for the computation.
 
+    If the estimator estimates disturbances w, the compensator cancels their steady effect:
+
+    .. math:: u - u_0 = -K (\hat x - \Pi \hat w) + \Gamma \hat w,\qquad
+              A \Pi - \Pi A_w + B \Gamma + B_d = 0,\qquad H \Pi = 0
+
+    For a sampled model, the regulator equation is ``A Pi + B Gamma + B_d = Pi A_w``. These
+    equations hold for the states that the gain regulates, and H selects the states in `zero_error`.
+    A constant disturbance then leaves no error in these states, and a sinusoid of a known frequency
+    none at the samples. Other states, such as the deflection of a spring, may be displaced. Biases
+    are estimated, but not fed back.
+
     Parameters
     ----------
     gain : Gain
     estimator : Estimator
         Estimator for the same model.
+    zero_error : sequence of str, optional
+        Names or groups of regulated states that disturbances must not displace in the steady state.
+        The default is the attitude and position of the base, and the positions of the joints with a
+        motor, as far as the gain regulates them.
 
     Returns
     -------
@@ -34,7 +59,10 @@ def lqg(gain: Gain, estimator: Estimator) -> Compensator:
     ------
     InputError
         If gain and estimator belong to different models, or the gain feeds back a state that the
-        estimator does not estimate.
+        estimator does not estimate. Also if no input can reject a disturbance, that is, if it
+        displaces states in `zero_error`; the message names the disturbance and these states.
+    UnknownNameError
+        If `zero_error` contains an unknown name.
 
     Examples
     --------
@@ -48,8 +76,9 @@ def lqg(gain: Gain, estimator: Estimator) -> Compensator:
     e = instance(
         "estimator", estimator, Estimator, "an Estimator, as fflin.kalman returns it"
     )
+    nx = len(gain.A)
     if gain.dt != e.dt or not (
-        np.array_equal(gain.A, e.A) and np.array_equal(gain.B, e.B)
+        np.array_equal(gain.A, e.A[:nx, :nx]) and np.array_equal(gain.B, e.B[:nx])
     ):
         raise InputError(
             "the gain and the estimator belong to different models; use one model for both"
@@ -61,14 +90,63 @@ def lqg(gain: Gain, estimator: Estimator) -> Compensator:
             "the same wheel_speeds= for both designs"
         )
     S = selection(names, e.state_names)
+    feedback = np.hstack((-gain.K, np.zeros((len(gain.K), len(e.A) - nx))))
+    if e.disturbances or zero_error is not None:
+        feedback[:, nx : nx + len(e.disturbances)] = _feedforward(gain, e, zero_error)
     return Compensator._of(
         e,
-        A=S @ (e.A - e.B @ gain.K - e.L @ (e.C - e.D @ gain.K)) @ S.T,
+        A=S @ (e.A + e.B @ feedback - e.L @ (e.C + e.D @ feedback)) @ S.T,
         B=S @ e.L,
-        C=-gain.K @ S.T,
+        C=feedback @ S.T,
         poles=np.concatenate((gain.poles, e.poles)),
         state_names=names,
         input_names=e.output_names,
         output_names=e.input_names,
         verified=gain.verified and e.verified,
     )
+
+
+def _feedforward(gain: Gain, e: Estimator, zero_error: Sequence[str] | None) -> Array:
+    """Return K Pi + Gamma (nu, nw), by which the inputs depend on the estimated disturbances."""
+    nx = len(gain.A)
+    regulated = gain.regulated or gain.state_names
+    R = selection(regulated, gain.state_names)
+    states = slice(nx, nx + len(e.disturbances))
+    held = _held_states(gain, regulated, zero_error)
+    equations = rejection(
+        R @ gain.A @ R.T,
+        R @ gain.B,
+        (R @ e.A[:nx, states], e.A[states, states]),
+        selection(held, regulated),
+        (R @ gain.Q @ R.T, gain.R),
+        gain.dt,
+    )
+    displaced = equations.displaced
+    if displaced.any():
+        moved = compress(held, np.any(displaced, axis=1).tolist())
+        disturbed = compress(e.disturbances, np.any(displaced, axis=0).tolist())
+        labels = [name.removeprefix(DISTURBANCE) for name in disturbed]
+        raise InputError(
+            f"no input can reject the disturbance {listed(labels)}: it displaces "
+            f"{listed(moved)} in the steady state; add inputs, or name the states "
+            "without an error in zero_error"
+        )
+    effect: Array = gain.K @ R.T @ equations.Pi + equations.Gamma
+    return effect
+
+
+def _held_states(
+    gain: Gain, regulated: Sequence[str], zero_error: Sequence[str] | None
+) -> list[str]:
+    """Return the names of the regulated states that disturbances must not displace."""
+    if zero_error is not None:
+        return [regulated[i] for i in chosen("regulated state", zero_error, regulated)]
+    motors = {
+        name.partition(".")[2] for name in gain.input_names if group_of(name) == "tau_m"
+    }
+    return [
+        name
+        for name in regulated
+        if group_of(name) in ("q_b", "r_b")
+        or (group_of(name) == "q_m" and name.partition(".")[2] in motors)
+    ]
