@@ -154,8 +154,10 @@ def _chosen_forces(
 ) -> tuple[dict[str, float], dict[str, tuple[float, ...]]]:
     """Return the intensity and the frequencies [Hz] of each disturbance, by its name."""
     expected = "a mapping {name: value}"
-    noise = instance("disturbance_noise", noise or {}, Mapping, expected)
-    frequency = instance("disturbance_frequency", frequency or {}, Mapping, expected)
+    noise = {} if noise is None else noise
+    noise = instance("disturbance_noise", noise, Mapping, expected)
+    frequency = {} if frequency is None else frequency
+    frequency = instance("disturbance_frequency", frequency, Mapping, expected)
     known = force_names(lin)
     intensities = {
         key: quantity(f"disturbance_noise of '{key}'", value)

@@ -87,7 +87,8 @@ def bias_intensities(
 ) -> dict[int, float]:
     """Return the intensity of the random walk of each bias by the index of its output."""
     expected = "a mapping {output: intensity}"
-    noise = instance("bias_noise", noise or {}, Mapping, expected)
+    noise = {} if noise is None else noise
+    noise = instance("bias_noise", noise, Mapping, expected)
     keys = _output_keys(noise, lin.output_names)
 
     def intensity(key: str, value: Sheet, unit: str) -> float:

@@ -140,6 +140,9 @@ def _held_states(
 ) -> list[str]:
     """Return the names of the regulated states that disturbances must not displace."""
     if zero_error is not None:
+        if isinstance(zero_error, str):
+            zero_error = [zero_error]
+        instance("zero_error", zero_error, Sequence, "a list of names of states")
         return [regulated[i] for i in chosen("regulated state", zero_error, regulated)]
     motors = {
         name.partition(".")[2] for name in gain.input_names if group_of(name) == "tau_m"

@@ -126,7 +126,7 @@ def lexicographic(levels: Sequence[tuple[Values, Values]]) -> Values:
     y: Values = np.zeros(size)
     free: Values = np.eye(size)
     for M, c in levels:
-        if not free.shape[1] or not len(M):
+        if not free.shape[1]:
             break
         U, values, V = np.linalg.svd(M @ free)
         largest = values.max(initial=0.0)
