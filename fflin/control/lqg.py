@@ -76,23 +76,13 @@ def lqg(
     e = instance(
         "estimator", estimator, Estimator, "an Estimator, as fflin.kalman returns it"
     )
+    names = require_estimated(gain, e)
     nx = len(gain.A)
-    if gain.dt != e.dt or not (
-        np.array_equal(gain.A, e.A[:nx, :nx]) and np.array_equal(gain.B, e.B[:nx])
-    ):
-        raise InputError(
-            "the gain and the estimator belong to different models; use one model for both"
-        )
-    names = e.estimated or e.state_names
-    if missing := [name for name in gain.regulated if name not in names]:
-        raise InputError(
-            f"the gain feeds back {listed(missing)}, which the estimator does not estimate; use "
-            "the same wheel_speeds= for both designs"
-        )
     S = selection(names, e.state_names)
     feedback = np.hstack((-gain.K, np.zeros((len(gain.K), len(e.A) - nx))))
     if e.disturbances or zero_error is not None:
-        feedback[:, nx : nx + len(e.disturbances)] = _feedforward(gain, e, zero_error)
+        Pi, Gamma = steady_rejection(gain, e, zero_error)
+        feedback[:, nx : nx + len(e.disturbances)] = gain.K @ Pi + Gamma
     return Compensator._of(
         e,
         A=S @ (e.A + e.B @ feedback - e.L @ (e.C + e.D @ feedback)) @ S.T,
@@ -106,8 +96,28 @@ def lqg(
     )
 
 
-def _feedforward(gain: Gain, e: Estimator, zero_error: Sequence[str] | None) -> Array:
-    """Return K Pi + Gamma (nu, nw), by which the inputs depend on the estimated disturbances."""
+def require_estimated(gain: Gain, e: Estimator) -> tuple[str, ...]:
+    """Return the names of the estimated states, or raise `InputError` if they do not fit a gain."""
+    nx = len(gain.A)
+    if gain.dt != e.dt or not (
+        np.array_equal(gain.A, e.A[:nx, :nx]) and np.array_equal(gain.B, e.B[:nx])
+    ):
+        raise InputError(
+            "the gain and the estimator belong to different models; use one model for both"
+        )
+    names = e.estimated or e.state_names
+    if missing := [name for name in gain.regulated if name not in names]:
+        raise InputError(
+            f"the gain feeds back {listed(missing)}, which the estimator does not estimate; use "
+            "the same wheel_speeds= for both designs"
+        )
+    return names
+
+
+def steady_rejection(
+    gain: Gain, e: Estimator, zero_error: Sequence[str] | None = None
+) -> tuple[Array, Array]:
+    """Return Pi (nx, nw) and Gamma (nu, nw), the steady state and inputs under disturbances."""
     nx = len(gain.A)
     regulated = gain.regulated or gain.state_names
     R = selection(regulated, gain.state_names)
@@ -131,8 +141,7 @@ def _feedforward(gain: Gain, e: Estimator, zero_error: Sequence[str] | None) -> 
             f"{listed(moved)} in the steady state; add inputs, or name the states "
             "without an error in zero_error"
         )
-    effect: Array = gain.K @ R.T @ equations.Pi + equations.Gamma
-    return effect
+    return R.T @ equations.Pi, equations.Gamma
 
 
 def _held_states(

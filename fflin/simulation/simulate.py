@@ -289,6 +289,7 @@ _CONTROLLERS = {
     "TrajectoryFeedback": "trajectory tracking",
     "TrajectoryOutputFeedback": "trajectory tracking, output feedback",
     "Mpc": "MPC",
+    "OutputMpc": "output feedback, MPC",
     "TrajectoryMpc": "trajectory tracking, MPC",
 }
 

@@ -422,7 +422,7 @@ def sound(folder):
                 "dt": 0.1,
                 "limits": {"tau_b": 1.0},
             },
-            **{"Qf": "steady", "weights": None},
+            **{"Qf": "steady", "weights": None, "disturbance": None},
         },
         "funnel": {
             **{
