@@ -60,7 +60,8 @@ def lqg(
     InputError
         If gain and estimator belong to different models, or the gain feeds back a state that the
         estimator does not estimate. Also if no input can reject a disturbance, that is, if it
-        displaces states in `zero_error`; the message names the disturbance and these states.
+        displaces states in `zero_error`; the message names the disturbance and these states. Also
+        if the gain has integral action and the estimator estimates disturbances.
     UnknownNameError
         If `zero_error` contains an unknown name.
 
@@ -80,6 +81,8 @@ def lqg(
     nx = len(gain.A)
     S = selection(names, e.state_names)
     feedback = np.hstack((-gain.K, np.zeros((len(gain.K), len(e.A) - nx))))
+    # A gain without integral action has no integrals.
+    require_one_integrator(getattr(gain, "integrals", ()), e.disturbances)
     if e.disturbances or zero_error is not None:
         Pi, Gamma = steady_rejection(gain, e, zero_error)
         feedback[:, nx : nx + len(e.disturbances)] = gain.K @ Pi + Gamma
@@ -94,6 +97,22 @@ def lqg(
         output_names=e.input_names,
         verified=gain.verified and e.verified,
     )
+
+
+def require_one_integrator(
+    integrals: Sequence[str], disturbances: Sequence[str]
+) -> None:
+    """Raise `InputError` if a gain with integral action meets estimated disturbances.
+
+    Both would integrate the error of the same channels, and only their sum would be determined.
+    """
+    if integrals and disturbances:
+        both = listed(integrals), listed(disturbances)
+        raise InputError(
+            f"the gain has integral action ({both[0]}) and the estimator estimates disturbances "
+            f"({both[1]}), which makes two integrators for one channel; omit integral_action or "
+            "disturbance_noise"
+        )
 
 
 def require_estimated(gain: Gain, e: Estimator) -> tuple[str, ...]:

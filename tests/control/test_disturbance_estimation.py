@@ -7,6 +7,7 @@ import scipy.linalg as sl
 from scipy.stats import chi2
 
 import fflin
+from fflin.control.lqg import require_one_integrator
 from fflin.control.rejection import rejection
 from tests.support.c_code import needs_compiler
 from tests.support.quadrotor import quadrotor
@@ -400,6 +401,14 @@ def test_a_disturbance_that_no_input_can_reject_is_named(tmp_path):
     assert tilt == pytest.approx(-0.1 / (robot.mass * 9.81), rel=1e-9)
     with pytest.raises(fflin.UnknownNameError, match="q_m"):
         fflin.lqg(gain, estimator, zero_error=["q_m"])
+
+
+def test_integral_action_and_an_estimated_disturbance_are_refused():
+    words = r"integral\.q_b\.x.*disturbance\.tau_b\.x.*two integrators for one channel"
+    with pytest.raises(fflin.InputError, match=words):
+        require_one_integrator(["integral.q_b.x"], ["disturbance.tau_b.x"])
+    require_one_integrator(["integral.q_b.x"], [])
+    require_one_integrator([], ["disturbance.tau_b.x"])
 
 
 def test_wrong_disturbances_and_biases_are_refused():
