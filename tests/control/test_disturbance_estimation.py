@@ -303,6 +303,31 @@ def test_a_constant_torque_is_rejected_in_the_simulation_with_wheels():
     assert not motion.stopped
 
 
+@pytest.mark.exhaustive
+def test_a_constant_torque_is_rejected_in_the_simulation_with_wings_and_wheels():
+    robot = satellite("inspector.toml")
+    model = fflin.linearize(robot).discretize(SAMPLE)
+    estimator = fflin.kalman(
+        model,
+        {"omega_b": 1e-12, "qdot_m": 1e-12},
+        {**NOISE, "q_m": 1e-9},
+        disturbance_noise={"tau_b": 1e-8},
+        bias_noise=BIAS_NOISE,
+    )
+    law = fflin.OutputFeedback(model, fflin.lqg(fflin.lqr(model), estimator))
+    motion = fflin.simulate(
+        robot,
+        law,
+        q0=robot.neutral(),
+        duration=100.0,
+        dt=0.0125,
+        every=400,
+        disturbance={"tau_b.x": 2e-5, "tau_b.z": 2e-3},
+    )
+    assert motion.attitude_error.max() > 1e-3
+    assert motion.attitude_error[-1] < 1e-3
+
+
 @pytest.fixture(scope="module")
 def runs():
     """Errors (runs, n) of the estimate after 1,000 seeded runs of the closed linear loop."""
