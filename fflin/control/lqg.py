@@ -36,10 +36,10 @@ def lqg(
               A \Pi - \Pi A_w + B \Gamma + B_d = 0,\qquad H \Pi = 0
 
     For a sampled model, the regulator equation is ``A Pi + B Gamma + B_d = Pi A_w``. These
-    equations hold for the states that the gain regulates, and H selects the states in `zero_error`.
-    A constant disturbance then leaves no error in these states, and a sinusoid of a known frequency
-    none at the samples. Other states, such as the deflection of a spring, may be displaced. Biases
-    are estimated, but not fed back.
+    equations, (10.9) of docs/derivation.md, hold for the states that the gain regulates. H selects
+    the states in `zero_error`. A constant disturbance then leaves no error in these states, and a
+    sinusoid of a known frequency none at the samples. Other states, such as the deflection of a
+    spring, may be displaced. Biases are estimated, but not fed back.
 
     Parameters
     ----------

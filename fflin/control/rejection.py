@@ -37,7 +37,7 @@ def rejection(
     cost: tuple[Array, Array],
     dt: float,
 ) -> Rejection:
-    r"""Solve the regulator equations of a model with a disturbance.
+    r"""Solve the regulator equations (10.9) of a model with a disturbance.
 
     .. math:: A \Pi + B \Gamma + B_d = \Pi A_w,\qquad H \Pi = 0
 
