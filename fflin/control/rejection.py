@@ -126,11 +126,11 @@ def lexicographic(levels: Sequence[tuple[Values, Values]]) -> Values:
     y: Values = np.zeros(size)
     free: Values = np.eye(size)
     for M, c in levels:
-        if not free.shape[1]:
-            break
+        if not len(M) or not free.shape[1]:
+            continue
         U, values, V = np.linalg.svd(M @ free)
-        largest = values.max(initial=0.0)
-        rank = int((values > _RANK * largest).sum())
+        # The size of M decides which values are zero, because M @ free may be rounding errors.
+        rank = int((values > _RANK * np.linalg.norm(M, 2)).sum())
         step = (U[:, :rank].conj().T @ (c - M @ y)) / values[:rank]
         y = y + free @ (V[:rank].conj().T @ step)
         free = free @ V[rank:].conj().T

@@ -428,6 +428,31 @@ def test_a_disturbance_that_no_input_can_reject_is_named(tmp_path):
         fflin.lqg(gain, estimator, zero_error=["q_m"])
 
 
+@pytest.mark.parametrize("dt", [0.0, SAMPLE])
+def test_a_force_on_a_spring_displaces_the_spring_and_no_motor(dt):
+    robot = satellite("inspector.toml")
+    lin = fflin.linearize(robot.replace(outputs=[*SENSORS, fflin.JointPositions()]))
+    model = lin.discretize(dt) if dt else lin
+    estimator = estimator_of(
+        model, disturbance_noise={"hinge_left_1": 1e-9}, bias_noise=None
+    )
+    gain = fflin.lqr(model)
+    compensator = fflin.lqg(gain, estimator)
+    assert compensator.disturbances == ("disturbance.tau_m.hinge_left_1",)
+    # The spring of 60 N m/rad carries the torque, so no input acts in the steady state.
+    at = rows_of(gain.state_names, gain.regulated)
+    Pi = np.zeros(len(at))
+    Pi[gain.regulated.index("q_m.hinge_left_1")] = 1.0 / 60.0
+    expected = gain.K[:, at] @ Pi
+    assert compensator.C[:, -1] == pytest.approx(
+        expected, abs=1e-7 * np.abs(expected).max()
+    )
+    words = r"tau_m\.hinge_left_1: it displaces q_m\.hinge_left_1 in"
+    for names in ("q_m", ["q_m.hinge_left_1"]):
+        with pytest.raises(fflin.InputError, match=words):
+            fflin.lqg(gain, estimator, zero_error=names)
+
+
 def test_integral_action_and_an_estimated_disturbance_are_refused():
     words = r"integral\.q_b\.x.*disturbance\.tau_b\.x.*two integrators for one channel"
     with pytest.raises(fflin.InputError, match=words):
