@@ -55,7 +55,11 @@ _PUBLIC = {
         "control.plan": "plan",
         "control.mpc": "mpc",
         "control.tvlqr": "tvlqr GainSchedule FilterSchedule",
-        "control.kalman": "tvkalman kalman Estimator lqg Compensator",
+        "control.tvkalman": "tvkalman",
+        "control.kalman": "kalman",
+        "control.estimator": "Estimator",
+        "control.lqg": "lqg",
+        "control.compensator": "Compensator",
     },
     "Uncertainty": {
         "uncertainty.sensitivity": "sensitivity Sensitivity",

@@ -94,12 +94,12 @@ from fflin.control.plan import plan as plan
 from fflin.control.mpc import mpc as mpc
 from fflin.control.tvlqr import tvlqr as tvlqr
 from fflin.control.tvlqr import GainSchedule as GainSchedule
-from fflin.control.kalman import tvkalman as tvkalman
+from fflin.control.tvkalman import tvkalman as tvkalman
 from fflin.control.tvlqr import FilterSchedule as FilterSchedule
 from fflin.control.kalman import kalman as kalman
-from fflin.control.kalman import Estimator as Estimator
-from fflin.control.kalman import lqg as lqg
-from fflin.control.kalman import Compensator as Compensator
+from fflin.control.estimator import Estimator as Estimator
+from fflin.control.lqg import lqg as lqg
+from fflin.control.compensator import Compensator as Compensator
 
 # Uncertainty
 from fflin.uncertainty.sensitivity import sensitivity as sensitivity

@@ -1,21 +1,18 @@
 """Controllability of a linear model, and checks before the design of regulators and filters."""
 
 import re
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from fflin.analysis import along_motion, mechanics, moving_points, ranks
 from fflin.analysis.hautus import split_by_poles, unobservable
+from fflin.analysis.lasting_modes import conclude, reached, root_of
 from fflin.analysis.mechanics import ConservedMomenta, combination
 from fflin.analysis.observability import lasting_motions, observability
 from fflin.base.errors import (
     DetectabilityError,
-    FflinError,
-    FflinWarning,
     InputError,
     StabilizabilityError,
     listed,
@@ -28,11 +25,6 @@ _LOOPS = (
     "a periodic joint motion can still rotate the base of the nonlinear robot, by O(e^2) for a "
     "joint amplitude e, although the linear model does not show it"
 )
-
-# A singular value of the scaled Popov-Belevitch-Hautus matrix [A - p I, B] counts as zero if it is
-# below this fraction of the largest singular value. The fraction is this large because a repeated
-# eigenvalue p has a relative rounding error of about this size.
-_RANK = 1e-7
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -476,10 +468,16 @@ def require_stabilizable(lin: LinearModel) -> None:
         robot = lin._robot
         if robot and any(robot.damping.get(name) for name in lin.wheels):
             missed += ", or remove the damping of the wheels"
-        report = _reached(
-            lin, lin.A, lin.B, "stabilised by the inputs", missed, unstable=True
+        report = reached(
+            lin.state_names,
+            lin.dt,
+            lin.A,
+            lin.B,
+            "stabilised by the inputs",
+            missed,
+            unstable=True,
         )
-        return _conclude(StabilizabilityError, *report)
+        return conclude(StabilizabilityError, *report)
     analysis = controllability(lin)
     words = ""
     if not analysis.stabilizable:
@@ -492,7 +490,7 @@ def require_stabilizable(lin: LinearModel) -> None:
         words = missed.format(listed(mechanics.grouped(lost))) + _remedies(
             lin, conserved
         )
-    return _conclude(StabilizabilityError, words, analysis.notes, analysis.margin)
+    return conclude(StabilizabilityError, words, analysis.notes, analysis.margin)
 
 
 def _lasting(
@@ -572,151 +570,37 @@ def require_detectable(lin: LinearModel) -> None:
     lin = lin.undelayed
     missed = "the outputs do not observe {}, whose motion does not decay by itself; add outputs"
     if len(lin.A) < 2 * len(lin.M):
-        report = _reached(
-            lin, lin.A.T, lin.C.T, "observed by the outputs", missed, unstable=True
+        report = reached(
+            lin.state_names,
+            lin.dt,
+            lin.A.T,
+            lin.C.T,
+            "observed by the outputs",
+            missed,
+            unstable=True,
         )
-        return _conclude(DetectabilityError, *report)
+        return conclude(DetectabilityError, *report)
     analysis = observability(lin)
     words = ""
     if not analysis.detectable:
         words = missed.format(listed(lasting_motions(lin, analysis)))
-    return _conclude(DetectabilityError, words, analysis.notes, analysis.margin)
+    return conclude(DetectabilityError, words, analysis.notes, analysis.margin)
 
 
 def require_weighed(lin: LinearModel, A: Array, Q: Array) -> None:
     """Raise `InputError` if a marginally stable mode has no weight in Q."""
     missed = "Q has no weight on {}, whose motion does not decay by itself; add a weight there"
-    _conclude(InputError, *_reached(lin, A.T, _root(Q), "weighted by Q", missed))
+    conclude(
+        InputError,
+        *reached(lin.state_names, lin.dt, A.T, root_of(Q), "weighted by Q", missed),
+    )
 
 
-def require_disturbed(lin: LinearModel, W: Array) -> None:
-    """Raise `InputError` if noise of intensity W leaves a marginally stable mode unexcited."""
+def require_disturbed(names: Sequence[str], dt: float, A: Array, W: Array) -> None:
+    """Raise `InputError` if noise of intensity W leaves a marginally stable mode of A unexcited."""
     missed = (
         "W does not excite {}, whose motion does not decay by itself, so a steady-state filter "
         "would not correct its estimate; give the noise there a positive intensity"
     )
-    _conclude(
-        InputError, *_reached(lin, lin.A, _root(W), "excited by W", missed, spans=True)
-    )
-
-
-def _conclude(
-    kind: type[FflinError], words: str, notes: Sequence[str], margin: ranks.Margin
-) -> None:
-    """Raise an error with the message `words` and the undecided ranks in `notes`.
-
-    If `words` is empty, warn about each undecided rank instead.
-    """
-    doubts = [note for note in notes if note.startswith("undecided")]
-    if words:
-        error: Any = kind("; ".join((words, *doubts)))
-        error.margin = margin
-        raise error
-    for note in doubts:
-        warnings.warn(note, FflinWarning, stacklevel=4)
-
-
-def _root(W: Array) -> Array:
-    """Return L with W = L L^T, for a positive semidefinite W (m, m) with entries of any units."""
-    # The condition number of L is the square root of the condition number of W, so the rank of L is
-    # easier to decide than the rank of W.
-    size = ranks.divisors(np.sqrt(W.diagonal()))
-    values, vectors = np.linalg.eigh(W / np.outer(size, size))
-    rounding = len(W) * np.finfo(float).eps * values[-1:].max(initial=0.0)
-    root: Array = (
-        size[:, None] * vectors * np.sqrt(np.where(values > rounding, values, 0.0))
-    )
-    return root
-
-
-def _reached(
-    lin: LinearModel,
-    A: Array,
-    B: Array,
-    what: str,
-    complaint: str,
-    *,
-    unstable: bool = False,
-    spans: bool = False,
-) -> tuple[str, list[str], ranks.Margin]:
-    """Test whether the columns of B excite every mode of A on the stability boundary.
-
-    If `unstable`, test the unstable modes as well. If `spans`, the message names one state for each
-    mode, and not the largest states of all modes. Return three results: an error message, or "" if
-    B excites all tested modes; notes on undecided ranks; and the margin of the rank decisions.
-    """
-    discrete = bool(lin.dt)
-    poles = np.linalg.eigvals(A)
-    size = max(float(np.abs(poles - discrete).max()), 1e-300)
-    beyond = np.abs(poles) - 1.0 if discrete else poles.real
-    # Rounding moves the eigenvalues of a Jordan block of size four by the fourth root of the
-    # rounding error. Poles closer than 1e-3 `size` therefore count as equal, and poles closer than
-    # this to the stability boundary count as marginally stable. `size` is the largest modulus of a
-    # pole, or of z - 1 for discrete-time poles z.
-    candidates = [complex(discrete)]
-    growing = (beyond > 0.0) & unstable
-    for pole in poles[
-        ((np.abs(beyond) <= 1e-3 * size) | growing) & (poles.imag >= 0.0)
-    ]:
-        if all(abs(pole - other) > 1e-3 * size for other in candidates):
-            candidates.append(complex(pole))
-    missed, margin = list[Values](), ranks.Margin()
-    for pole in candidates:
-        shift = pole if pole.imag else pole.real
-        shifted = A - shift * np.eye(len(A))
-        matrix = np.column_stack((shifted, B))
-        # Rows and columns have different units, so they are scaled to comparable sizes.
-        rows = np.ones(len(matrix))
-        columns = np.ones(matrix.shape[1])
-        scaled = matrix
-        for _ in range(4):
-            rows /= ranks.divisors(np.sqrt(np.abs(scaled).max(axis=1)))
-            columns /= ranks.divisors(np.sqrt(np.abs(scaled).max(axis=0)))
-            scaled = rows[:, None] * matrix * columns
-        left, values, _ = np.linalg.svd(scaled)
-        vectors: Values = left.conj().T * rows
-        vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
-        ratios = values / (_RANK * values[0])
-        rank = int((ratios > 1.0).sum())
-        missed += list(vectors[rank:])
-        margin &= ranks.judged(ratios, vectors.T, rank)
-    doubts = list[str]()
-    for ratio, at, change in margin.doubts:
-        decision = what if change < 0 else f"not {what}"
-        doubts.append(
-            f"undecided: {_dominant(at[None], lin.state_names)} counts as {decision}, but the test "
-            f"value is only {ratio:.2g} times its rounding error, so another machine may decide "
-            "otherwise"
-        )
-    words = ""
-    if missed:
-        name = _spanning if spans and len(missed) > 1 else _dominant
-        words = complaint.format(name(np.array(missed), lin.state_names))
-    return words, doubts, margin
-
-
-def _dominant(vectors: Values, names: Sequence[str]) -> str:
-    """Name the states with the largest entries in vectors (k, nx), for a message."""
-    # The vectors may be any basis of their space. The lengths of the projections of the coordinate
-    # axes onto this space do not depend on the basis.
-    basis, _ = np.linalg.qr(vectors.T)
-    sizes = np.linalg.norm(basis, axis=1)
-    large = sizes >= 0.3 * sizes.max()
-    words = listed(name for name, chosen in zip(names, large, strict=True) if chosen)
-    count = len(vectors)
-    if large.sum() <= count:
-        return words
-    if count == 1:
-        return f"a combination of {words}"
-    return f"{count} combinations of {words}"
-
-
-def _spanning(vectors: Values, names: Sequence[str]) -> str:
-    """Name states that determine a vector of the space of vectors (k, nx), for a message.
-
-    They are states of the base if possible, as for the momenta of the robot.
-    """
-    space, _ = ranks.image(np.vstack((vectors.real, vectors.imag)).T, 1e-6)
-    of_base = [not name.partition(".")[0].endswith("_m") for name in names]
-    _, pivots = ranks.echelon(space, np.ones(len(names)), np.array(of_base))
-    return listed(names[i] for i in pivots)
+    report = reached(names, dt, A, root_of(W), "excited by W", missed, spans=True)
+    conclude(InputError, *report)

@@ -24,7 +24,7 @@ from fflin.base.validation import (
     shaped,
 )
 from fflin.base.writing import RECORDS, as_path, check_ending, reason
-from fflin.control.kalman import Compensator
+from fflin.control.compensator import Compensator
 from fflin.control.loops import NOT_CORRECTED
 from fflin.control.policies import LinearLaw, OutputSensing
 from fflin.control.policy import (

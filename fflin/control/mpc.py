@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import compress
 from typing import NamedTuple, TypeAlias
 
@@ -24,17 +25,21 @@ from fflin.base.validation import (
     vector,
     whole,
 )
+from fflin.control.estimator import Estimator
 from fflin.control.gain import Gain
-from fflin.control.loops import next_sample
+from fflin.control.loops import Loop, Measure, next_sample
+from fflin.control.lqg import require_estimated, steady_rejection
 from fflin.control.lqr import at_fixed_point, regulator
 from fflin.control.optimal.differential_riccati import bounded_by, samples_back
-from fflin.control.policies import Deviation, Feedback, StateFeedback
-from fflin.control.policy import BoundLaw, Command
+from fflin.control.policies import Deviation, Feedback, OutputSensing, StateFeedback
+from fflin.control.policy import BoundLaw, Command, Noise
 from fflin.control.tracking import TrajectoryFeedback
 from fflin.control.trajectory_end import rest_or_fall, steady_regulator
 from fflin.control.tvlqr import asks_steady, held_stages, tvlqr
 from fflin.control.weights import Rule, Weight, sampled_cost, weight
+from fflin.dynamics.outputs import Measuring
 from fflin.dynamics.state import StateMap
+from fflin.linear.fit import require_fit
 from fflin.linear.linear_trajectory import LinearTrajectory, along
 from fflin.linear.model import LinearModel
 from fflin.robot.fields import chosen_limits, input_limits, range_of
@@ -79,6 +84,7 @@ def mpc(
     limits: float | str | Mapping[str, object] | Sequence[object] | None = "urdf",
     Qf: Weight | str = "steady",
     weights: Rule | None = None,
+    disturbance: Estimator | None = None,
 ) -> Mpc | TrajectoryMpc:
     r"""Return the model predictive controller about a fixed point or along a trajectory.
 
@@ -124,10 +130,15 @@ def mpc(
         to go of the regulator from the end of the horizon on.
     weights : {"urdf", "identity"} or mapping, optional
         Rule for the weights if Q and R are omitted, as in `lqr`.
+    disturbance : Estimator, optional
+        Filter of `kalman` for the sampled model, about a point. The controller then feeds back the
+        estimate of the filter instead of the state. The regulator equations of `lqg` give the
+        steady state and inputs under the estimated disturbances, from which the errors are counted,
+        so that constant disturbances leave no error.
 
     Returns
     -------
-    Mpc or TrajectoryMpc
+    Mpc, OutputMpc or TrajectoryMpc
         Policy for `simulate` and `monte_carlo`. The method ``matrices(e)`` of the policy
         (``matrices(e, t)`` along a trajectory) returns the quadratic program at a state error e,
         for use with other solvers.
@@ -188,8 +199,18 @@ def mpc(
     cost = (Q, R, Qf, weights)
     stageless = _stageless_horizon(source, limits, samples, dt)
     if isinstance(source, LinearTrajectory):
+        if disturbance is not None:
+            raise InputError(
+                "disturbance is given along a trajectory, expected a model about a point"
+            )
         return _along(source, stageless, cost)
-    return _about(source, stageless, cost)
+    about = _about(source, stageless, cost)
+    if disturbance is None:
+        return about
+    expected = "an Estimator, as fflin.kalman returns it"
+    estimator = instance("disturbance", disturbance, Estimator, expected)
+    require_estimated(about.gain, estimator)
+    return OutputMpc(about.lin, about.gain, about.horizon, estimator)
 
 
 # Largest number of rows of the table on the card of a notebook.
@@ -263,6 +284,96 @@ class Mpc(_Predictive):
     lin: LinearModel
     gain: Gain
     horizon: Horizon
+
+
+class Target(NamedTuple):
+    """Steady state and inputs under a disturbance, as deviations from the operating point."""
+
+    x: Array  # (nx,)
+    u: Array  # (nu,)
+    limited: Array  # limited signals of all stages
+
+
+@dataclass(eq=False, repr=False)
+class OutputMpc(OutputSensing, Mpc):
+    """Model predictive controller that feeds back an estimate of the state and disturbances.
+
+    Attributes
+    ----------
+    estimator : Estimator
+        The filter that estimates the state, the disturbances and the biases.
+    Pi, Gamma : ndarray (nx, nw), (nu, nw)
+        Steady state ``Pi w`` and inputs ``Gamma w`` under disturbances w.
+    """
+
+    estimator: Estimator
+    noise: Noise | None = None
+
+    def __post_init__(self) -> None:
+        self.Pi, self.Gamma = steady_rejection(self.gain, self.estimator)
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """Names of the outputs of the model."""
+        return self.lin.output_names
+
+    @property
+    def sample_time(self) -> float:
+        """Sampling time [s]."""
+        return self.lin.dt
+
+    def bind(self, robot: Robot) -> Command:
+        """Return policy(t, q, v) -> u for a robot with the same states, inputs and outputs."""
+        lin = self.lin
+        state = self.state_map(robot)
+        require_fit(lin, robot, state, sensed=True)
+        return _Estimating(self, state)
+
+    def target(self, stages: Sequence[Stage], w: Array) -> Target:
+        """Return the steady state and inputs under the disturbance w (nw,) during the stages."""
+        nx = len(self.lin.A)
+        at = slice(nx, nx + len(w))
+        step = self.estimator.A[at, at]
+        limited, now = list[Array](), w
+        for stage in stages:
+            after = step @ now
+            limited.append(stage.E @ (self.Pi @ after) + stage.D @ (self.Gamma @ now))
+            now = after
+        return Target(self.Pi @ w, self.Gamma @ w, np.concatenate(limited))
+
+
+class _Estimating(Loop):
+    """Policy that advances the estimate and plans from it."""
+
+    def __init__(self, policy: OutputMpc, state: StateMap) -> None:
+        lin = policy.lin
+        sizes = len(policy.estimator.A), len(lin.C)
+        measuring = Measuring(state, lin.q), state.read(lin.q, lin.v)
+        super().__init__(
+            state,
+            lin.dt,
+            sizes,
+            lambda t: (partial(self._step, t), *measuring),
+            policy.noise,
+        )
+        self.policy = policy
+        self.receding = Receding(policy.horizon, policy.deviation(state.robot))
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Notes of the plans."""
+        return self.receding.notes
+
+    def _step(self, t: float, z: Array, measure: Measure) -> tuple[Array, Array]:
+        """Return the command and the next estimate."""
+        policy, e = self.policy, self.policy.estimator
+        nx = len(policy.lin.A)
+        w = z[nx : nx + policy.Pi.shape[1]]
+        target = policy.target(policy.horizon.window(t), w)
+        du = target.u + self.receding.step(t, z[:nx] - target.x, target)
+        u = policy.lin.u0 + du
+        innovation = measure(u) - policy.lin.y0 - e.C @ z - e.D @ du
+        return u, e.A @ z + e.B @ du + e.L @ innovation
 
 
 @dataclass(eq=False, repr=False)
@@ -573,8 +684,11 @@ class Receding(BoundLaw):
         command: Array = u + self.step(t, e)
         return command
 
-    def step(self, t: float, e: Array) -> Array:
-        """Return the command (nu,) minus the reference inputs, at a sample with error e (nx,)."""
+    def step(self, t: float, e: Array, target: Target | None = None) -> Array:
+        """Return the command (nu,) minus the reference inputs, at a sample with error e (nx,).
+
+        With a target, the error and the result are relative to its state and inputs.
+        """
         stages = self.of.window(t)
         now = stages[0]
         d = -stages[0].K @ e
@@ -584,12 +698,17 @@ class Receding(BoundLaw):
             self._change(stages)
             self._model.update(A=self._rows)
         free = self._free @ e
+        steady_x: Array = np.zeros(len(e))
+        steady_u: Array = np.zeros(len(d))
+        if target is not None:
+            steady_x, steady_u = target.x, target.u
+            free = free + target.limited
         self.solves += 1
         if self._due:
             # Check the soft limits at the end of the last sample. The robot may exceed a limit even
             # if the plan does not, because the robot differs from the model.
             previous, last = self._due
-            reached = previous.E @ e + previous.D @ last
+            reached = previous.E @ (e + steady_x) + previous.D @ last
             width = previous.high - previous.low
             excess = np.maximum(previous.low - reached, reached - previous.high)
             width = np.where(np.isfinite(width) & (width > 0.0), width, 1.0)
@@ -617,8 +736,11 @@ class Receding(BoundLaw):
                 )
         # indices of limited inputs, whose limits come first
         hard = self.of.at[self.of.at < len(d)]
-        d[hard] = np.clip(d[hard], now.low[: len(hard)], now.high[: len(hard)])
-        self._due = now, d
+        low, high = (
+            limit[: len(hard)] - steady_u[hard] for limit in (now.low, now.high)
+        )
+        d[hard] = np.clip(d[hard], low, high)
+        self._due = now, d + steady_u
         return d
 
     def _record(

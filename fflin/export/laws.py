@@ -12,8 +12,8 @@ from numpy.linalg import norm
 from fflin.base.errors import FflinError, InputError
 from fflin.base.rotation import conjugate, quaternion_product
 from fflin.base.validation import Array, Indices, instance
+from fflin.control.compensator import Compensator
 from fflin.control.gain import Gain, model_of
-from fflin.control.kalman import Compensator
 from fflin.control.loops import NOT_CORRECTED, Sample
 from fflin.control.policies import StateFeedback
 from fflin.control.policy import Command, OutputForm, PathForm, Policy, StateForm, bound

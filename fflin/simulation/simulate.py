@@ -292,6 +292,7 @@ _CONTROLLERS = {
     "TrajectoryFeedback": "trajectory tracking",
     "TrajectoryOutputFeedback": "trajectory tracking, output feedback",
     "Mpc": "MPC",
+    "OutputMpc": "output feedback, MPC",
     "TrajectoryMpc": "trajectory tracking, MPC",
 }
 

@@ -150,7 +150,15 @@ def light(folder):
         "JointPositions": {"joints": (joint,)},
         "JointTorque": {"joint": joint, "max": 1.0, "min": -0.5},
         "JointVelocities": {"joints": (joint,)},
-        "kalman": {"lin": lin, "W": 1.0, "V": 1.0, "G": lin.B},
+        "kalman": {
+            "lin": lin,
+            "W": 1.0,
+            "V": 1.0,
+            "G": lin.B,
+            "disturbance_noise": {"tau_b": 1e-6},
+            "bias_noise": None,
+            "disturbance_frequency": {"tau_b.x": [0.01]},
+        },
         "linearize": result | place,
         "linearize_trajectory": knots
         | {"robot": robot, "strict": False, "hold": "previous", "frame": "world"},
@@ -176,7 +184,7 @@ def light(folder):
         "load_dispersions": {"path": "nosuch.toml"},
         "load_inputs": {"path": "nosuch.toml"},
         "line_up": {"gain": gain, "lin": lin},
-        "lqg": {"gain": gain, "estimator": filtered},
+        "lqg": {"gain": gain, "estimator": filtered, "zero_error": ["q_b"]},
         "lqr": {"lin": lin} | weights | {"N": None},
         "Momentum": {},
         "from_tool": {
@@ -414,7 +422,7 @@ def sound(folder):
                 "dt": 0.1,
                 "limits": {"tau_b": 1.0},
             },
-            **{"Qf": "steady", "weights": None},
+            **{"Qf": "steady", "weights": None, "disturbance": None},
         },
         "funnel": {
             **{

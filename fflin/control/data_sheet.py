@@ -1,0 +1,149 @@
+"""Noise of sensors in the units of their data sheets, converted to the units of a model."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple, TypeAlias
+
+from fflin.base.errors import InputError, require_known
+from fflin.base.names import by_name, stands_for_any
+from fflin.base.validation import instance, quantity
+from fflin.control.weights import Weight
+from fflin.linear.model import LinearModel
+
+# An intensity or a covariance, or one figure of a data sheet such as {"angle_random_walk": 0.1}.
+Sheet: TypeAlias = "float | Mapping[str, float]"
+Noises: TypeAlias = "Weight | Mapping[str, Sheet]"
+
+_DEGREE = math.pi / 180.0
+_HOUR = 3600.0
+_ARC_SECOND = _DEGREE / _HOUR
+
+
+class Figure(NamedTuple):
+    """One figure of a data sheet.
+
+    Attributes
+    ----------
+    unit : str
+        Unit of the figure.
+    factors : mapping
+        Factor from the figure to the standard deviation in SI units, by the unit of the output. An
+        output with another unit cannot have this figure.
+    sampled : bool
+        Whether the figure is the standard deviation of a sample. If False, it is a density, whose
+        square is divided by the sampling time.
+    """
+
+    unit: str
+    factors: Mapping[str, float]
+    sampled: bool = False
+
+
+# The unit "1" is the unit of the vector part of a quaternion, which is half of a small rotation.
+_OF_NOISE = {
+    "angle_random_walk": Figure("deg/sqrt(h)", {"rad/s": _DEGREE / _HOUR**0.5}),
+    "velocity_random_walk": Figure("m/s/sqrt(h)", {"m/s^2": 1.0 / _HOUR**0.5}),
+    "noise_equivalent_angle": Figure(
+        "arc seconds", {"1": 0.5 * _ARC_SECOND, "rad": _ARC_SECOND}, sampled=True
+    ),
+}
+
+# Bias instability counts as the standard deviation of the change of the bias within one hour.
+_OF_BIAS = {
+    "bias_instability": Figure("deg/h", {"rad/s": _DEGREE / _HOUR**1.5}),
+    "rate_random_walk": Figure("deg/h/sqrt(h)", {"rad/s": _DEGREE / _HOUR**1.5}),
+}
+
+
+def measurement_noise(lin: LinearModel, V: Noises) -> Weight:
+    """Return V of `kalman` with covariances or intensities in place of figures of data sheets."""
+    if not isinstance(V, Mapping):
+        return V
+    keys = _output_keys(V, lin.output_names)
+    figures = any(isinstance(value, Mapping) for value in V.values())
+    if not figures:
+        return {keys[key]: value for key, value in V.items()}  # type: ignore[misc]
+
+    def intensity(key: str, value: Sheet, unit: str) -> float:
+        if not isinstance(value, Mapping):
+            return value
+        figure, square = _squared(f"V of '{key}'", value, unit, _OF_NOISE)
+        if not figure.sampled:
+            return square / (lin.dt or 1.0)
+        if not lin.dt:
+            raise InputError(
+                f"V of '{key}' is the standard deviation of a sample, but the model is continuous; "
+                "use lin.discretize(dt)"
+            )
+        return square
+
+    return _by_output(lin, V, keys, intensity)
+
+
+def bias_intensities(
+    lin: LinearModel, noise: Mapping[str, Sheet] | None
+) -> dict[int, float]:
+    """Return the intensity of the random walk of each bias by the index of its output."""
+    expected = "a mapping {output: intensity}"
+    noise = {} if noise is None else noise
+    noise = instance("bias_noise", noise, Mapping, expected)
+    keys = _output_keys(noise, lin.output_names)
+
+    def intensity(key: str, value: Sheet, unit: str) -> float:
+        what = f"bias_noise of '{key}'"
+        if isinstance(value, Mapping):
+            return _squared(what, value, unit, _OF_BIAS)[1]
+        return quantity(what, value)
+
+    values = _by_output(lin, noise, keys, intensity)
+    at = sorted(lin.output_names.index(name) for name in values)
+    return {i: values[lin.output_names[i]] for i in at}
+
+
+def _output_keys(given: Mapping[str, object], names: Sequence[str]) -> dict[str, str]:
+    """Return the key that `by_name` understands for each key, such as "*.gyroscope.*"."""
+    keys = {}
+    for key in given:
+        pattern = f"*.{key}.*"
+        quantity_alone = not stands_for_any(key, names) and stands_for_any(
+            pattern, names
+        )
+        keys[key] = pattern if quantity_alone else key
+    return keys
+
+
+def _by_output(
+    lin: LinearModel,
+    given: Mapping[str, Sheet],
+    keys: Mapping[str, str],
+    intensity: Callable[[str, Sheet, str], float],
+) -> dict[str, float]:
+    """Return {output: intensity} from values by name, group or pattern."""
+    entries = {keys[key]: (key, value) for key, value in given.items()}
+    values = {}
+    for at, (key, value) in by_name("output", entries, lin.output_names).items():
+        values[lin.output_names[at]] = intensity(key, value, lin.output_units[at])
+    return values
+
+
+def _squared(
+    what: str, given: Mapping[str, float], unit: str, known: Mapping[str, Figure]
+) -> tuple[Figure, float]:
+    """Return the figure of a data sheet, and its square in SI units."""
+    require_known(f"part of {what}", given, tuple(known))
+    if len(given) != 1:
+        raise InputError(
+            f"{what} has {len(given)} figures, expected one, such as {{'{next(iter(known))}': 0.1}}"
+        )
+    ((name, value),) = given.items()
+    figure = known[name]
+    factor = figure.factors.get(unit)
+    if factor is None:
+        units = " or ".join(figure.factors)
+        raise InputError(
+            f"{what} has the figure {name}, which is for outputs in {units}, but the unit of the "
+            f"output is {unit}"
+        )
+    return figure, (factor * quantity(f"{name} in {what}", value, figure.unit)) ** 2

@@ -1,0 +1,235 @@
+"""Compensators that feed back the estimate of a Kalman filter."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import compress
+
+import numpy as np
+
+from fflin.base.errors import InputError, listed
+from fflin.base.names import chosen, group_of
+from fflin.base.validation import Array, instance
+from fflin.control.compensator import Compensator
+from fflin.control.estimator import DISTURBANCE, Estimator
+from fflin.control.gain import Gain
+from fflin.control.rejection import rejection
+from fflin.dynamics.state import selection
+
+
+def lqg(
+    gain: Gain,
+    estimator: Estimator,
+    *,
+    zero_error: Sequence[str] | None = None,
+) -> Compensator:
+    r"""Return the LQG compensator, which feeds back the state estimate: u - u0 = -K xh.
+
+    .. math:: \dot z = (A - B K - L C + L D K) z + L (y - y_0),\qquad u - u_0 = -K z
+
+    For a sampled model, xh is the prediction from earlier samples, so that one sampling time is
+    available for the computation.
+
+    If the estimator estimates disturbances w, the compensator cancels their steady effect:
+
+    .. math:: u - u_0 = -K (\hat x - \Pi \hat w) + \Gamma \hat w,\qquad
+              A \Pi - \Pi A_w + B \Gamma + B_d = 0,\qquad H \Pi = 0
+
+    For a sampled model, the regulator equation is ``A Pi + B Gamma + B_d = Pi A_w``. These
+    equations, (10.9) of docs/derivation.md, hold for the states that the gain regulates. H selects
+    the states in `zero_error`. A constant disturbance then leaves no error in these states, and a
+    sinusoid of a known frequency none at the samples. Other states, such as the deflection of a
+    spring, may be displaced. Biases are estimated, but not fed back.
+
+    If the gain has integrals, the compensator integrates the measured outputs, and the integrals
+    are its last states: u - u0 = -K xh - K_i xi. A constant disturbance then leaves no error in
+    these outputs, although it leaves an error in the estimate.
+
+    If limits change the commands of a compensator that integrates or rejects disturbances, the
+    filter uses the limited inputs, and the integrals are corrected as in `StateFeedback`.
+
+    Parameters
+    ----------
+    gain : Gain
+    estimator : Estimator
+        Estimator for the same model.
+    zero_error : sequence of str, optional
+        Names or groups of regulated states that disturbances must not displace in the steady state.
+        The default is the attitude and position of the base, and the positions of the joints with a
+        motor, as far as the gain regulates them.
+
+    Returns
+    -------
+    Compensator
+
+    Raises
+    ------
+    InputError
+        If gain and estimator belong to different models, or the gain feeds back a state that the
+        estimator does not estimate. Also if no input can reject a disturbance, that is, if it
+        displaces states in `zero_error`; the message names the disturbance and these states. Also
+        if the gain has integral action and the estimator estimates disturbances, or an integrated
+        signal is not measured.
+    UnknownNameError
+        If `zero_error` contains an unknown name.
+
+    Examples
+    --------
+    >>> lin = fflin.linearize(fflin.load("planar_detumble"))
+    >>> sampled = lin.discretize(0.1)
+    >>> compensator = fflin.lqg(fflin.lqr(sampled), fflin.kalman(sampled, 1e-3, 1e-4))
+    >>> compensator.dt
+    0.1
+    """
+    instance("gain", gain, Gain, "a Gain, as fflin.lqr returns it")
+    e = instance(
+        "estimator", estimator, Estimator, "an Estimator, as fflin.kalman returns it"
+    )
+    names = require_estimated(gain, e)
+    require_one_integrator(gain.integrals, e.disturbances)
+    nx = len(gain.model_states)
+    S = selection(names, e.state_names)
+    feedback = np.hstack((-gain.K_x, np.zeros((len(gain.K), len(e.A) - nx))))
+    if e.disturbances or zero_error is not None:
+        Pi, Gamma = steady_rejection(gain, e, zero_error)
+        feedback[:, nx : nx + len(e.disturbances)] = gain.K_x @ Pi + Gamma
+    A: Array = S @ (e.A + e.B @ feedback - e.L @ (e.C + e.D @ feedback)) @ S.T
+    B: Array = S @ e.L
+    C: Array = feedback @ S.T
+    # A filter without integrators forgets a limited command, but the estimate of a disturbance
+    # would wind up, so this filter uses the limited inputs.
+    driven = S @ (e.B - e.L @ e.D)
+    E = np.zeros((0, 0))
+    if e.disturbances:
+        E = driven
+    if gain.integrals:
+        A, B, C = _with_integrals(gain, e, A, B, C, driven)
+        E = np.vstack((driven, gain.anti_windup))
+    return Compensator._of(
+        e,
+        A=A,
+        B=B,
+        C=C,
+        E=E,
+        poles=np.concatenate((gain.poles, e.poles)),
+        state_names=(*names, *gain.integrals),
+        input_names=e.output_names,
+        output_names=e.input_names,
+        verified=gain.verified and e.verified,
+    )
+
+
+def _with_integrals(
+    gain: Gain, e: Estimator, A: Array, B: Array, C: Array, driven: Array
+) -> tuple[Array, Array, Array]:
+    """Return A, B and C of a compensator with the integrals of measured outputs as last states.
+
+    A, B and C are without integrals, and `driven` is the effect of the inputs on the estimate.
+    """
+    k = len(gain.integrals)
+    nx = len(gain.model_states)
+    H = np.hstack((gain.H, np.zeros((k, len(e.A) - nx))))
+    undelayed = ~e.D.any(axis=1)
+    measured = e.C[undelayed]
+    # combination of outputs whose value is H (x - x0)
+    rows = np.linalg.lstsq(measured[:, :nx].T, gain.H.T, rcond=None)[0].T
+    lack = np.abs(rows @ measured - H).max(axis=1) > 1e-9 * np.abs(H).max()
+    if lack.any():
+        name = gain.integrals[int(lack.argmax())].removeprefix("integral.")
+        raise InputError(
+            f"the gain integrates {name}, which the outputs do not measure; add an output that "
+            "measures it, or leave it out of integral_action"
+        )
+    combined = np.zeros((k, len(e.C)))
+    combined[:, undelayed] = rows
+    corner = np.eye(k) if gain.dt else np.zeros((k, k))
+    A = np.block([[A, -driven @ gain.K_i], [np.zeros((k, len(A))), corner]])
+    B = np.vstack((B, (gain.dt or 1.0) * combined))
+    return A, B, np.hstack((C, -gain.K_i))
+
+
+def require_one_integrator(
+    integrals: Sequence[str], disturbances: Sequence[str]
+) -> None:
+    """Raise `InputError` if a gain with integral action meets estimated disturbances.
+
+    Both would integrate the error of the same channels, and only their sum would be determined.
+    """
+    if integrals and disturbances:
+        both = listed(integrals), listed(disturbances)
+        raise InputError(
+            f"the gain has integral action ({both[0]}) and the estimator estimates disturbances "
+            f"({both[1]}), which makes two integrators for one channel; omit integral_action or "
+            "disturbance_noise"
+        )
+
+
+def require_estimated(gain: Gain, e: Estimator) -> tuple[str, ...]:
+    """Return the names of the estimated states, or raise `InputError` if they do not fit a gain."""
+    nx = len(gain.model_states)
+    if gain.dt != e.dt or not (
+        np.array_equal(gain.A[:nx, :nx], e.A[:nx, :nx])
+        and np.array_equal(gain.B[:nx], e.B[:nx])
+    ):
+        raise InputError(
+            "the gain and the estimator belong to different models; use one model for both"
+        )
+    names = e.estimated or e.state_names
+    regulated = [name for name in gain.regulated if name not in gain.integrals]
+    if missing := [name for name in regulated if name not in names]:
+        raise InputError(
+            f"the gain feeds back {listed(missing)}, which the estimator does not estimate; use "
+            "the same wheel_speeds= for both designs"
+        )
+    return names
+
+
+def steady_rejection(
+    gain: Gain, e: Estimator, zero_error: Sequence[str] | None = None
+) -> tuple[Array, Array]:
+    """Return Pi (nx, nw) and Gamma (nu, nw), the steady state and inputs under disturbances."""
+    names = gain.model_states
+    nx = len(names)
+    regulated = [name for name in gain.regulated or names if name in names]
+    R = selection(regulated, names)
+    states = slice(nx, nx + len(e.disturbances))
+    held = _held_states(gain, regulated, zero_error)
+    equations = rejection(
+        R @ gain.A[:nx, :nx] @ R.T,
+        R @ gain.B[:nx],
+        (R @ e.A[:nx, states], e.A[states, states]),
+        selection(held, regulated),
+        (R @ gain.Q[:nx, :nx] @ R.T, gain.R),
+        gain.dt,
+    )
+    displaced = equations.displaced
+    if displaced.any():
+        moved = compress(held, np.any(displaced, axis=1).tolist())
+        disturbed = compress(e.disturbances, np.any(displaced, axis=0).tolist())
+        labels = [name.removeprefix(DISTURBANCE) for name in disturbed]
+        raise InputError(
+            f"no input can reject the disturbance {listed(labels)}: it displaces "
+            f"{listed(moved)} in the steady state; add inputs, or name the states "
+            "without an error in zero_error"
+        )
+    return R.T @ equations.Pi, equations.Gamma
+
+
+def _held_states(
+    gain: Gain, regulated: Sequence[str], zero_error: Sequence[str] | None
+) -> list[str]:
+    """Return the names of the regulated states that disturbances must not displace."""
+    if zero_error is not None:
+        if isinstance(zero_error, str):
+            zero_error = [zero_error]
+        instance("zero_error", zero_error, Sequence, "a list of names of states")
+        return [regulated[i] for i in chosen("regulated state", zero_error, regulated)]
+    motors = {
+        name.partition(".")[2] for name in gain.input_names if group_of(name) == "tau_m"
+    }
+    return [
+        name
+        for name in regulated
+        if group_of(name) in ("q_b", "r_b")
+        or (group_of(name) == "q_m" and name.partition(".")[2] in motors)
+    ]
