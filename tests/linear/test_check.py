@@ -10,7 +10,7 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from fflin.linear.aba_route import Route
+from fflin.linear.aba_route import Route, _whole
 from fflin.linear.check import References
 from tests.support.random_robots import random_case
 from tests.support.robots import mostly, random_point, random_pose
@@ -161,6 +161,19 @@ def test_the_rounding_of_an_output_is_divided_by_the_step_of_each_state_it_depen
     depends = np.abs(lin.C) > 1e-9
     assert depends.any() and (np.abs(C - lin.C) <= rounding)[depends].all()
     assert (rounding >= least)[depends].all()
+
+
+def test_all_entries_of_a_base_block_have_the_magnitude_of_its_largest_entry():
+    # The rounding error of a rotation matrix is relative to 1, not to its entry.
+    nv = 8
+    x = np.random.default_rng(3).normal(size=(2 * nv, 2 * nv))
+    sizes = _whole(x, nv)
+    expected = np.abs(x)
+    for rows in np.split(np.r_[:6, nv : nv + 6], 4):
+        for columns in np.split(np.r_[:6, nv : nv + 6], 4):
+            block = np.ix_(rows, columns)
+            expected[block] = expected[block].max()
+    assert (sizes == expected).all()
 
 
 def test_far_joints_are_confirmed_as_far_as_m_is():
