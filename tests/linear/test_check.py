@@ -10,7 +10,8 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from fflin.linear.aba_route import Route
+from fflin.linear import aba_route
+from fflin.linear.aba_route import Route, _whole
 from fflin.linear.check import References
 from tests.support.random_robots import random_case
 from tests.support.robots import mostly, random_point, random_pose
@@ -161,6 +162,31 @@ def test_the_rounding_of_an_output_is_divided_by_the_step_of_each_state_it_depen
     depends = np.abs(lin.C) > 1e-9
     assert depends.any() and (np.abs(C - lin.C) <= rounding)[depends].all()
     assert (rounding >= least)[depends].all()
+
+
+def test_all_entries_of_a_base_block_have_the_magnitude_of_its_largest_entry():
+    # The rounding error of a rotation matrix is relative to 1, not to its entry.
+    nv = 8
+    x = np.random.default_rng(3).normal(size=(2 * nv, 2 * nv))
+    sizes = _whole(x, nv)
+    expected = np.abs(x)
+    for rows in np.split(np.r_[:6, nv : nv + 6], 4):
+        for columns in np.split(np.r_[:6, nv : nv + 6], 4):
+            block = np.ix_(rows, columns)
+            expected[block] = expected[block].max()
+    assert (sizes == expected).all()
+
+
+def test_rounding_is_sampled_at_points_that_differ_in_every_coordinate(monkeypatch):
+    monkeypatch.setattr(aba_route, "_NUDGE", 1e-3)
+    robot = fflin.load("servicer_7dof")
+    q, v, u = random_point(robot, np.random.default_rng(1), degrees=50.0)
+    route = Route(robot, fflin.linearize(robot, q, v, u))
+    other_q, other_v, other_u = route._nudged(np.random.default_rng(2))
+    apart = pin.difference(robot.model, q, other_q)
+    assert np.abs(apart) == pytest.approx(1e-3, rel=1e-6)
+    assert np.abs(other_v / v - 1.0) == pytest.approx(1e-3, rel=1e-6)
+    assert np.abs(other_u / route._u - 1.0) == pytest.approx(1e-3, rel=1e-6)
 
 
 def test_far_joints_are_confirmed_as_far_as_m_is():
