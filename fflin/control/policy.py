@@ -151,10 +151,16 @@ class Policy(ABC):
     """Base class of control laws for `simulate`, `monte_carlo` and the other functions.
 
     A subclass must define `bind`. All other members have defaults, with which a law works in
-    simulations and campaigns. A law that overrides them gets more: the default step follows from
-    `closed_loop`, reports judge the states in `fed_back`, and the compiled loop flies a law whose
-    `form` returns a `StateForm`. A subclass that redefines `bind` does not inherit the members that
-    describe the law, such as `form` and `feedback_gain`.
+    simulations and campaigns. A law that overrides them gets more:
+
+    - `closed_loop` limits the default step of a continuous law, and `model` together with
+      `loop_around` limits the default step of a sampled law. If `model` and `feedback_gain` are
+      defined, both loops follow from them;
+    - reports judge the states in `fed_back`;
+    - the compiled loop flies a law whose `form` returns a `StateForm`.
+
+    A subclass that redefines `bind` does not inherit the members that describe the law, such as
+    `form` and `feedback_gain`.
 
     A plain function policy(t, q, v) -> u is also accepted wherever a policy is.
 

@@ -53,10 +53,11 @@ _DISPLACEMENTS = (1e-6, 1e-5)
 _SMOOTH = 0.05
 _STEEPEST = 1e100  # largest derivative of a policy [SI units] that counts as finite
 
-# A step resolves a function of time if a parabola through its values at the three stages of the
-# step is accurate to _PARABOLA times the largest value. This is compared at the fractions _BETWEEN
-# of the step, in _WINDOWS steps of the run. _TRIALS is the largest number of steps that are tried.
-# A function that jumps within a step is never resolved; it may jump at multiples of the step.
+# A step resolves a function of time if a parabola through its values at the start, the middle and
+# the end of the step is accurate to _PARABOLA times the largest value. This is compared at the
+# fractions _BETWEEN of the step, in _WINDOWS steps of the run. _TRIALS is the largest number of
+# steps that are tried. A function that jumps within a step is never resolved; it may jump at
+# multiples of the step.
 _PARABOLA = 0.02
 _BETWEEN = (0.2, 0.35, 0.7, 0.85)
 _WINDOWS = 16
@@ -373,12 +374,12 @@ def limits_of_step(
         limits.append(Poles("loop along the trajectory", poles))
         limits.append(rotation(_largest_rate(plant, trajectory.v)))
         return limits
-    linear = policy.closed_loop()
     if sample:
         loop = _sampled_loop(policy, sample)
         if loop is not None:
             limits.append(loop)
         return limits
+    linear = policy.closed_loop()
     if linear is not None:
         loop_names = _loop_names(policy, len(linear[0]))
         limits.append(Poles.of(CLOSED_LOOP, linear[0], loop_names))
