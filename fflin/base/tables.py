@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import shutil
 import sys
 import textwrap
@@ -10,6 +9,7 @@ from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 from fflin.base.errors import MissingPackageError
+from fflin.base.paragraphs import PARAGRAPH, first_paragraph
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 MOST_ROWS, _SPARE = 20, 2  # rows of a cut table; up to _SPARE more are not cut
 
 _GAP = "  "
-_PARAGRAPH = re.compile(r"\n(?!  \S)")
 _EPS = sys.float_info.epsilon
 
 
@@ -38,23 +37,8 @@ def folded(lines: Iterable[str]) -> str:
 
 def headed(command: str, report: str) -> str:
     """Put the name of a command before its report, and wrap the first paragraph again."""
-    _, *rest = _PARAGRAPH.split(report, maxsplit=1)
+    _, *rest = PARAGRAPH.split(report, maxsplit=1)
     return "\n".join([folded([f"{command}: {first_paragraph(report)}"]), *rest])
-
-
-def first_paragraph(report: str) -> str:
-    """Return the first line of a report, together with the indented lines that continue it."""
-    return " ".join(_PARAGRAPH.split(report, maxsplit=1)[0].split())
-
-
-def without_first_paragraph(report: str, paragraph: str) -> str:
-    """Return a report without its first paragraph, if it is equal to `paragraph` except for breaks.
-
-    The report may have been wrapped after its first paragraph was formatted.
-    """
-    if first_paragraph(report) != " ".join(paragraph.split()):
-        return report
-    return "".join(_PARAGRAPH.split(report, maxsplit=1)[1:])
 
 
 def cut(rows: Sequence[Sequence[str]], rest: str = "see -o") -> list[Sequence[str]]:

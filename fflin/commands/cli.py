@@ -18,7 +18,8 @@ from typing import TYPE_CHECKING
 import fflin
 from fflin.base import __version__
 from fflin.base.errors import FflinError, FflinWarning, FileError
-from fflin.base.tables import first_paragraph, headed
+from fflin.base.paragraphs import first_paragraph
+from fflin.base.tables import headed
 from fflin.base.terminal import color_report
 from fflin.base.writing import (
     check_ending,
