@@ -15,4 +15,4 @@ in_c = fflin.simulate(robot, code, **options)
 in_python = fflin.simulate(robot, fflin.StateFeedback(lin, gain.K), **options)
 assert np.abs(in_c.q - in_python.q).max() < 1e-12
 figure = in_c.plot(show=["omega_b", "q_m", "tau_m"])
-figure.savefig("c_code.png", dpi=75)
+figure.savefig("c_code.png", dpi=62)

@@ -1,4 +1,4 @@
-"""Paragraphs of reports."""
+"""Paragraphs of reports: a line, and the indented lines that continue it."""
 
 import re
 
@@ -11,10 +11,7 @@ def first_paragraph(report: str) -> str:
 
 
 def without_first_paragraph(report: str, paragraph: str) -> str:
-    """Return a report without its first paragraph, if it is equal to `paragraph` except for breaks.
-
-    The report may have been wrapped after its first paragraph was formatted.
-    """
+    """Return a report without its first paragraph, if this is `paragraph` with any line breaks."""
     if first_paragraph(report) != " ".join(paragraph.split()):
         return report
     return "".join(PARAGRAPH.split(report, maxsplit=1)[1:])

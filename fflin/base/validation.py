@@ -11,6 +11,7 @@ import numpy as np
 
 from fflin.base import html
 from fflin.base.errors import InputError
+from fflin.base.paragraphs import without_first_paragraph
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -350,8 +351,6 @@ class Result(FrozenArrays):
 
     def _html_parts(self) -> Sequence[str]:
         """Return the parts of the card in HTML."""
-        from fflin.base.paragraphs import without_first_paragraph  # only cards need it
-
         report = without_first_paragraph(self._report(), repr(self))
         return (html.preformatted(report.lstrip("\n")),)
 

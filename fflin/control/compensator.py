@@ -37,9 +37,9 @@ class Compensator(ModelDesign):
         estimator.
     y0, u0 : ndarray
         Outputs and inputs at the operating point.
-    E : ndarray (nz, nu), or empty
+    E : ndarray (nz, nu)
         Gain of the anti-windup: ``E (u_applied - u)`` is added to dz/dt, or to the next z of a
-        sampled compensator, if limits change the command. Empty without integral action and
+        sampled compensator, if limits change the command. Zero without integral action and
         without estimated disturbances.
     dt : float
         Sampling time [s]; 0 for continuous time.
@@ -63,6 +63,7 @@ class Compensator(ModelDesign):
     y0: Vector
     u0: Vector
     output_names: tuple[str, ...]
+    # Files of earlier versions do not contain E.
     E: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     @property

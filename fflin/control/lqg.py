@@ -99,7 +99,7 @@ def lqg(
     # A filter without integrators forgets a limited command, but the estimate of a disturbance
     # would wind up, so this filter uses the limited inputs.
     driven = S @ (e.B - e.L @ e.D)
-    E = np.zeros((0, 0))
+    E = np.zeros_like(driven)
     if e.disturbances:
         E = driven
     if gain.integrals:

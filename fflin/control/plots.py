@@ -54,7 +54,7 @@ _GRID_TEXT: dict[str, Any] = {
     "bbox": {"facecolor": "white", "edgecolor": "none", "pad": 0.6},
 }
 # Width and height of these labels, as fractions of the axes.
-_LABEL_SIZE = (0.1, 0.07)
+_LABEL_SIZE = (0.075, 0.055)
 
 _POINTS = 400
 
