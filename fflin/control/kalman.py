@@ -194,9 +194,10 @@ class Compensator(ModelDesign):
         estimator.
     y0, u0 : ndarray
         Outputs and inputs at the operating point.
-    E : ndarray (nz, nu), or empty
+    E : ndarray (nz, nu)
         Gain of the anti-windup: ``E (u_applied - u)`` is added to dz/dt, or to the next z of a
-        sampled compensator, if limits change the command. Empty without integral action.
+        sampled compensator, if limits change the command. Zero without integral action, and empty
+        in a compensator from a file of an older version.
     dt : float
         Sampling time [s]; 0 for continuous time.
     state_names, input_names, output_names : tuple of str
@@ -447,7 +448,7 @@ def lqg(gain: Gain, estimator: Estimator) -> Compensator:
     A: Array = S @ (e.A - e.B @ K - e.L @ (e.C - e.D @ K)) @ S.T
     B: Array = S @ e.L
     C: Array = -K @ S.T
-    E = np.zeros((0, 0))
+    E = np.zeros_like(C.T)
     if gain.integrals:
         driven = S @ (e.B - e.L @ e.D)
         A, B, C = _with_integrals(gain, e, A, B, driven)

@@ -255,7 +255,7 @@ class OutputFeedback(LinearController):
             Compensator,
             "a Compensator, as fflin.lqg returns it",
         )
-        windup = compensator.E if compensator.E.size else None
+        windup = compensator.E if compensator.E.any() else None
         super().__init__(compensator, lin, noise=noise, anti_windup=windup)
         self.compensator = compensator
         if not lin.dt:

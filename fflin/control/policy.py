@@ -362,7 +362,7 @@ class Policy(ABC):
         if lin is None or K is None:
             return ()
         loop = lin.A - lin.B @ K
-        unstable = unstable_note("linear loop", loop[_on_feedback(loop, K)], lin.dt, "")
+        unstable = unstable_note("linear loop", loop[on_feedback(loop, K)], lin.dt, "")
         if unstable or lin.dt or not held:
             return unstable
         sampled = lin.discretize(held)
@@ -373,7 +373,7 @@ class Policy(ABC):
         )
         loop = sampled.A - sampled.B @ K
         return unstable_note(
-            "sampled linear loop", loop[_on_feedback(lin.A, K)], held, advice
+            "sampled linear loop", loop[on_feedback(lin.A, K)], held, advice
         )
 
     def form(self, robot: Robot) -> Form | None:
@@ -554,7 +554,7 @@ def unstable_note(what: str, matrix: Array, dt: float, advice: str) -> tuple[str
     return (f"the {what} is unstable, with a pole at {pole:.4g}{unit}{advice}",)
 
 
-def _on_feedback(A: Array, K: Array) -> tuple[Mask, ...]:
+def on_feedback(A: Array, K: Array) -> tuple[Mask, ...]:
     """Return rows and columns of the states that affect the states that the gain K feeds back.
 
     Other states, such as the position of a base that no input pushes, may drift in a stable loop.

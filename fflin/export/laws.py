@@ -392,12 +392,13 @@ def _samples(policy: TrajectoryFeedback, state: StateMap) -> dict[str, Array]:
 def _compensator_law(given: Compensator, robot: Robot) -> Law:
     """Convert a compensator, which contains no model; units are those of the robot's signals."""
     none = np.zeros((len(given.u0), len(given.y0)))
+    corrected = given.E if given.E.any() else NOT_CORRECTED
     state = StateMap(robot)
     sensed, asked = (signals_of(state, kind) for kind in ("output", "input"))
     known = dict(zip(sensed[0] + asked[0], sensed[1] + asked[1], strict=True))
     return _output_law(
         type(given).__name__,
-        Sample(given.A, given.B, given.C, none, given.u0, given.y0, E=given.E),
+        Sample(given.A, given.B, given.C, none, given.u0, given.y0, E=corrected),
         inputs=(
             given.output_names,
             tuple(known.get(x, "unknown") for x in given.output_names),
