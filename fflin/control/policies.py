@@ -33,7 +33,10 @@ from fflin.control.policy import (
     StateForm,
     System,
     as_policy,
+    block_of_feedback,
     bound,
+    states_of_gain,
+    unstable_note,
 )
 from fflin.dynamics.coordinates import Chart, Frame
 from fflin.dynamics.integrators import held_exponential
@@ -375,7 +378,8 @@ class StateFeedback(LinearLaw):
     def __repr__(self) -> str:
         nu, nx = self.K.shape
         time = f"dt={self.lin.dt:g} s" if self.lin.dt else "continuous"
-        return f"StateFeedback('{self.lin.robot}', nx={nx}, nu={nu}, {time})"
+        more = f" integrals={len(self.integrals)}," if self.integrals else ""
+        return f"StateFeedback('{self.lin.robot}', nx={nx}, nu={nu},{more} {time})"
 
     def _repr_html_(self) -> str:
         return html.result_card(self, gain_map(self.K, self.lin))
@@ -408,6 +412,22 @@ class StateFeedback(LinearLaw):
     def sensors(self) -> tuple[str, ...]:
         """Names of the states of the robot in the model."""
         return self.lin.robot_states
+
+    @property
+    def fed_back(self) -> tuple[str, ...]:
+        """Names of the states that the law feeds back or integrates."""
+        used = np.vstack((self.system.D, self.system.B))
+        return states_of_gain(self.lin.state_names, used)
+
+    def loop_notes(self, held: float = 0.0) -> tuple[str, ...]:
+        """Return notes on unstable poles of the linear loop."""
+        if self.is_gain:
+            return super().loop_notes(held)
+        A, B, C, D = self.system[:4]
+        loop = self.loop
+        used = np.block([[D, C], [B, np.eye(len(A))]])
+        part = loop[block_of_feedback(loop, used)]
+        return unstable_note("linear loop", part, self.sample_time, "")
 
     def with_sensor_errors(self, error: Callable[[float], Array]) -> Policy:
         """Return the feedback of states with errors."""

@@ -369,7 +369,7 @@ class Policy(ABC):
             return ()
         loop = lin.A - lin.B @ K
         unstable = unstable_note(
-            "linear loop", loop[_block_of_feedback(loop, K)], lin.dt, ""
+            "linear loop", loop[block_of_feedback(loop, K)], lin.dt, ""
         )
         if unstable or lin.dt or not held:
             return unstable
@@ -381,7 +381,7 @@ class Policy(ABC):
         )
         loop = sampled.A - sampled.B @ K
         return unstable_note(
-            "sampled linear loop", loop[_block_of_feedback(lin.A, K)], held, advice
+            "sampled linear loop", loop[block_of_feedback(lin.A, K)], held, advice
         )
 
     def form(self, robot: Robot) -> Form | None:
@@ -562,7 +562,7 @@ def unstable_note(what: str, matrix: Array, dt: float, advice: str) -> tuple[str
     return (f"the {what} is unstable, with a pole at {pole:.4g}{unit}{advice}",)
 
 
-def _block_of_feedback(A: Array, K: Array) -> tuple[Mask, ...]:
+def block_of_feedback(A: Array, K: Array) -> tuple[Mask, ...]:
     """Return the index of the block of A (nx, nx) whose poles count for stability.
 
     The block contains the states that the gain K (nu, nx) feeds back, and the states that affect

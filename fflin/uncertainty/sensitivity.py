@@ -13,7 +13,7 @@ from fflin.base.record import Record, write_record
 from fflin.base.tables import folded, grid
 from fflin.base.validation import Array, FrozenArrays, instance, numbers, shaped, whole
 from fflin.base.writing import as_path
-from fflin.control.gain import gain_matrix
+from fflin.control.gain import Gain, gain_matrix
 from fflin.linear.files import record_of
 from fflin.linear.model import LinearModel
 from fflin.uncertainty.derivatives import ModelDerivatives
@@ -188,13 +188,25 @@ class Sensitivity:
             NaN, because such poles are not differentiable.
         """
         lin = self.lin
-        K: Array = np.zeros(lin.B.T.shape)
+        A, B, dA, dB = lin.A, lin.B, self.dA, self.dB
+        K: Array = np.zeros(B.T.shape)
+        if isinstance(gain, Gain) and gain.integrals:
+            # The integrals are further states, on which the parameters have no direct effect.
+            if gain.model_states != lin.state_names or gain.dt:
+                raise InputError(
+                    f"the gain was designed for a model of '{gain.robot}' with other states or in "
+                    "discrete time; give a continuous gain of the model of the same robot"
+                )
+            more = len(gain.integrals)
+            A, B = gain.A, gain.B
+            dA = np.pad(dA, ((0, 0), (0, more), (0, more)))
+            dB = np.pad(dB, ((0, 0), (0, more), (0, 0)))
         if gain is not None:
-            K = shaped("gain", gain_matrix(gain), lin.B.T.shape, " (nu, nx)")
+            K = shaped("gain", gain_matrix(gain), B.T.shape, " (nu, nx)")
         from scipy.linalg import eig
 
-        poles, left, right = eig(lin.A - lin.B @ K, left=True)
-        changes = self.dA - self.dB @ K
+        poles, left, right = eig(A - B @ K, left=True)
+        changes = dA - dB @ K
         derivatives = np.einsum(
             "ik,pij,jk->pk", left.conj(), changes, right, optimize=True
         )

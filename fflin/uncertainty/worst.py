@@ -133,6 +133,8 @@ def searched(
             "has no delay; give a gain of the continuous model, or the samples of the set to "
             "fflin.margins one by one"
         )
+    if isinstance(gain, Gain) and gain.integrals:
+        lft = _with_integrals(lft, gain)
     K = shaped("gain", gain_matrix(gain), lft.B2.T.shape, " (nu, nx)")
     kept = judged_states(lft, K, regulated_states(gain))
     lft = part_of(lft, kept)
@@ -204,6 +206,26 @@ def judged_states(lft: LFT, K: Array, regulated: Sequence[str]) -> Mask:
     while (acting := ~kept & (np.abs(lft.A[kept]) > least).any(axis=0)).any():
         kept |= acting
     return kept
+
+
+def _with_integrals(lft: LFT, gain: Gain) -> LFT:
+    """Return the LFT with the integrals of a gain as further states."""
+    if gain.model_states != lft.state_names or gain.dt:
+        raise InputError(
+            f"the gain was designed for a model of '{gain.robot}' with other states or in discrete "
+            "time; give a continuous gain of the model of the same robot"
+        )
+    k = len(gain.integrals)
+    nx = len(lft.A)
+    return replace(
+        lft,
+        A=np.block([[lft.A, np.zeros((nx, k))], [gain.H, np.zeros((k, k))]]),
+        B1=np.vstack((lft.B1, np.zeros((k, lft.B1.shape[1])))),
+        B2=np.vstack((lft.B2, np.zeros((k, lft.B2.shape[1])))),
+        C1=np.hstack((lft.C1, np.zeros((len(lft.C1), k)))),
+        C2=np.hstack((lft.C2, np.zeros((len(lft.C2), k)))),
+        state_names=gain.state_names,
+    )
 
 
 def part_of(lft: LFT, kept: Mask) -> LFT:

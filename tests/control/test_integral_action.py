@@ -390,3 +390,119 @@ def unmeasured(gain, estimator, held):
     shapes = {name: np.zeros((len(held.A), len(held.y0))) for name in ("L", "L_update")}
     V = np.eye(len(held.y0))
     return fflin.lqg(gain, replace(estimator, **rows, **shapes, V=V))
+
+
+def test_validity_flies_the_integrals_and_predicts_them(arm):
+    robot, lin = arm
+    gain = fflin.lqr(lin, integral_action=["q_b"])
+    result = fflin.validity(robot, lin, gain, samples=4, seed=1)
+    # the error of the right prediction is of second order, that of a wrong one of first order
+    power = float(
+        " ".join(str(result).split()).partition("to the power ")[2].split()[0]
+    )
+    assert 1.9 < power < 2.1
+
+
+def test_uncertain_loops_contain_the_integrals(arm):
+    robot, lin = arm
+    gain = fflin.lqr(lin, integral_action=["q_b"])
+    model = fflin.uncertain(robot, {"base.density": 0.2})
+    with_it, without = (model.worst(one, samples=5) for one in (gain, fflin.lqr(lin)))
+    assert with_it.margin.value < without.margin.value
+    density = with_it.margin.parameters["base.density"]
+    lft = model.lft()
+    A, B, _, _ = lft.at({"base.density": density})
+    size = len(A)
+    extended = gain.A.copy(), gain.B.copy()
+    extended[0][:size, :size], extended[1][:size] = A, B
+    worst = replace(gain, A=extended[0], B=extended[1])
+    assert abs(worst.margins.disk - with_it.margin.value) < 1e-6
+
+
+def test_derivatives_of_poles_contain_the_integrals(arm):
+    _, lin = arm
+    gain = fflin.lqr(lin, integral_action=["q_b", "r_b", "q_m"])
+    sensitivity = fflin.sensitivity(lin)
+    poles, derivatives = sensitivity.poles(gain)
+    expected = np.sort_complex(gain.poles)
+    assert np.abs(np.sort_complex(poles) - expected).max() < 1e-6
+    assert derivatives.shape[1] == len(gain.A)
+
+
+def test_a_robot_file_names_the_integrated_signals(tmp_path):
+    file = tmp_path / "arm.toml"
+    for text, expected in (
+        ('integral = ["q_b"]', ["q_b"]),
+        ("integral = {q_b = 1e-3}", {"q_b": 1e-3}),
+    ):
+        file.write_text(f'urdf = "planar_detumble"\n[weights]\n{text}\n')
+        lin = fflin.linearize(fflin.load(file))
+        given = fflin.lqr(
+            fflin.linearize(fflin.load("planar_detumble")), integral_action=expected
+        )
+        assert np.array_equal(fflin.lqr(lin).K, given.K)
+
+
+def test_an_allocated_satellite_returns_from_a_constant_torque():
+    robot = fflin.load("cubesat", inputs=fflin.load_inputs("cubesat"))
+    wheels = [x for x in robot.inputs if isinstance(x, fflin.ReactionWheel)]
+    design = robot.replace(inputs=[fflin.BaseTorque(), fflin.BaseForce(), *wheels])
+    lin = fflin.linearize(design).discretize(0.25)
+    run = {"duration": 200.0, "dt": 0.25, "every": 800, "linear": False}
+    pushed = {"disturbance": {"tau_b": (TORQUE, 0.0, 0.0)}}
+    finals = []
+    for action in (["q_b"], None):
+        law = fflin.StateFeedback(lin, fflin.lqr(lin, integral_action=action))
+        motion = fflin.simulate(robot, fflin.Allocation(law, design), **run, **pushed)
+        finals.append(2.0 * np.degrees(np.abs(motion.x[-1, :3]).max()))
+    assert finals[0] < 1e-2 * finals[1]
+
+
+@pytest.mark.compiled
+@pytest.mark.parametrize("limits", [None, {"tau_b": 0.05}])
+def test_campaigns_of_both_engines_agree(arm, limits):
+    pytest.importorskip("numba")
+    robot, lin = arm
+    lin = lin.discretize(0.1)
+    law = fflin.StateFeedback(lin, fflin.lqr(lin, integral_action=["q_b"]))
+    spread = {
+        "q_b": 0.05,
+        "base.density": 0.1,
+        "q_b.sensor": 1e-3,
+        "omega_b.noise": 1e-4,
+    }
+    one, other = (
+        fflin.monte_carlo(
+            robot,
+            law,
+            spread,
+            runs=9,
+            duration=5.0,
+            dt=0.02,
+            seed=4,
+            limits=limits,
+            engine=engine,
+        )
+        for engine in ("python", "compiled")
+    )
+    for name in ("largest_x", "largest_u"):
+        assert np.abs(getattr(one, name) - getattr(other, name)).max() < 1e-12
+
+
+def test_reports_and_notes_know_the_integrals(arm, satellite):
+    _, lin = arm
+    gain = fflin.lqr(lin, integral_action=["q_b"])
+    law = fflin.StateFeedback(lin, gain)
+    assert "integrals=3" in repr(law)
+    assert "3 integrals xi" in str(gain)
+    assert "integral" in gain._repr_html_()
+    assert not law.loop_notes()
+    wrong = replace(gain, K=np.hstack((gain.K_x, -gain.K_i)))
+    assert "unstable" in fflin.StateFeedback(lin, wrong).loop_notes()[0]
+    _, wheels, _ = satellite
+    gain = fflin.lqr(wheels, integral_action=["q_b"])
+    law = fflin.StateFeedback(wheels, gain)
+    assert set(law.fed_back) == {*gain.regulated} - {*gain.integrals}
+    assert not law.loop_notes()
+    with pytest.raises(fflin.InputError, match="integrals"):
+        gain.to("drake")
