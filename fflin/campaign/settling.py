@@ -17,10 +17,10 @@ from fflin.base.rotation import quaternion_product
 from fflin.base.validation import Array, Mask, as_double, instance
 from fflin.batch.run import Execution, Progress
 from fflin.campaign.runs import EDGE, CampaignJob, completed
-from fflin.control.gain import gain_matrix, regulated_states
+from fflin.control.gain import Gain, gain_matrix, regulated_states
 from fflin.control.policies import StateFeedback
 from fflin.dynamics.integrators import DEFAULT_INTEGRATOR, held_exponential
-from fflin.dynamics.state import StateMap, selection
+from fflin.dynamics.state import StateMap
 from fflin.linear.fit import require_fit
 from fflin.linear.linearization import linearize
 from fflin.linear.model import LinearModel, refuse_delayed
@@ -58,14 +58,17 @@ class Loop:
         instance("robot", robot, Robot, "a fflin.Robot")
         instance("lin", lin, LinearModel, "a fflin.LinearModel")
         refuse_delayed(lin, "the comparison of linear and nonlinear motions")
-        K = StateFeedback(lin, as_double("gain", gain_matrix(gain))).K
+        # A gain with integral action must be given itself, because its matrix has more columns.
+        has_integrals = isinstance(gain, Gain) and bool(gain.integrals)
+        K = gain if has_integrals else as_double("gain", gain_matrix(gain))
+        policy = StateFeedback(lin, K)
         kept = regulated_states(gain)
         part = regulated_part(lin, any(f"qdot_m.{name}" in kept for name in lin.wheels))
         # omit states that are not fed back and cannot settle
         if part.state_names == kept:
-            K = K @ selection(kept, lin.state_names).T
+            policy = policy.of_part(part)
             lin = part
-        self.robot, self.lin, self.K = robot, lin, K
+        self.robot, self.lin, self.policy = robot, lin, policy
         # Map between (q, v) and the full state of the robot, in the frame of the model.
         self.state = state = StateMap(robot, reference=lin.reference, frame=lin.frame)
         require_fit(lin, robot, state)
@@ -84,8 +87,9 @@ class Loop:
         self.model_states = np.array(
             [state.names.index(name) for name in lin.state_names]
         )
-        # State matrix of the linear loop, and its slowest decay rate [1/s].
-        self.rate: Array = lin.A - lin.B @ K
+        # State matrix of the linear loop, whose last states are the integrals of the policy, and
+        # its slowest decay rate [1/s].
+        self.rate: Array = policy.loop_with(lin)
         poles = np.linalg.eigvals(self.rate)
         self.decay = -float(poles.real.max())
         if lin.dt:
@@ -98,7 +102,7 @@ class Loop:
 
     @cached_property
     def weight(self) -> Array:
-        """Matrix P of the Lyapunov function of the linear loop."""
+        """Matrix P of the Lyapunov function of the linear loop, for zero integrals."""
         from scipy.linalg import solve_continuous_lyapunov, solve_discrete_lyapunov
 
         names, full = self.lin.state_names, self.state.names
@@ -114,12 +118,14 @@ class Loop:
         size = [
             self.decay * root_of[rates[name]] for name in names if name not in root_of
         ]
-        Q = np.diag(np.array([*size, *root_of.values()]) ** 2)
+        roots = [*size, *root_of.values(), *(0.0 for _ in self.policy.integrals)]
+        Q = np.diag(np.array(roots) ** 2)
         P: Array
         if self.lin.dt:
             P = solve_discrete_lyapunov(self.rate.T, Q)
         else:
             P = solve_continuous_lyapunov(self.rate.T, -Q)
+        P = P[: len(names), : len(names)]
         return (P + P.T) / 2.0
 
     def size(self, error: Array) -> Array:
@@ -222,8 +228,9 @@ class Loop:
         options |= {"histories": histories}
         judge = partial(self._judged, transition)
         over = None if predicts else self._is_over
-        policy = StateFeedback(lin, self.K)
-        return CampaignJob(self.robot, policy, None, 0, engine, options, judge, over)
+        return CampaignJob(
+            self.robot, self.policy, None, 0, engine, options, judge, over
+        )
 
     def _transition(self, dt: float, every: int) -> Array:
         """Return the transition matrix of the linear loop from one check to the next.
@@ -261,10 +268,12 @@ class Loop:
         diverged = (stop == STOPS.index("diverged")) | ~(last < DIVERGED * first)
         code = np.select([turned, diverged, last <= SETTLED * first], [2, 3, 1], 0)
         apart = np.zeros(len(e))
-        predicted = e[:, 0]
         if step is not None:
+            nx = e.shape[-1]
+            integrals = np.zeros((len(e), len(step) - nx))
+            predicted = np.hstack((e[:, 0], integrals))
             for now in e.swapaxes(0, 1):
-                apart = np.maximum(apart, self.size(now - predicted))
+                apart = np.maximum(apart, self.size(now - predicted[:, :nx]))
                 predicted = predicted @ step.T
         return {"outcome": code, "error": np.where(code > 1, np.nan, apart / first)}
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from argparse import Namespace
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial, reduce
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
 
 import fflin
 from fflin.base.errors import InputError, UnknownNameError, located
@@ -22,7 +24,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-_WEIGHTS = ("weights", "q", "r", "bryson", "sample")
+_WEIGHTS = ("weights", "q", "r", "bryson", "sample", "integral")
 _POSE = ("target_rpy", "target_position")
 _TARGETS = (
     "target_joint",
@@ -362,14 +364,18 @@ def gain_of(
 ) -> fflin.Gain:
     """Return the regulator of a model.
 
-    The options --weights, --q, --r and --bryson define the weights. With --sample, the model is
-    first discretised. If `allocated` is true, the error for an unknown name mentions --no-allocate.
+    The options --weights, --q, --r and --bryson define the weights, and --integral the integrated
+    signals. With --sample, the model is first discretised. If `allocated` is true, the error for an
+    unknown name mentions --no-allocate.
     """
     if arguments.sample is not None:
         lin = lin.discretize(arguments.sample)
     try:
         return fflin.lqr(
-            lin, weights=weights_of(arguments), wheel_speeds=arguments.wheel_speeds
+            lin,
+            weights=weights_of(arguments),
+            wheel_speeds=arguments.wheel_speeds,
+            integral_action=arguments.integral or None,
         )
     except UnknownNameError as error:
         message = str(error)
@@ -472,7 +478,7 @@ def about_point(
     gain: fflin.Gain | None = None
     feedback: fflin.StateFeedback | fflin.LinearController
     if arguments.mpc:
-        names = ("allocate", "gain", "controller", "reduce")
+        names = ("allocate", "gain", "controller", "reduce", "integral")
         refuse(arguments, names, "--mpc replaces the regulator and its options")
         if arguments.sample is None:
             raise InputError(
@@ -510,12 +516,22 @@ def about_point(
     else:
         gain = gain or gain_of(lin, arguments, allocated=design is not robot)
         model = lin.discretize(gain.dt) if gain.dt else lin
-        feedback = fflin.StateFeedback(model, gain.K)
+        feedback = _state_feedback(model, gain)
     if design is not robot:
         return fflin.Allocation(feedback, design), feedback, None
     if arguments.reduce or arguments.controller:
         return feedback, feedback, None
     return feedback, feedback, lin
+
+
+def _state_feedback(model: fflin.LinearModel, gain: fflin.Gain) -> fflin.StateFeedback:
+    """Return the feedback of a gain about the point of a model, which may be another point."""
+    if not gain.integrals:
+        return fflin.StateFeedback(model, gain.K)
+    none = np.zeros(len(gain.integrals))
+    x0 = np.concatenate((model.x0, none))
+    moved = replace(gain, x0=x0, u0=model.u0, placement=model.placement)
+    return fflin.StateFeedback(model, moved)
 
 
 def _about_gain(

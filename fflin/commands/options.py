@@ -29,8 +29,8 @@ _LOOP = {
     "start": f"{_POSE} offset",
     "target": f"{_TARGET} {_INPUTS}",
     TRAJECTORY: _TRAJECTORY,
-    CONTROLLER: f"{_WEIGHTS} schedule gain controller negative-feedback allocate mpc horizon free "
-    "limits limit delay",
+    CONTROLLER: f"{_WEIGHTS} integral schedule gain controller negative-feedback allocate mpc "
+    "horizon free limits limit delay",
     SIMULATION: "duration dt step method frame",
     ROBOT: _SYSTEM,
 }
@@ -66,7 +66,7 @@ OPTIONS: dict[str, dict[str, str]] = {
     },
     "validity": {
         **_AT_POINT,
-        CONTROLLER: f"{_WEIGHTS} dt allocate",
+        CONTROLLER: f"{_WEIGHTS} integral dt allocate",
         "runs": "attitude offset spread samples seed jobs limits",
         OUTPUT: "plot",
     },
@@ -78,7 +78,7 @@ OPTIONS: dict[str, dict[str, str]] = {
     },
     "lqr": {
         **_AT_POINT,
-        CONTROLLER: f"{_WEIGHTS} dt allocate",
+        CONTROLLER: f"{_WEIGHTS} integral dt allocate",
         OUTPUT: "output-file plot",
     },
     "tvlqr": {**_ALONG, CONTROLLER: f"{_WEIGHTS} dt qf", OUTPUT: "output-file"},
@@ -221,6 +221,9 @@ ABOUT: dict[str, str] = {
     "bryson": "largest acceptable value of a state, an input or a group. Its weight is 1/VALUE^2, "
     "and all weights set by the rule are multiplied by one factor, so that both kinds of weights "
     "are comparable",
+    "integral": "also integrate a state or an output, so that a constant disturbance leaves no "
+    "error in it. NAME is a state, an output or a group, such as q_b. The integrals are slower "
+    "than the loop; the report states their rate",
     "sample": "sample time of the controller [s], with zero-order hold of the inputs. The sampled "
     "gain minimises the continuous-time cost",
     "reduce": "for robots with conserved momentum: regulate only the controllable states",

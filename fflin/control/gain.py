@@ -434,7 +434,7 @@ def gain_matrix(gain: object) -> object:
 def regulated_states(gain: object) -> tuple[str, ...]:
     """Return the names of the states that a `Gain` regulates, or () for all states."""
     if isinstance(gain, Gain):
-        return gain.regulated
+        return tuple(name for name in gain.regulated if name not in gain.integrals)
     return ()
 
 

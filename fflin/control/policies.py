@@ -385,6 +385,20 @@ class StateFeedback(LinearLaw):
         """Note on the momentum that wheels gain while they hold the robot at the point."""
         return wheel_notes(self.lin)
 
+    def of_part(self, part: LinearModel) -> Self:
+        """Return the feedback of the states of a reduced model, which contains all fed-back states.
+
+        `part` contains some of the states of `lin`.
+        """
+        S = selection(part.state_names, self.lin.state_names)
+        law = copy(self)
+        law.lin = part
+        law.K = self.K @ S.T
+        law.system = self.system._replace(
+            B=self.system.B @ S.T, D=self.system.D @ S.T, inputs=part.state_names
+        )
+        return law
+
     @property
     def feedback_gain(self) -> Array | None:
         """The gain K, or None if the law also has integrals."""

@@ -154,7 +154,12 @@ def _law_of(given: Design, robot: Robot) -> Law:
         model = policy._lin or model_of(
             policy, robot, made, pin.XYZQUATToSE3(policy.placement)
         )
-        policy = StateFeedback(model, gain)
+        law: Gain | Array = gain.K
+        if gain.integrals:
+            law = gain
+            if gain.dt and not model.dt:
+                model = model.discretize(gain.dt)
+        policy = StateFeedback(model, law)
     form = policy.form(robot)
     if isinstance(form, StateForm) and policy.model:
         dt = given.dt if isinstance(given, Gain) else policy.sample_time

@@ -104,3 +104,14 @@ def test_a_continuous_law_with_integrals_is_refused(tmp_path):
     gain = fflin.lqr(lin, integral_action=["q_b"])
     with pytest.raises(fflin.InputError, match="continuous"):
         fflin.write_c(gain, tmp_path)
+
+
+@pytest.mark.parametrize("ending", ["npz", "json"])
+def test_a_gain_with_integrals_from_a_file_gives_the_same_code(tmp_path, ending):
+    robot, _, gain, _ = designed("gain")
+    gain.save(tmp_path / f"gain.{ending}")
+    read = fflin.Gain.load(tmp_path / f"gain.{ending}")
+    one = fflin.write_c(gain, tmp_path / "one", robot=robot)
+    other = fflin.write_c(read, tmp_path / "other", robot=robot)
+    name = "controller.c"
+    assert (one / name).read_text() == (other / name).read_text()
