@@ -1,5 +1,6 @@
 """Sampled models whose inputs are delayed: exact matrices, names, files and designs."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -429,3 +430,15 @@ def test_wheels_are_left_out_of_delayed_designs():
     left = np.setdiff1d(np.arange(len(late.A)), kept)
     assert not gain.K[:, left].any()
     assert gain.K.shape == (3, len(late.A))
+
+
+def test_files_of_earlier_versions_have_no_delay(arm, tmp_path):
+    path = tmp_path / "m.json"
+    arm.discretize(0.1).save(path)
+    entries = json.loads(path.read_text())
+    for key in ("added", "delay", "sha256"):
+        del entries[key]
+    path.write_text(json.dumps(entries))
+    read = fflin.LinearModel.load(path)
+    assert read.added == () and not read.delay.any()
+    assert read.undelayed is read
