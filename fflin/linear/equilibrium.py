@@ -118,7 +118,8 @@ def equilibrium(
     The balanced forces are the forces that `linearize` also includes: springs, gravity, dampers,
     and the inertial forces of a steady motion. With `disturbed`, they also include the constant
     part of `Robot.disturbance`. In orbit, the base is at rest in the rotating orbital frame, and
-    the forces include the gravity gradient and the inertial forces of this frame. To find attitudes at which the base needs no torque in orbit, use `relative_equilibria`.
+    the forces include the gravity gradient and the inertial forces of this frame. To find
+    attitudes at which the base needs no torque in orbit, use `relative_equilibria`.
 
     Let f be the generalised forces on the robot without the inputs u, and B the matrix from u to
     generalised forces. The inputs solve
