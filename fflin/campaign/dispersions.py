@@ -24,13 +24,14 @@ from fflin.dynamics.state import StateMap
 from fflin.kernel.forward import ActuatorFaults
 from fflin.kernel.tree import Tree, batch_tree
 from fflin.linear.model import LinearModel
+from fflin.robot.disturbance import UNITS, DisturbanceTerm
 from fflin.robot.equipment.assembly import first_impossible, turned_to
 from fflin.robot.fields import warn_of_degrees
 from fflin.robot.inputs import JointTorque, ReactionWheel, Thruster
 from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.mass_properties import properties, varied
 from fflin.robot.robot import Robot
-from fflin.simulation.lanes import noise_generator
+from fflin.simulation.lanes import DISTURBANCE, disturbances_of, noise_generator
 from fflin.simulation.plan import Times
 from fflin.simulation.plant import Plant
 
@@ -45,6 +46,7 @@ _AXES = {"com": "xyz", "inertia": "xyz", "misalignment": "12"}
 _OF_BODIES = ("mass", "com", "inertia", "density")
 _OF_INPUTS, _OF_SPRINGS = ("gain", "bias", "fails"), ("stiffness", "damping")
 _OF_SENSORS = ("sensor", "noise")
+_DISTURBANCES = tuple(f"{name}.{axis}" for name in UNITS for axis in "xyz")
 _FACTORS = ("mass", "inertia", "density", "frequency", *_OF_SPRINGS)
 
 
@@ -84,6 +86,7 @@ class Dispersions:
             **dict.fromkeys((*_OF_INPUTS, "misalignment"), input_keys(plant.actuation)),
             **dict.fromkeys(_OF_SPRINGS, robot.joint_names),
             "frequency": modes,
+            DISTURBANCE: _DISTURBANCES,
         }
         kinds = [*self._known]
         self._known |= {
@@ -447,6 +450,13 @@ class Dispersions:
                 runs[key][:, fed] = self._of(kind, drawn)
             if "noise" in self._kinds:
                 runs["seed"] = self._of("seed", drawn)[:, 0]
+        if DISTURBANCE in self._kinds:
+            waves = disturbances_of(plant.robot, dispersed=True)
+            vectors = np.tile([wave.vector for wave in waves], (count, 1, 1))
+            vectors = vectors.reshape(count, -1)
+            # The last two terms are the dispersed constants, in the order of `_DISTURBANCES`.
+            vectors[:, -len(_DISTURBANCES) :] = self._of(DISTURBANCE, drawn)
+            runs[DISTURBANCE] = vectors
         if "delay" in self._kinds:
             runs["delay"] = self.delays(drawn)
         return runs
@@ -471,6 +481,8 @@ class Dispersions:
         robot = replace(
             robot, stiffness=springs["stiffness"], damping=springs["damping"]
         )
+        if DISTURBANCE in self._kinds:
+            robot = _disturbed(robot, self._of(DISTURBANCE, rows)[0])
         if policy and self._kinds & {*_OF_SENSORS}:
             errors = (self._of(kind, rows)[0] for kind in (*_OF_SENSORS, "seed"))
             policy = _with_sensor_errors(policy, *errors)
@@ -505,6 +517,15 @@ class _Bound(Policy):
     def bind(self, robot: Robot) -> Command:
         """Return the command of the policy for its own robot."""
         return bound(self.policy, self.robot)
+
+
+def _disturbed(robot: Robot, drawn: Array) -> Robot:
+    """Return a robot with further constant disturbances (6,), in the order of `_DISTURBANCES`."""
+    terms = dict(robot.disturbance)
+    for name, value in zip(UNITS, drawn.reshape(-1, 3).tolist(), strict=True):
+        x, y, z = value
+        terms[name] = (*terms.get(name, ()), DisturbanceTerm(constant=(x, y, z)))
+    return replace(robot, disturbance=terms)
 
 
 def _with_sensor_errors(

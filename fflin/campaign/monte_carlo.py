@@ -118,6 +118,9 @@ def monte_carlo(
         - ``INPUT.misalignment`` [rad]: two independently drawn angles. The direction of a thruster,
           the axis of a wheel, or an axis of tau_b or F_b is rotated by these angles about two axes
           perpendicular to it.
+        - ``tau_b.disturbance`` [N m] and ``F_b.disturbance`` [N]: constant torque and force on the
+          base, or one of their components, such as ``tau_b.x.disturbance``. The drawn values add to
+          `Robot.disturbance`, in its default axes.
         - ``NAME.sensor``: constant offset in the measurement of a state that a `StateFeedback`
           reads, or of an output that an `OutputFeedback`, `LinearController` or
           `TrajectoryOutputFeedback` measures. ``NAME.noise``: white noise added to this measurement

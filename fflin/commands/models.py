@@ -11,7 +11,14 @@ from functools import partial
 from pathlib import Path
 
 import fflin
-from fflin.base.errors import FflinError, FflinWarning, FileError, InputError, listed
+from fflin.base.errors import (
+    EquilibriumError,
+    FflinError,
+    FflinWarning,
+    FileError,
+    InputError,
+    listed,
+)
 from fflin.base.names import with_units
 from fflin.base.tables import counted, cut, folded, grid, matrix, signals
 from fflin.base.writing import RECORDS, check_ending, write_atomically
@@ -380,6 +387,7 @@ def equilibrium(arguments: Namespace) -> Report:
     from fflin.base.record import write_record
     from fflin.dynamics.points import LIMIT_SLACK
     from fflin.linear.holding import wheel_notes
+    from fflin.robot.disturbance import terms_of
     from fflin.robot.fields import limits_of
 
     refuse(
@@ -416,6 +424,17 @@ def equilibrium(arguments: Namespace) -> Report:
         str(held),
         *(folded([note]) for note in wheel_notes(lin)),
     ]
+    disturbed: fflin.Equilibrium | None = None
+    if any(any(term.constant) for _, term in terms_of(robot.disturbance)):
+        title = "u against the constant disturbance too"
+        try:
+            disturbed = fflin.equilibrium(
+                robot, q, v=v, tilt=may_tilt(arguments), disturbed=True, **axes
+            )
+            names, units = disturbed.input_names, disturbed.input_units
+            lines.append(signals(title, disturbed.u, names, units))
+        except EquilibriumError as error:
+            lines.append(folded([f"{title}: none, {error}"]))
     names = (*lin.state_names, *lin.input_names)
     value_of = dict(zip(names, (*lin.x0, *held.u), strict=True))
     limits = limits_of(robot).items()
@@ -438,6 +457,8 @@ def equilibrium(arguments: Namespace) -> Report:
         "zero_eigenvalues": lin_modes.zero_eigenvalues,
         "poles": poles,
     }
+    if disturbed is not None:
+        result["disturbed_u"] = disturbed.u
     entries = {"kind": "Equilibrium", **vars(held), "poles": poles}
     write = partial(write_record, record=entries, checksummed=True)
     return Report(robot.name, result, "\n".join(lines), {arguments.output_file: write})

@@ -24,7 +24,7 @@ from fflin.kernel.vectors import Entries, angle, called, chosen, load, store
 class Mechanics(
     namedtuple(
         "Mechanics",
-        "tree gravity index circling scale springy rest held triads origin faults",
+        "tree gravity index circling scale springy rest held triads origin faults disturbance",
     )
 ):
     """Parameters of a robot in the simulation loop.
@@ -45,6 +45,7 @@ class Mechanics(
     - `held`: the entries of `triads` for the vector inputs in reference axes.
     - `origin` (7,): placement of the world relative to the reference, as position and quaternion.
     - `faults`: the `ActuatorFaults`.
+    - `disturbance`: the `BaseDisturbance`.
     """
 
 
@@ -57,14 +58,24 @@ class ActuatorFaults(namedtuple("ActuatorFaults", "gain bias until turn")):
     """
 
 
+class BaseDisturbance(namedtuple("BaseDisturbance", "vector phase rate at held")):
+    """Torques and forces on the base: k terms, each a vector times sin(rate t + phase).
+
+    - `vector` (k, 3): torques [N m] and forces [N]. `phase` (k,): phases [rad].
+    - `rate` (k,): angular frequencies [rad/s], 0 for a constant, whose phase is pi / 2.
+    - `at` (k,): 0 for a torque, 3 for a force.
+    - `held` (k,): True if the vector is in world axes, False if it is in base axes.
+    """
+
+
 class Point(namedtuple("Point", "q nu u pushing wrench")):
     """Point of a robot: q (nq,), nu (6 + n,) in base axes, and inputs.
 
     - `u` (number of inputs,): the commanded inputs.
     - `pushing` (number of inputs,): the inputs after faults. Torques and forces on the base are in
       base axes.
-    - `wrench` (6,): moment and force of the inputs about the base's origin, in base axes, at the
-      last evaluation of the accelerations.
+    - `wrench` (6,): moment and force of the inputs and disturbances about the base's origin, in
+      base axes, at the last evaluation of the accelerations.
     """
 
 
@@ -72,10 +83,18 @@ class CommonPoint(Point):
     """Point whose arrays have no axis of lanes, because all lanes have the same point."""
 
 
+BASE_DISTURBANCE = Struct(BaseDisturbance, LANED, rate=REALS, at=INDICES, held=FLAGS)
 ACTUATOR_FAULTS, POINT = Struct(ActuatorFaults, LANED), Struct(Point, LANED)
 COMMON_POINT = Struct(CommonPoint)
 _OF_MECHANICS = {FLAGS: "circling springy", REALS: "gravity scale rest origin"}
-MECHANICS = Struct(Mechanics, INDICES, _OF_MECHANICS, tree=TREE, faults=ACTUATOR_FAULTS)
+MECHANICS = Struct(
+    Mechanics,
+    INDICES,
+    _OF_MECHANICS,
+    tree=TREE,
+    faults=ACTUATOR_FAULTS,
+    disturbance=BASE_DISTURBANCE,
+)
 
 
 @called
@@ -152,8 +171,21 @@ def push(work, tree, pushing):
 
 
 @called
-def accelerate(work, robot, point, rates, to):
-    """Write d(nu)/dt into `rates` from the index `to` on.
+def disturb(work, robot, point, t):
+    """Add the disturbances at time t [s] to the generalised force that `push` has written."""
+    disturbance = robot.disturbance
+    for index in range(len(disturbance.at)):
+        phase = disturbance.rate[index] * t + load(disturbance.phase, index)
+        sine = vec.cosine_and_sine(phase)[1]
+        force = vec.times(vec.get3(disturbance.vector, 3 * index), sine)
+        if disturbance.held[index]:
+            force = vec.across(vec.axes_of(point.q), force)
+        vec.add3(work, robot.tree.offsets.c + disturbance.at[index], force)
+
+
+@called
+def accelerate(work, robot, point, t, rates, to):
+    """Write d(nu)/dt at time t [s] into `rates` from the index `to` on.
 
     First, the equation of motion (3.1) is solved for the accelerations c: M c is the force of the
     inputs, minus the bias, minus the force of springs and dampers. `configure` must be called
@@ -164,6 +196,7 @@ def accelerate(work, robot, point, rates, to):
     size = len(tree.row)
     bodies.write_columns(work, tree)
     push(work, tree, point.pushing)
+    disturb(work, robot, point, t)
     vec.copy(work, force, point.wrench, 0, 6)
     bodies.move_bodies(work, tree, nu)
     bodies.load_bodies(work, tree)

@@ -380,7 +380,7 @@ def _advance(arguments, clock, last, every, rows, work):
                     vec.put3(rows, at + 6, center)
                     at += 9
             forward.accelerate(
-                work, robot, point, method.rates, (1 + stage) * len(point.nu)
+                work, robot, point, t, method.rates, (1 + stage) * len(point.nu)
             )
             if arguments.pushed:
                 weight, moment = method.weights[stage], method.moments[stage]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import permutations, product
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -12,7 +13,17 @@ from fflin.base import html
 from fflin.base.errors import EquilibriumError, InputError, SingularInertiaError, listed
 from fflin.base.tables import grid, signals
 from fflin.base.validation import Array, Complex, FrozenArrays, Indices, instance, truth
-from fflin.dynamics.coordinates import LINEAR, ORBITAL, Frame, forces_of, frame_of
+from fflin.dynamics.coordinates import (
+    ANGULAR,
+    LINEAR,
+    ORBITAL,
+    PIN_ANGULAR,
+    PIN_LINEAR,
+    Frame,
+    forces_of,
+    frame_of,
+)
+from fflin.dynamics.disturbance import BaseDisturbance
 from fflin.dynamics.orbital import OrbitField, mean_motion
 from fflin.dynamics.state import Actuation, StateMap
 from fflin.linear.linearization import Linearizer
@@ -100,13 +111,15 @@ def equilibrium(
     frame: Frame | None = None,
     reference: pin.SE3 | None = None,
     tilt: bool = True,
+    disturbed: bool = False,
 ) -> Equilibrium:
     r"""Compute the spring deflections and the minimum-norm inputs that balance all forces.
 
     The balanced forces are the forces that `linearize` also includes: springs, gravity, dampers,
-    and the inertial forces of a steady motion. In orbit, the base is at rest in the rotating
-    orbital frame, and the forces include the gravity gradient and the inertial forces of this
-    frame. To find attitudes at which the base needs no torque in orbit, use `relative_equilibria`.
+    and the inertial forces of a steady motion. With `disturbed`, they also include the constant
+    part of `Robot.disturbance`. In orbit, the base is at rest in the rotating orbital frame, and
+    the forces include the gravity gradient and the inertial forces of this frame. To find
+    attitudes at which the base needs no torque in orbit, use `relative_equilibria`.
 
     Let f be the generalised forces on the robot without the inputs u, and B the matrix from u to
     generalised forces. The inputs solve
@@ -153,6 +166,11 @@ def equilibrium(
     tilt : bool
         Whether the base may be tilted under gravity, by less than 90 deg. A base that moves is
         never tilted.
+    disturbed : bool
+        Whether the inputs also balance the constant part of `Robot.disturbance`. Such inputs show
+        what the actuators must hold. By default, the inputs are the inputs of a control law, which
+        does not know the disturbance; a linear model does not contain it either. Inertial axes are
+        those at t = 0.
 
     Returns
     -------
@@ -191,6 +209,9 @@ def equilibrium(
     """
     state = StateMap(robot, frame=frame, reference=reference)
     tilt = truth("tilt", tilt)
+    pushed = BaseDisturbance(robot, state.field, constant=True)
+    if not truth("disturbed", disturbed):
+        pushed.waves.clear()
     given = robot.neutral() if q is None else robot.checked_configuration(q)
     # put the reference at the base, so that forces and inputs are in base axes
     if robot.orbit:
@@ -198,10 +219,11 @@ def equilibrium(
         linearizer = Linearizer(robot, frame=frame, reference=base_pose)
     else:
         linearizer = Linearizer(robot, moving=True)
-    balance = first = _settled(linearizer, state, given, v, spun=False)
+    problem = _Problem(linearizer, state, pushed, v)
+    balance = first = _settled(problem, given, spun=False)
     if tilt and first.asks_tilt:
-        balance = _tilted(linearizer, state, first, v)
-    balance = _with_other_points(linearizer, state, balance, given, v)
+        balance = _tilted(problem, first)
+    balance = _with_other_points(problem, balance, given)
     if not balance.holds:
         balance = first
     if not balance.holds:
@@ -224,6 +246,22 @@ def equilibrium(
     return Equilibrium(at, u, sag, rotation, balance.residual, *names)
 
 
+class _Problem(NamedTuple):
+    """Robot, as its linearizer, with the velocity and the disturbances of an equilibrium."""
+
+    linearizer: Linearizer
+    state: StateMap
+    disturbance: BaseDisturbance
+    v: Array | None
+
+    def disturbance_at(self, q: Array) -> Array:
+        """Return the generalised force (6 + n,) of the disturbances, in base axes."""
+        forces: Array = np.zeros(6 + self.state.robot.n)
+        wrench = self.disturbance.wrench(0.0, q)
+        forces[ANGULAR], forces[LINEAR] = wrench[PIN_ANGULAR], wrench[PIN_LINEAR]
+        return forces
+
+
 def _pushed(linearizer: Linearizer) -> bool:
     """Return whether a robot has inputs that exert a force on the base."""
     return not {"F_b", "thrust"}.isdisjoint(linearizer.prepared.actuation.groups)
@@ -242,29 +280,23 @@ def on_orbit(robot: Robot, q: Array, frame: Frame) -> Array:
     return placed
 
 
-def _with_other_points(
-    linearizer: Linearizer,
-    state: StateMap,
-    balance: _Balance,
-    given: Array,
-    v: Array | None,
-) -> _Balance:
+def _with_other_points(problem: _Problem, balance: _Balance, given: Array) -> _Balance:
     """Return `balance` if it holds, or a balance with accelerating wheels or on the orbit."""
-    robot = linearizer.robot
+    robot = problem.linearizer.robot
     wheels = balance.lin.wheels
     # configuration, and whether the wheels may accelerate
     attempts = list[tuple[Array, bool]]()
     if wheels:
         attempts.append((given, True))
-    if robot.orbit and not given[:3].any() and not _pushed(linearizer):
-        centered = on_orbit(robot, given, state.frame)
+    if robot.orbit and not given[:3].any() and not _pushed(problem.linearizer):
+        centered = on_orbit(robot, given, problem.state.frame)
         attempts.append((centered, False))
         if wheels:
             attempts.append((centered, True))
     for at, spun in attempts:
         if balance.holds:
             break
-        balance = _settled(linearizer, state, at, v, spun=spun)
+        balance = _settled(problem, at, spun=spun)
     return balance
 
 
@@ -285,23 +317,17 @@ def _unbalanced(robot: Robot, balance: _Balance) -> EquilibriumError:
     )
 
 
-def _settled(
-    linearizer: Linearizer,
-    state: StateMap,
-    given: Array,
-    v: Array | None,
-    *,
-    spun: bool,
-) -> _Balance:
+def _settled(problem: _Problem, given: Array, *, spun: bool) -> _Balance:
     """Return the balance after joints with a spring but without a motor have deflected.
 
     If `spun`, the inputs may accelerate the wheels of the robot, so that the wheels gain momentum.
     """
+    linearizer, state, v = problem.linearizer, problem.state, problem.v
     robot = linearizer.robot
     pushes, motors = forces_of(robot), set(Actuation(state).names)
     free = {f"tau_m.{name}" for name, k in robot.stiffness.items() if k} - motors
     soft = np.array([name in free for name in pushes])
-    balance = _Balance(linearizer, given, v, spun=spun)
+    balance = _Balance(problem, given, spun=spun)
     tolerance = balance.tolerance
     for _ in range(20):  # Newton's method, which needs a few steps
         loose = soft & (np.abs(balance.residual) > tolerance)
@@ -319,15 +345,13 @@ def _settled(
         step[soft] = np.linalg.solve(hold, balance.residual[soft])
         at = pin.integrate(robot.model, lin.q, state.spread(step))
         at[:7] = given[:7]
-        balance = _Balance(linearizer, at, v, spun=spun)
+        balance = _Balance(problem, at, spun=spun)
         tolerance = np.maximum(tolerance, balance.tolerance)
     balance.left[soft & ~loose] = 0.0
     return balance
 
 
-def _tilted(
-    linearizer: Linearizer, state: StateMap, start: _Balance, v: Array | None
-) -> _Balance:
+def _tilted(problem: _Problem, start: _Balance) -> _Balance:
     """Tilt the base by Gauss-Newton steps until the inputs balance the forces.
 
     Return `start` if no attitude within 90 deg is found.
@@ -343,7 +367,7 @@ def _tilted(
         q = balance.lin.q.copy()
         rotation = pin.Quaternion(q[3:7]).matrix() @ pin.exp3(step)
         q[3:7] = pin.Quaternion(rotation).coeffs()
-        balance = _settled(linearizer, state, q, v, spun=False)
+        balance = _settled(problem, q, spun=False)
         if np.linalg.norm(pin.log3(level.T @ rotation)) >= 0.5 * np.pi:
             return start
         if balance.holds:
@@ -358,12 +382,11 @@ class _Balance:
     of their forces are then zero, and their inertial forces are taken out of all other rows.
     """
 
-    def __init__(
-        self, linearizer: Linearizer, q: Array, v: Array | None, *, spun: bool = False
-    ) -> None:
+    def __init__(self, problem: _Problem, q: Array, *, spun: bool = False) -> None:
+        linearizer = problem.linearizer
         robot, actuation = linearizer.robot, linearizer.prepared.actuation
         self.robot = robot
-        self.lin = lin = linearizer(q, v)
+        self.lin = lin = linearizer(q, problem.v)
         drift = lin.rate
         _require_steady(lin, drift)
         columns = actuation.columns(robot.create_data(), lin.q)
@@ -389,6 +412,7 @@ class _Balance:
         if robot.orbit:
             noise = terms + rounding
         wanted[np.abs(wanted) <= noise] = 0.0
+        wanted -= problem.disturbance_at(lin.q)
         if spun:
             wheels = np.array(
                 [6 + robot.joint_names.index(name) for name in lin.wheels]

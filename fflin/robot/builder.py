@@ -20,6 +20,7 @@ import pinocchio as pin
 
 from fflin.base.errors import InputError, require_known
 from fflin.base.names import stands_for_any
+from fflin.robot.disturbance import ORBITAL, terms_of
 from fflin.robot.equipment.appendages import Appendage, FlexibleAppendage, rigid_inertia
 from fflin.robot.equipment.assembly import (
     Mounted,
@@ -113,6 +114,12 @@ def _require_consistent(robot: RobotData) -> None:
             f"'{robot.name}' has both uniform gravity and an orbit, but an orbit already "
             "includes the gravity of its central body; leave one of them out"
         )
+    for name, term in terms_of(robot.disturbance):
+        if term.axes == ORBITAL and not robot.orbit:
+            raise InputError(
+                f"disturbance '{name}' is in orbital axes, but '{robot.name}' is not in orbit; "
+                "give base or inertial axes, or give the robot an orbit"
+            )
     for name in robot.used_frames:
         find_frame(robot.model, name)
     require_free_rotors(robot)

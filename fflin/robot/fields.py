@@ -27,6 +27,7 @@ from fflin.base.validation import (
     number,
     numbers,
 )
+from fflin.robot.disturbance import checked_disturbance
 from fflin.robot.inputs import (
     KINDS,
     Input,
@@ -362,6 +363,7 @@ FIELDS: dict[str, Callable[[object, RobotData], Any] | None] = {
     **{name: partial(_of_joints, name) for name in ("stiffness", "damping", "rest")},
     "gravity": lambda value, _: three_numbers("gravity", value),
     "orbit": lambda value, _: checked_orbit(value),
+    "disturbance": lambda value, _: checked_disturbance(value),
     "limits": _given_limits,
     "weights": _weights,
     **{name: partial(_state, name) for name in ("point", "target", "start")},

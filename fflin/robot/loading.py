@@ -89,9 +89,9 @@ def load(
         precedence over the table ``[xacro]`` of the robot file.
     **fields
         Fields of the robot: inputs, outputs, appendages, stiffness, damping, rest, gravity, orbit,
-        limits, passive, weights, point, target and start; see `Robot.replace`. Fields given here
-        take precedence over the robot file. Locks, limits, springs and dampers are merged with the
-        robot file: an entry given here replaces only the entry with the same name.
+        disturbance, limits, passive, weights, point, target and start; see `Robot.replace`. Fields
+        given here take precedence over the robot file. Locks, limits, springs and dampers are
+        merged with the robot file: an entry given here replaces only the entry with the same name.
 
     Returns
     -------

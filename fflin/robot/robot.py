@@ -76,6 +76,9 @@ class Robot(RobotData):
         zero gravity.
     orbit : CircularOrbit or None
         Orbit of the robot. In orbit, Pinocchio's world is the orbital frame, see `CircularOrbit`.
+    disturbance : mapping
+        Torque and force on the base that act in simulations, {"tau_b" or "F_b": terms}, see
+        `replace`. Linear models and control laws do not contain them.
     package_dirs : tuple of Path
         Folders that are searched for ``package://`` meshes when the robot is drawn.
     xacro : mapping
@@ -112,6 +115,9 @@ class Robot(RobotData):
     >>> stiff = robot.replace(stiffness={"joint_1": 50.0}, gravity=(0, 0, -1.62))
     >>> robot.n, stiff.stiffness["joint_1"], round(heavy.mass)
     (3, 50.0, 972)
+    >>> pushed = robot.replace(disturbance={"tau_b": (2e-5, 0, 0)})
+    >>> pushed.disturbance["tau_b"][0].constant
+    (2e-05, 0.0, 0.0)
     """
 
     def replace(self, **fields: object) -> Robot:
@@ -142,6 +148,19 @@ class Robot(RobotData):
         orbit : CircularOrbit, float, mapping or None
             Orbit of the robot, altitude [m] over the earth, or parameters {name: value} of a
             `CircularOrbit`. None removes the orbit.
+        disturbance : mapping or None
+            Torque ``tau_b`` [N m] and force ``F_b`` [N] on the base that act on the true system:
+            in `simulate` and in campaigns, but not in linear models, so that control laws do not
+            know them. Each value is three numbers, which is a constant, or a mapping with the keys
+
+            - ``constant`` (3,) [N m | N];
+            - ``amplitude`` (3,) [N m | N], ``frequency`` [Hz] and ``phase`` [rad] (0 by default):
+              the term amplitude sin(2 pi frequency t + phase);
+            - ``axes``: "base", "inertial", or "orbital" in orbit. By default, the torque is in
+              base axes, and the force in inertial axes, or in orbital axes in orbit. In orbit,
+              inertial axes are parallel to the orbital axes at t = 0.
+
+            A list of such mappings is their sum. None removes all disturbances.
         passive : sequence of str
             Names of joints without a motor. Their torques are removed from the inputs.
         wheel_joints : sequence of str
@@ -188,6 +207,7 @@ class Robot(RobotData):
             - a value is negative or not a number;
             - a wheel has a larger inertia than the link that carries it;
             - a joint in `wheel_joints` cannot spin freely;
+            - a disturbance is incomplete, or in orbital axes without an orbit;
             - both gravity and an orbit are given.
         UnknownNameError
             If a field, a joint, a frame of an input or output, or a name in `limits` does not

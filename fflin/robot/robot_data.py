@@ -13,6 +13,7 @@ import pinocchio as pin
 
 from fflin.base.errors import InputError, unknown
 from fflin.base.validation import Array
+from fflin.robot.disturbance import DisturbanceTerms
 from fflin.robot.equipment.appendages import Appendage
 from fflin.robot.equipment.assembly import stored_momentum
 from fflin.robot.inputs import (
@@ -79,6 +80,7 @@ class RobotData(Coordinates):
     rest: Mapping[str, float] = field(default_factory=dict)
     gravity: tuple[float, float, float] = (0.0, 0.0, 0.0)
     orbit: CircularOrbit | None = None
+    disturbance: DisturbanceTerms = field(default_factory=dict)
     package_dirs: tuple[Path, ...] = ()
     xacro: Mapping[str, str] = field(default_factory=dict)
     passive: tuple[str, ...] = ()

@@ -146,6 +146,10 @@ def _settings(robot: Robot) -> list[str]:
         "passive joints": robot.passive,
         "locked joints": robot.locked,
         "gravity [m/s^2]": robot.gravity if any(robot.gravity) else (),
+        "disturbance, in simulations only": {
+            name: [term.text(name, orbit=robot.orbit is not None) for term in terms]
+            for name, terms in robot.disturbance.items()
+        },
         "outputs": outputs if outputs != ["state"] else (),
         "limits": {
             key: f"{low:g} to {high:g}" for key, (low, high) in robot.limits.items()

@@ -21,12 +21,15 @@ from fflin.control.channel import channel_of
 from fflin.control.loops import Sample, measured_at
 from fflin.control.policy import Form, OutputForm, PathForm, Policy, StateForm
 from fflin.control.tracking import AT_THE_END, TrajectoryFeedback
+from fflin.dynamics.disturbance import Wave, waves_of
 from fflin.dynamics.state import StateMap
 from fflin.kernel import allocation, forward, loop, policies
 from fflin.kernel.compiled import compiles, is_kept, kernel
 from fflin.kernel.limits import Task, reason_against
 from fflin.kernel.tree import LANES, batch_tree, empty, laid_out, work_space
+from fflin.robot.disturbance import BASE, UNITS, DisturbanceTerm
 from fflin.robot.fields import input_limits, limits_of
+from fflin.robot.inputs import BaseTorque
 from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.outputs import Gyroscope
 from fflin.robot.robot import Robot
@@ -47,6 +50,9 @@ LONG = 20_000
 
 SLOTS = 128  # number of samples for which noise is stored at once
 _MEMORY = 2**22  # [bytes] memory for recorded rows
+
+# Name, in `Runs`, of the vectors of `disturbances_of` with dispersed constants.
+DISTURBANCE = "disturbance"
 
 # {name of an array of the loop: values (N, size), one row per run}; see `Dispersions.in_lanes`.
 Runs: TypeAlias = Mapping[str, Array]
@@ -222,7 +228,7 @@ class LaneLoop:
             # `stop.sign` is the sign of q0 at the start of the plan, or 0 if q0 is not checked. The
             # initial quaternions of dispersed runs have a positive q0.
             stop = stop._replace(sign=[abs(stop.sign[0])])
-        parts = packed(plan, stop, noisy="seed" in runs)
+        parts = packed(plan, stop, noisy="seed" in runs, dispersed=DISTURBANCE in runs)
         self._plan = plan
         self._state = plan.plant.state
         self._ending = ending_of(plan, stop)
@@ -254,6 +260,7 @@ class LaneLoop:
             "delay": self.parts.channel.delay,
             **robot.tree._asdict(),
             **robot.faults._asdict(),
+            DISTURBANCE: robot.disturbance.vector,
         }
 
     def _space(self, size: int) -> Array:
@@ -449,17 +456,22 @@ def recorded(plan: Plan, runs: Runs | None = None) -> Recording:
 
 
 def packed(
-    plan: Plan, stop: loop.StopConditions, *, noisy: bool = False
+    plan: Plan,
+    stop: loop.StopConditions,
+    *,
+    noisy: bool = False,
+    dispersed: bool = False,
 ) -> loop.Arguments:
     """Return the arguments of `kernel.loop.advance` for a plan that the kernel supports.
 
     `stop.squares` (nv,) must contain the squared limits of the entries of v. If `noisy` is true,
-    the law stores the noise of SLOTS samples, even if the policy defines no noise.
+    the law stores the noise of SLOTS samples, even if the policy defines no noise. `dispersed` is
+    the argument of `mechanics_of`.
     """
     plant, times, method, u = plan.plant, plan.times, plan.method, plan.initial
     h, state = times.dt, plant.state
     size, (shift, speed) = 6 + state.robot.n, method.step_weights(h)
-    mechanics = mechanics_of(plant)
+    mechanics = mechanics_of(plant, dispersed=dispersed)
     # The delay line needs no space for commands that arrive after the end of the run.
     delays = [min(delay, times.steps) for delay in times.delays]
     channel = channel_of(plan.limits, u, times.sample, delays)
@@ -492,13 +504,31 @@ def packed(
     )
 
 
-def mechanics_of(plant: Plant) -> forward.Mechanics:
-    """Return the kernel's parameters of the robot and the actuators of a plant."""
+def disturbances_of(robot: Robot, *, dispersed: bool) -> list[Wave]:
+    """Return the disturbances of a robot in the order of the compiled loop.
+
+    If `dispersed` is true, a constant torque and a constant force follow, both zero, to which runs
+    of a campaign add their drawn values.
+    """
+    waves = waves_of(robot)
+    if dispersed:
+        for name in UNITS:
+            axes = DisturbanceTerm().axes_in(name, orbit=robot.orbit is not None)
+            waves.append(Wave(name, axes, (0.0, 0.0, 0.0)))
+    return waves
+
+
+def mechanics_of(plant: Plant, *, dispersed: bool = False) -> forward.Mechanics:
+    """Return the kernel's parameters of the robot and the actuators of a plant.
+
+    `dispersed` is the argument of `disturbances_of`.
+    """
     robot = plant.robot
     actuation = plant.actuation
     tree = batch_tree(plant.robot)
     springs = robot.springs
     assert tree is not None
+    waves = disturbances_of(robot, dispersed=dispersed)
     return forward.Mechanics(
         tree=tree,
         gravity=list(robot.gravity),
@@ -511,6 +541,13 @@ def mechanics_of(plant: Plant) -> forward.Mechanics:
         triads=plant.triads,
         origin=pin.SE3ToXYZQUAT(plant.state.origin),
         faults=plant.faults,
+        disturbance=forward.BaseDisturbance(
+            vector=np.array([wave.vector for wave in waves]).ravel(),
+            phase=[wave.phase for wave in waves],
+            rate=[wave.rate for wave in waves],
+            at=[0 if wave.name == BaseTorque.GROUP else 3 for wave in waves],
+            held=[wave.axes != BASE for wave in waves],
+        ),
     )
 
 

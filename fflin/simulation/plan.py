@@ -165,9 +165,7 @@ class Plan:
         limits = limits_of_step(
             plant, policy, commands, self.q, self.v, u, sample or 0.0
         )
-        if options.disturbance is not None:
-            disturbance = partial(plant.disturbing, q=self.q, v=self.v)
-            limits.append(Signal.of("the disturbance", disturbance, dt, duration))
+        limits += _signals(plant, self.q, self.v, dt, duration)
         pace = Pace(limits, self.method, duration)
         late = delays_of(policy, plant, options.delay)
         self.times = times = times_of(options, duration, sample, pace, late)
@@ -272,6 +270,20 @@ class Plan:
         return channelled(
             law, speeds, self.limits, self.initial, times.sample, times.delays, correct
         )
+
+
+def _signals(
+    plant: Plant, q: Array, v: Array, dt: float | None, duration: float
+) -> list[Signal]:
+    """Return the disturbances that depend on time, at q and v, as limits of the step."""
+    signals = list[Signal]()
+    if plant.disturbance is not None:
+        given = partial(plant.disturbing, q=q, v=v)
+        signals.append(Signal.of("the disturbance", given, dt, duration))
+    if plant.on_base.periodic:
+        wrench = partial(plant.on_base.wrench, q=q)
+        signals.append(Signal.of("the robot's disturbance", wrench, dt, duration))
+    return signals
 
 
 def law_of(

@@ -14,6 +14,7 @@ from fflin.base.names import by_name
 from fflin.base.validation import Array, ArrayLike, as_double, dimension, number, vector
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.coordinates import ANGULAR, LINEAR, forces_of
+from fflin.dynamics.disturbance import BaseDisturbance
 from fflin.dynamics.state import StateMap
 from fflin.kernel.forward import ActuatorFaults, apply_faults
 
@@ -40,8 +41,9 @@ LARGEST_TURN = 1.0
 
 
 class Plant(Aba):
-    """The nonlinear robot with inputs, actuator faults and a disturbance.
+    """The nonlinear robot with inputs, actuator faults and disturbances.
 
+    The disturbances are `Robot.disturbance` and the argument `disturbance` of `simulate`.
     The base torque and the base force in u are in the axes that the frame of `state` defines.
     """
 
@@ -55,6 +57,8 @@ class Plant(Aba):
         robot.require_inertia()
         super().__init__(state)
         self.disturbance = disturbance
+        # Disturbances of the robot itself.
+        self.on_base = BaseDisturbance(robot, state.field)
         # Whether the warning about a disturbance given as an array was already issued.
         self._warned = False
         nu = len(self.actuation.names)
@@ -88,6 +92,7 @@ class Plant(Aba):
             np.any(robot.springs),
             any(robot.gravity),
             robot.orbit,
+            robot.disturbance,
         )
         self._plain = state.S is None and not self.actuation.carried and not any(others)
 
@@ -116,6 +121,10 @@ class Plant(Aba):
             begin, h = self.step
             within = min(max(t, begin * ROUNDED_UP), (begin + h) * ROUNDED_DOWN)
             disturbed = self.disturbing(within, q, v)
+        if self.on_base.waves:
+            on_base = np.zeros(self.robot.nv)
+            on_base[:6] = self.on_base.wrench(t, q)
+            disturbed = on_base if disturbed is None else disturbed + on_base
         rate = self.acceleration(q, v, u, disturbed)
         push = force[_LINEAR_FIRST]
         if disturbed is not None:
@@ -184,6 +193,9 @@ class Plant(Aba):
         driven = driven or bool(self.faults.bias.any())
         base = driven and (self._columns[:6].any() or self.actuation.carried)
         outside = (
-            self.disturbance is not None or any(self.robot.gravity) or self.robot.orbit
+            self.disturbance is not None,
+            self.on_base.waves,
+            any(self.robot.gravity),
+            self.robot.orbit,
         )
-        return not (base or outside)
+        return not (base or any(outside))

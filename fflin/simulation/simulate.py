@@ -156,7 +156,8 @@ def simulate(
         ``F_b``. A function may also return an array (nv,) in Pinocchio's order: force, then torque
         on the base, both in base axes, then joints. This form is deprecated and gives a warning.
         Before the run, a function is called at times of the whole run with the initial q and v, to
-        choose the step.
+        choose the step. These forces add to `Robot.disturbance`, which acts in every simulation
+        of the robot. The linear prediction contains neither.
     events : sequence of callable
         Functions event(t, q, v) -> float. The run ends after the step in which the value of an
         event becomes zero or negative.
@@ -397,6 +398,7 @@ def _energy_note(
     driven = (
         run.u.any()
         or plan.options.disturbance is not None
+        or robot.disturbance
         or robot.springs.damping.any()
     )
     if driven or robot.orbit or not scale:

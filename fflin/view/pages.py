@@ -361,9 +361,9 @@ def payloads(
 def _flight(caught: Capture, frame: Frame, t: Array) -> list[Array]:
     """Return the poses of a payload at times t (N,) [s] before its capture, which is at t = 0.
 
-    The free flight is integrated backwards from the capture, without damping.
+    The free flight is integrated backwards from the capture, without damping and disturbances.
     """
-    payload = caught.payload.replace(damping=0.0)
+    payload = caught.payload.replace(damping=0.0, disturbance=None)
     state = StateMap(payload, frame=frame)
     q = caught.payload_q
     v = caught.payload_v

@@ -126,6 +126,25 @@ def test_an_equilibrium_has_its_inputs_and_its_stability(tmp_path):
     assert "--effort" in refused("equilibrium", ROBOT, "--effort", "tau_m.joint_1=1")
 
 
+def test_an_equilibrium_states_the_inputs_against_a_constant_disturbance(tmp_path):
+    head = 'urdf = "cubesat"\n[disturbance]\ntau_b = [2e-5, 0, 0]\n'
+    (tmp_path / "pushed.toml").write_text(head)
+    title = "u against the constant disturbance too"
+    out = run("equilibrium", "pushed.toml", cwd=tmp_path)[1]
+    assert "u: all zero" in out
+    assert f"{title}: tau_b.x = -2e-05 N m" in out
+    message = json.loads(run("equilibrium", "pushed.toml", "--json", cwd=tmp_path)[1])
+    assert message["disturbed_u"] == pytest.approx([-2e-5, 0, 0, 0, 0, 0], abs=1e-12)
+    assert not any(message["u"])
+    info = " ".join(run("info", "pushed.toml", cwd=tmp_path)[1].split())
+    assert "disturbance, in simulations only: tau_b = 2e-05, 0, 0 N m (base" in info
+    jet = '[[input]]\ntype = "thruster"\nframe = "base"\ndirection = [1, 0, 0]\n'
+    (tmp_path / "jet.toml").write_text(head + jet + "position = [0, 0, 0]\n")
+    code, out, _ = run("equilibrium", "jet.toml", cwd=tmp_path)
+    assert code == 0
+    assert f"{title}: none, the inputs of" in " ".join(out.split())
+
+
 def test_an_equilibrium_beyond_the_limits_is_reported():
     heavy = ("equilibrium", "servicer_7dof", "--gravity", 0, 0, -9.81)
     message = json.loads(run(*heavy, "--json")[1])

@@ -317,3 +317,53 @@ def test_invalid_input_is_reported():
         result.u = 0
     with pytest.raises(ValueError, match="read-only"):
         result.u[0] = 1.0
+
+
+def test_disturbed_inputs_hold_the_true_robot_at_rest():
+    """Only the constant part counts: the periodic part starts at zero and is left out."""
+    rng = np.random.default_rng(8)
+    robot, q = sprung("ets_vii", rng)
+    constant = {
+        "tau_b": {"constant": (0.4, -0.2, 0.3)},
+        "F_b": [(3.0, -5.0, 2.0), {"constant": (1.0, 2.0, -1.0), "axes": "base"}],
+    }
+    true = robot.replace(disturbance=constant)
+    world = pin.SE3.Identity()
+    u = fflin.equilibrium(true, q, reference=world, disturbed=True).u
+    motion = fflin.simulate(true, lambda t, q, v: u, q0=q, duration=0.5)
+    assert np.abs(motion.v).max() < 1e-10
+    wave = {"amplitude": (9.0, 9.0, 9.0), "frequency": 1.0, "phase": 1.0}
+    both = robot.replace(disturbance=constant | {"tau_b": [(0.4, -0.2, 0.3), wave]})
+    again = fflin.equilibrium(both, q, reference=world, disturbed=True).u
+    assert np.array_equal(again, u)
+
+
+def test_by_default_the_inputs_are_those_of_the_undisturbed_model():
+    rng = np.random.default_rng(8)
+    robot, q = sprung("ets_vii", rng)
+    true = robot.replace(disturbance={"tau_b": (0.4, -0.2, 0.3)})
+    held = fflin.equilibrium(true, q)
+    assert np.array_equal(held.u, fflin.equilibrium(robot, q).u)
+    assert fflin.linearize(true, held.q, u=held.u).is_equilibrium(1e-8)
+
+
+def test_wheels_take_up_a_constant_torque():
+    robot = fflin.load("cubesat", inputs=fflin.load_inputs("cubesat"))
+    wheels = [x for x in robot.inputs if isinstance(x, fflin.ReactionWheel)]
+    torque = np.array((2e-5, -1e-5, 3e-5))
+    true = robot.replace(inputs=wheels, disturbance={"tau_b": torque})
+    held = fflin.equilibrium(true, disturbed=True)
+    axes = np.array([wheel.axis for wheel in wheels]).T
+    assert axes @ held.u == pytest.approx(torque, abs=1e-12)
+    motion = fflin.simulate(true, lambda t, q, v: held.u, duration=1.0)
+    assert np.abs(motion.x[:, :3]).max() < 1e-12
+
+
+def test_thrusters_that_cannot_pull_against_a_disturbance_leave_it():
+    thruster = fflin.Thruster("base", (0, 0, 0), (1, 0, 0), name="jet")
+    robot = fflin.load("cubesat", inputs=[thruster])
+    pushed = robot.replace(disturbance={"F_b": (-0.1, 0.0, 0.0)})
+    assert fflin.equilibrium(pushed, disturbed=True).u == pytest.approx([0.1])
+    pulled = robot.replace(disturbance={"F_b": (0.1, 0.0, 0.0)})
+    with pytest.raises(fflin.EquilibriumError, match=r"F_b.x -?0.1 N"):
+        fflin.equilibrium(pulled, disturbed=True)

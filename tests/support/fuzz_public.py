@@ -124,6 +124,7 @@ def light(folder):
             "v": v,
             "frame": "hybrid",
             "tilt": True,
+            "disturbed": False,
         },
         "FramePose": {"frame": "base"},
         "FrameVelocity": {"frame": "base"},
@@ -180,6 +181,7 @@ def light(folder):
                 "gravity": vector,
             },
             "limits": {"tau_b": 1.0},
+            "disturbance": {"tau_b": vector},
         },
         "load_dispersions": {"path": "nosuch.toml"},
         "load_inputs": {"path": "nosuch.toml"},
@@ -327,6 +329,7 @@ def light(folder):
                 "inputs": robot.inputs,
                 "outputs": robot.outputs,
                 "gravity": vector,
+                "disturbance": {"tau_b": vector},
             },
             **{
                 "stiffness": 1.0,

@@ -1,0 +1,76 @@
+"""Torque and force that the disturbances of a robot exert on its base."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import pinocchio as pin
+
+from fflin.base.rotation import rotation_matrix
+from fflin.base.validation import Array
+from fflin.dynamics.coordinates import PIN_ANGULAR, PIN_LINEAR
+from fflin.dynamics.orbital import OrbitField
+from fflin.robot.disturbance import BASE, INERTIAL, terms_of
+from fflin.robot.inputs import BaseForce, BaseTorque
+from fflin.robot.joints import ROOT
+from fflin.robot.robot import Robot
+
+_ROWS = {BaseTorque.GROUP: PIN_ANGULAR, BaseForce.GROUP: PIN_LINEAR}
+
+# A constant is a wave of frequency 0 at this phase [rad], because sin(pi / 2) = 1.
+QUARTER = 0.5 * math.pi
+
+
+class Wave(NamedTuple):
+    """Torque or force on the base: vector times sin(rate t + phase)."""
+
+    name: str  # "tau_b" or "F_b"
+    axes: str  # "base", "inertial" or "orbital"
+    vector: tuple[float, float, float]  # [N m | N]
+    rate: float = 0.0  # [rad/s]
+    phase: float = QUARTER  # [rad]
+
+
+def waves_of(robot: Robot) -> list[Wave]:
+    """Return the disturbances of a robot as waves; a constant is a wave of frequency 0."""
+    waves = list[Wave]()
+    for name, term in terms_of(robot.disturbance):
+        axes = term.axes_in(name, orbit=robot.orbit is not None)
+        if any(term.constant):
+            waves.append(Wave(name, axes, term.constant))
+        if term.periodic:
+            rate = 2.0 * math.pi * term.frequency
+            waves.append(Wave(name, axes, term.amplitude, rate, term.phase))
+    return waves
+
+
+class BaseDisturbance:
+    """Disturbances of a robot as functions of time and of the attitude of the base.
+
+    `field` is the field of the robot's orbit, or None without an orbit. If `constant` is true, the
+    periodic parts are left out.
+    """
+
+    def __init__(
+        self, robot: Robot, field: OrbitField | None, *, constant: bool = False
+    ) -> None:
+        self.waves = waves_of(robot)
+        if constant:
+            self.waves = [wave for wave in self.waves if not wave.rate]
+        self.periodic = any(wave.rate for wave in self.waves)
+        self._root = robot.model.jointPlacements[ROOT].rotation
+        self._field = field
+
+    def wrench(self, t: float, q: Array) -> Array:
+        """Return force and torque (6,) on the base, in base axes, at time t [s] and q (nq,)."""
+        total: Array = np.zeros(6)
+        R = self._root @ rotation_matrix(q[3:7])
+        for wave in self.waves:
+            value = np.array(wave.vector) * math.sin(wave.rate * t + wave.phase)
+            if wave.axes == INERTIAL and self._field:
+                # The orbital frame has rotated by t times its angular velocity.
+                value = pin.exp3(-t * self._field.rate) @ value
+            if wave.axes != BASE:
+                value = value @ R
+            total[_ROWS[wave.name]] += value
+        return total

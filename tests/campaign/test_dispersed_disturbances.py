@@ -1,0 +1,55 @@
+"""Dispersed constant torques and forces on the base, compared with their closed forms."""
+
+import numpy as np
+import pytest
+
+import fflin
+from tests.support.robots import free_body
+
+BODY = free_body((4.0, 5.0, 6.0))
+WAVE = {"amplitude": (0.0, 0.0, 0.02), "frequency": 0.3, "phase": 0.4}
+DURATION = 2.0
+ENGINES = ["python", pytest.param("compiled", marks=pytest.mark.compiled)]
+
+
+def campaign_of(robot, spreads, engine, runs=4, **options):
+    if engine == "compiled":
+        pytest.importorskip("numba")
+    options = {"duration": DURATION, "dt": 0.1} | options
+    return fflin.monte_carlo(robot, None, spreads, runs=runs, engine=engine, **options)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_drawn_force_displaces_the_body_by_half_its_acceleration_times_t_squared(
+    engine,
+):
+    robot = BODY.replace(disturbance={"F_b": (0.5, 0.0, -0.2)})
+    # The force is in inertial axes, so a spin of the body does not matter.
+    v0 = fflin.velocity(robot, {"omega_b.x": 0.4, "omega_b.y": -0.3})
+    campaign = campaign_of(robot, {"F_b.disturbance": 0.3}, engine, v0=v0)
+    assert campaign.names == tuple(f"F_b.{axis}.disturbance" for axis in "xyz")
+    force = campaign.drawn + np.array((0.5, 0.0, -0.2))
+    assert np.abs(campaign.drawn).min() > 1e-3
+    expected = 0.5 * force / robot.mass * DURATION**2
+    assert campaign.q[:, :3] == pytest.approx(expected, abs=1e-13)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_drawn_torque_adds_to_the_disturbance_of_the_robot(engine):
+    robot = BODY.replace(disturbance={"tau_b": [(0.01, 0.0, 0.0), WAVE]})
+    spreads = {"tau_b.x.disturbance": (0.02, 0.05), "base.mass": 0.1, "tau_b.gain": 0.1}
+    campaign = campaign_of(robot, spreads, engine)
+    at = campaign.names.index("tau_b.x.disturbance")
+    for run, drawn in enumerate(campaign.drawn[:, at].tolist()):
+        total = {"tau_b": [(0.01 + drawn, 0.0, 0.0), WAVE]}
+        alone = fflin.simulate(
+            BODY.replace(disturbance=total), duration=DURATION, dt=0.1, engine="python"
+        )
+        assert campaign.q[run] == pytest.approx(alone.q[-1], abs=1e-12)
+        motion = campaign.replay(run)
+        assert np.array_equal(motion.q[-1], campaign.q[run])
+
+
+def test_an_unknown_disturbance_is_refused():
+    with pytest.raises(fflin.UnknownNameError, match="disturbance to disperse"):
+        campaign_of(BODY, {"tau_c.disturbance": 0.3}, "python")
