@@ -168,6 +168,7 @@ def simulate(arguments: Namespace) -> Report:
     """
     from fflin.simulation.report import motion_record, motion_report
 
+    window = _window(arguments)
     robot = load_robot(arguments)
     show = arguments.show
     check_pictures(robot, arguments)
@@ -188,7 +189,20 @@ def simulate(arguments: Namespace) -> Report:
     if motion.stopped.startswith("interrupted"):
         interrupted = motion.stopped
     text = motion_report(motion)
-    return Report(robot.name, motion_record(motion), text, files, code, interrupted)
+    record = motion_record(motion)
+    if window is not None and not motion.stopped:
+        pointing = motion.pointing(window, accuracy=arguments.accuracy)
+        record["pointing"] = pointing
+        text += f"\n\n{pointing}"
+    return Report(robot.name, record, text, files, code, interrupted)
+
+
+def _window(arguments: Namespace) -> float | None:
+    """Return the window [s] of the pointing errors, or None."""
+    window: float | None = arguments.pointing
+    if window is None and arguments.accuracy is not None:
+        raise InputError("--accuracy needs --pointing WINDOW")
+    return window
 
 
 def montecarlo(arguments: Namespace) -> Report:
@@ -196,9 +210,11 @@ def montecarlo(arguments: Namespace) -> Report:
 
     example: fflin montecarlo ets_vii uncertain.toml --runs 1000 --plot runs.png
     """
+    from fflin.campaign.pointing import pointing_record
     from fflin.campaign.report import campaign_record, worst_runs
     from fflin.control.policy import BoundLaw, bound
 
+    window = _window(arguments)
     path = arguments.output_file
     is_table = path is not None and path.suffix in (".csv", ".mat")
     if is_table and path.exists() and not arguments.force:
@@ -235,6 +251,10 @@ def montecarlo(arguments: Namespace) -> Report:
     shown = [str(campaign), *(folded([note]) for note in notes)]
     text = "\n".join([*shown, *worst_runs(campaign, arguments.worst)])
     result = {**campaign_record(campaign, arguments.worst), "notes": notes}
+    if window is not None and not campaign.stopped.all():
+        errors = campaign.pointing(window, accuracy=arguments.accuracy)
+        result["pointing"] = pointing_record(errors)
+        text += f"\n\n{errors}"
     return Report(robot.name, result, text, files)
 
 

@@ -252,12 +252,14 @@ def margins(
         raise InputError(f"delay is {delay:g} s, expected at least 0")
     if sample is not None:
         sample = positive("sample", sample, "s")
-    law = _law_of(policy, lin, sample)
+    law = law_in_loop(policy, lin, sample)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        return _Closed(law, lin, delay, sample, at).margins()
+        return ClosedLoop(law, lin, delay, sample, at).margins()
 
 
-def _law_of(policy: Policy | Gain, lin: LinearModel, sample: float | None) -> System:
+def law_in_loop(
+    policy: Policy | Gain, lin: LinearModel, sample: float | None
+) -> System:
     """Return the linear law of a policy, sampled if it is continuous and `sample` [s] is given.
 
     Raise `InputError` if it does not fit the model.
@@ -291,7 +293,7 @@ def _law_of(policy: Policy | Gain, lin: LinearModel, sample: float | None) -> Sy
     return law
 
 
-class _Closed:
+class ClosedLoop:
     """Loop of a law and a model, with factors at the inputs or at the measured signals."""
 
     def __init__(
@@ -332,8 +334,12 @@ class _Closed:
             C = np.eye(len(model.A))[rows]
             D = np.zeros((len(rows), model.B.shape[1]))
         used = self.law.D.any(axis=0) | self.law.B.any(axis=0)
-        kept = _joined(model.A, model.B, C[used])
+        kept = self.kept_states(model, C[used])
         return System(model.A[np.ix_(kept, kept)], model.B[kept], C[:, kept], D)
+
+    def kept_states(self, model: LinearModel, C: Array) -> list[int]:
+        """Return the indices of the states of the plant; C is that of the used signals."""
+        return _joined(model.A, model.B, C)
 
     @property
     def is_continuous_plant(self) -> bool:

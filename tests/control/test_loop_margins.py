@@ -8,7 +8,7 @@ import pytest
 from scipy.linalg import expm
 
 import fflin
-from fflin.control.margins import _Closed, _law_of
+from fflin.control.margins import ClosedLoop, law_in_loop
 from fflin.control.optimal.disk import best_scaling, worst_perturbation
 from fflin.dynamics.delays import HeldSystem, split
 from tests.support.marks import exhaustive
@@ -23,7 +23,7 @@ def satellite(inputs=None, **fields):
 def loop_of(policy, lin, **how):
     """Return the loop whose margins are computed."""
     how = {"delay": 0.0, "sample": None, "at": "inputs", **how}
-    return _Closed(_law_of(policy, lin, how["sample"]), lin, *how.values())
+    return ClosedLoop(law_in_loop(policy, lin, how["sample"]), lin, *how.values())
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.03, 0.1, 0.1 + 1e-12, 0.17, 0.2, 0.33])
