@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from argparse import Namespace
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import fflin
 from fflin.base.errors import FileError, InputError
@@ -190,11 +190,35 @@ def simulate(arguments: Namespace) -> Report:
         interrupted = motion.stopped
     text = motion_report(motion)
     record = motion_record(motion)
+    record["margins"], line = _margins_of(policy, settings)
+    if line:
+        text += f"\n{folded([line])}"
     if window is not None and not motion.stopped:
         pointing = motion.pointing(window, accuracy=arguments.accuracy)
         record["pointing"] = pointing
         text += f"\n\n{pointing}"
     return Report(robot.name, record, text, files, code, interrupted)
+
+
+def _margins_of(policy: object, settings: Mapping[str, Any]) -> tuple[object, str]:
+    """Return the margins of the loop of a simulation for all inputs at once, and a line on them."""
+    from fflin.control.margins import margins_at_once
+    from fflin.control.policy import Policy
+
+    if not isinstance(policy, Policy) or policy.linear_law() is None:
+        return None, ""
+    delay = settings.get("delay") or 0.0
+    margins = margins_at_once(policy, delay, settings.get("sample"))
+    if margins is None:
+        return None, "margins of the linear loop: see fflin.margins(policy, lin)"
+    if not margins.disk:
+        return margins, "margins of the linear loop: none, because it is unstable"
+    low, high = margins.gain
+    line = (
+        f"margins of the linear loop, all inputs at once: gain {low:.3g} to {high:.3g}, phase "
+        f"{margins.phase:.3g} deg (disk margin {margins.disk:.3g})"
+    )
+    return margins, line
 
 
 def _window(arguments: Namespace) -> float | None:

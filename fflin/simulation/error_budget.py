@@ -405,7 +405,7 @@ class DisturbedLoop(ClosedLoop):
         delays = np.full(self.plant.B.shape[1], delay)
         self._delayed = self.with_delays(delays)
         self.F = self.closed(self._delayed)[0]
-        if not self._is_stable(self.F):
+        if not self.is_stable(self.F):
             raise InputError(
                 "the loop is unstable or does not control the attitude, so its errors are not "
                 "bounded; give a law that stabilises the attitude"
