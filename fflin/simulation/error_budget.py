@@ -269,7 +269,7 @@ def error_budget(
     >>> lin = fflin.linearize(fflin.load("planar_detumble"))
     >>> policy = fflin.StateFeedback(lin, fflin.lqr(lin).K)
     >>> budget = fflin.error_budget(policy, lin, disturbance={"tau_b.z": 1e-3})
-    >>> budget.total[2] > 0.0, float(budget.deviation[2])
+    >>> float(budget.total[2]) > 0.0, float(budget.deviation[2])
     (True, 0.0)
     """
     instance("lin", lin, LinearModel, "a fflin.LinearModel")
