@@ -86,7 +86,8 @@ CARDS = (
     *("Motion", "Check", "Modes", "Controllability", "Observability", "Equilibrium"),
     *("EffectiveMasses", "ReducedModel", "ToolModel", "ToolGain", "Trajectory"),
     *("LinearTrajectory", "Sensitivity", "Uncertain", "LFT", "LinearBatch", "Impact"),
-    *("GainBatch", "GainSchedule", "Campaign"),
+    *("GainBatch", "GainSchedule", "Campaign", "Pointing", "CampaignPointing"),
+    "ErrorBudget",
 )
 
 
