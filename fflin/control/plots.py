@@ -33,7 +33,7 @@ from fflin.control.gain import Gain, asymmetry
 from fflin.control.margins import ClosedLoop, Margins, closed_loop
 from fflin.control.optimal.channel_limits import channel_limits
 from fflin.control.optimal.disk import as_continuous
-from fflin.control.policy import Policy, as_policy
+from fflin.control.policy import Policy
 from fflin.linear.check import Check
 from fflin.linear.model import LinearModel
 
@@ -364,10 +364,15 @@ def plot_loops(
     >>> policy = fflin.StateFeedback(lin, gain.K)
     >>> figure = fflin.plot_loops(policy, "delayed.png", delay=0.1, sample=0.1)
     """
+    if not isinstance(policy, Gain | Policy):
+        raise InputError(
+            f"policy has type {type(policy).__name__}, expected a linear policy, such as a "
+            "StateFeedback, or a Gain, as from fflin.lqr"
+        )
     if isinstance(policy, Gain) and lin is None and not delay and sample is None:
         return _plot_gain(policy, path, axes)
     if lin is None:
-        lin = policy._lin if isinstance(policy, Gain) else as_policy(policy).model
+        lin = policy._lin if isinstance(policy, Gain) else policy.model
     if lin is None:
         raise InputError("the model of the law is not known; give lin=")
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):

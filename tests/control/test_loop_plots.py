@@ -7,6 +7,7 @@ import fflin
 from fflin.base.errors import InputError
 from fflin.control.margins import closed_loop, margins_at_once
 from fflin.control.plots import loop_responses
+from fflin.control.policy import FunctionPolicy
 from fflin.dynamics.delays import HeldSystem
 
 
@@ -91,7 +92,7 @@ def test_output_feedback_unstable_loops_and_laws_without_a_model(satellite):
     late = fflin.plot_loops(law, delay=15.0, sample=0.25)
     assert "unstable" in late.get_suptitle()
     with pytest.raises(InputError, match="lin="):
-        fflin.plot_loops(lambda t, q, v: np.zeros(3))
+        fflin.plot_loops(FunctionPolicy(lambda t, q, v: np.zeros(3)))
 
 
 @pytest.mark.parametrize("how", [(0.0, None), (0.2, 0.25)])
