@@ -144,7 +144,7 @@ COMMON = {
     "plan": "joint rpy position velocity target-joint target-rpy target-position target-velocity "
     "duration knots hold free-end r limits limit guess inputs output-file",
     "simulate": "joint rpy target-joint target-rpy trajectory weights q r sample mpc gain "
-    "schedule free limits duration inputs pointing output-file plot html",
+    "schedule free limits duration inputs output-file plot html",
     "sweep": "grid random seed range joint velocity inputs output frame engine workers output-file",
     "montecarlo": "runs seed until width confidence workers goal worst joint rpy trajectory gain "
     "schedule duration inputs pointing output-file plot",
