@@ -80,11 +80,13 @@ _PUBLIC = {
         "simulation.simulate": "simulate",
         "simulation.motion": "Motion",
         "simulation.pointing": "Pointing PointingError",
+        "simulation.error_budget": "error_budget ErrorBudget Contribution",
         "view.visualize": "visualize",
     },
     "Campaigns": {
         "campaign.monte_carlo": "monte_carlo",
         "campaign.campaign": "Campaign",
+        "campaign.pointing": "CampaignPointing",
         "campaign.spreads": "load_dispersions",
         "campaign.funnel": "funnel Funnel",
         "campaign.validity": "validity Validity",

@@ -128,11 +128,15 @@ from fflin.simulation.simulate import simulate as simulate
 from fflin.simulation.motion import Motion as Motion
 from fflin.simulation.pointing import Pointing as Pointing
 from fflin.simulation.pointing import PointingError as PointingError
+from fflin.simulation.error_budget import error_budget as error_budget
+from fflin.simulation.error_budget import ErrorBudget as ErrorBudget
+from fflin.simulation.error_budget import Contribution as Contribution
 from fflin.view.visualize import visualize as visualize
 
 # Campaigns
 from fflin.campaign.monte_carlo import monte_carlo as monte_carlo
 from fflin.campaign.campaign import Campaign as Campaign
+from fflin.campaign.pointing import CampaignPointing as CampaignPointing
 from fflin.campaign.spreads import load_dispersions as load_dispersions
 from fflin.campaign.funnel import funnel as funnel
 from fflin.campaign.funnel import Funnel as Funnel

@@ -58,7 +58,10 @@ def results_of(robot):
     batch = fflin.sweep(robot, np.tile(robot.neutral(), (3, 1)))
     runs = {"runs": 3, "duration": 0.2, "goals": ["attitude < 1 deg"]}
     jammed = fflin.jam(robot, robot.joint_names[0])
+    campaign = fflin.monte_carlo(robot, policy, {"q_b": 0.02}, **runs)
     objects = [
+        *(campaign.pointing(0.05), motion.pointing(0.1)),
+        fflin.error_budget(gain, lin, disturbance={"tau_b.x": 1e-3}),
         *(robot, lin, sampled, gain, estimator, compensator, policy, motion),
         *(fflin.check(robot, lin), fflin.modes(sprung), fflin.modes(sprung).modes[0]),
         *(fflin.controllability(lin), fflin.observability(lin)),
@@ -68,7 +71,7 @@ def results_of(robot):
         *(fflin.sensitivity(lin), uncertain, uncertain.lft(), batch, jammed),
         *(fflin.lqr_batch(batch, 1.0, 1.0), fflin.Allocation(policy, robot)),
         *(fflin.tvlqr(along), lin.certificate),
-        fflin.monte_carlo(robot, policy, {"q_b": 0.02}, **runs),
+        campaign,
     ]
     return {type(one).__name__: one for one in objects}
 
@@ -83,7 +86,8 @@ CARDS = (
     *("Motion", "Check", "Modes", "Controllability", "Observability", "Equilibrium"),
     *("EffectiveMasses", "ReducedModel", "ToolModel", "ToolGain", "Trajectory"),
     *("LinearTrajectory", "Sensitivity", "Uncertain", "LFT", "LinearBatch", "Impact"),
-    *("GainBatch", "GainSchedule", "Campaign"),
+    *("GainBatch", "GainSchedule", "Campaign", "Pointing", "CampaignPointing"),
+    "ErrorBudget",
 )
 
 

@@ -47,6 +47,9 @@ RESULTS = {
     "ToolTrajectory",
     "Pointing",
     "PointingError",
+    "CampaignPointing",
+    "ErrorBudget",
+    "Contribution",
     "Margins",
     "ChannelMargins",
     *(

@@ -29,6 +29,7 @@ from fflin.base.validation import (
 )
 from fflin.base.writing import as_path, write_atomically
 from fflin.batch.files import read_rows, write_rows
+from fflin.campaign.pointing import campaign_pointing
 from fflin.campaign.report import campaign_card, campaign_report
 from fflin.campaign.runs import KINDS, MODES, WHEEL_SPEEDS, kind_named
 from fflin.campaign.spreads import SEED
@@ -52,6 +53,7 @@ _FACTORS = {  # {(unit in a condition, unit of the figure): conversion factor}
     ("deg", "rad"): _DEGREE,
     ("rad", "deg"): 1.0 / _DEGREE,
     ("deg/s", "rad/s"): _DEGREE,
+    ("arcsec", "deg"): 1.0 / 3600.0,
     ("mm", "m"): 1e-3,
     ("mm/s", "m/s"): 1e-3,
 }
@@ -441,17 +443,10 @@ class Campaign(FrozenArrays):
             If the motion does not end at the recorded q and v, because the policy or an option
             differs.
         """
-        at = whole("run", run, 0, len(self) - 1)
-        job = self._job
-        if job is None and robot is None:
-            raise InputError(
-                "the campaign was loaded from a file, which does not contain its robot and policy; "
-                "give them, as in replay(0, robot=robot, policy=policy)"
-            )
-        if job is None or robot is not None:
-            from fflin.campaign.replay import job_of
+        from fflin.campaign.replay import job_of_campaign
 
-            job = job_of(self, robot, policy, options)
+        at = whole("run", run, 0, len(self) - 1)
+        job = job_of_campaign(self, robot, policy, options)
         motion = job.replay(np.array(self.drawn[at]))
         missed = max(
             float(np.abs(motion.q[-1] - self.q[at]).max()),
@@ -469,6 +464,8 @@ class Campaign(FrozenArrays):
             worst = f", worst {self.about.removeprefix('worst ')}"
         about = f"run {at} of {len(self)}{worst}, seed {self.seed}, {motion._about}"
         return replace(motion, _about=about)
+
+    pointing = campaign_pointing
 
     def save(self, path: str | Path) -> None:
         """Save the campaign to a .npz, .h5, .csv or .mat file, atomically.

@@ -56,6 +56,23 @@ def _plain(value: object) -> object:
     return value
 
 
+def job_of_campaign(
+    campaign: Campaign,
+    robot: Robot | None,
+    policy: object,
+    options: Mapping[str, object],
+) -> CampaignJob:
+    """Return the job that repeats the runs of a campaign; see `Campaign.replay`."""
+    if robot is not None:
+        return job_of(campaign, robot, policy, options)
+    if campaign._job is None:
+        raise InputError(
+            "the campaign was loaded from a file, which does not contain its robot and policy; "
+            "give them, as in replay(0, robot=robot, policy=policy)"
+        )
+    return campaign._job
+
+
 def job_of(
     campaign: Campaign, robot: object, policy: object, options: Mapping[str, object]
 ) -> CampaignJob:

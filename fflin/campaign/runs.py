@@ -6,7 +6,7 @@ of the statistics does not depend on the duration of the run.
 """
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import replace
 from functools import partial
@@ -371,6 +371,18 @@ class CampaignJob:
         else:
             run = lanes.recorded(self.plan, self.dispersions.in_lanes(drawn[None]))
         return replace(motion_of(plan, run), _nominal=self.plant.robot.urdf_sha256)
+
+    def replays(self, drawn: Array) -> Iterator[Motion]:
+        """Repeat runs with drawn values (N, k), eight at a time in compiled code."""
+        if self.engine == "python":
+            yield from map(self.replay, drawn)
+            return
+        for first in range(0, len(drawn), LANES):
+            eight = drawn[first : first + LANES]
+            values = self.dispersions.in_lanes(eight)
+            recordings = lanes.recorded_runs(self.plan, values, len(eight))
+            for row, run in zip(eight, recordings, strict=True):
+                yield motion_of(self.plan_of(row), run)
 
 
 class RunStatistics(lanes.Statistics):

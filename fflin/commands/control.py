@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from argparse import Namespace
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import fflin
 from fflin.base.errors import FileError, InputError
@@ -168,6 +168,7 @@ def simulate(arguments: Namespace) -> Report:
     """
     from fflin.simulation.report import motion_record, motion_report
 
+    window = _window(arguments)
     robot = load_robot(arguments)
     show = arguments.show
     check_pictures(robot, arguments)
@@ -188,7 +189,44 @@ def simulate(arguments: Namespace) -> Report:
     if motion.stopped.startswith("interrupted"):
         interrupted = motion.stopped
     text = motion_report(motion)
-    return Report(robot.name, motion_record(motion), text, files, code, interrupted)
+    record = motion_record(motion)
+    record["margins"], line = _margins_of(policy, settings)
+    if line:
+        text += f"\n{folded([line])}"
+    if window is not None and not motion.stopped:
+        pointing = motion.pointing(window, accuracy=arguments.accuracy)
+        record["pointing"] = pointing
+        text += f"\n\n{pointing}"
+    return Report(robot.name, record, text, files, code, interrupted)
+
+
+def _margins_of(policy: object, settings: Mapping[str, Any]) -> tuple[object, str]:
+    """Return the margins of the loop of a simulation for all inputs at once, and a line on them."""
+    from fflin.control.margins import margins_at_once
+    from fflin.control.policy import Policy
+
+    if not isinstance(policy, Policy) or policy.linear_law() is None:
+        return None, ""
+    delay = settings.get("delay") or 0.0
+    margins = margins_at_once(policy, delay, settings.get("sample"))
+    if margins is None:
+        return None, "margins of the linear loop: see fflin.margins(policy, lin)"
+    if not margins.disk:
+        return margins, "margins of the linear loop: none, because it is unstable"
+    low, high = margins.gain
+    line = (
+        f"margins of the linear loop, all inputs at once: gain {low:.3g} to {high:.3g}, phase "
+        f"{margins.phase:.3g} deg (disk margin {margins.disk:.3g})"
+    )
+    return margins, line
+
+
+def _window(arguments: Namespace) -> float | None:
+    """Return the window [s] of the pointing errors, or None."""
+    window: float | None = arguments.pointing
+    if window is None and arguments.accuracy is not None:
+        raise InputError("--accuracy needs --pointing WINDOW")
+    return window
 
 
 def montecarlo(arguments: Namespace) -> Report:
@@ -196,9 +234,11 @@ def montecarlo(arguments: Namespace) -> Report:
 
     example: fflin montecarlo ets_vii uncertain.toml --runs 1000 --plot runs.png
     """
+    from fflin.campaign.pointing import pointing_record
     from fflin.campaign.report import campaign_record, worst_runs
     from fflin.control.policy import BoundLaw, bound
 
+    window = _window(arguments)
     path = arguments.output_file
     is_table = path is not None and path.suffix in (".csv", ".mat")
     if is_table and path.exists() and not arguments.force:
@@ -235,6 +275,10 @@ def montecarlo(arguments: Namespace) -> Report:
     shown = [str(campaign), *(folded([note]) for note in notes)]
     text = "\n".join([*shown, *worst_runs(campaign, arguments.worst)])
     result = {**campaign_record(campaign, arguments.worst), "notes": notes}
+    if window is not None and not campaign.stopped.all():
+        errors = campaign.pointing(window, accuracy=arguments.accuracy)
+        result["pointing"] = pointing_record(errors)
+        text += f"\n\n{errors}"
     return Report(robot.name, result, text, files)
 
 

@@ -429,7 +429,7 @@ def equilibrium(arguments: Namespace) -> Report:
         title = "u against the constant disturbance too"
         try:
             disturbed = fflin.equilibrium(
-                robot, q, v=v, tilt=may_tilt(arguments), disturbed=True, **axes
+                robot, q, v=v, tilt=may_tilt(robot, arguments), disturbed=True, **axes
             )
             names, units = disturbed.input_names, disturbed.input_units
             lines.append(signals(title, disturbed.u, names, units))

@@ -93,6 +93,7 @@ OPTIONS: dict[str, dict[str, str]] = {
     "simulate": {
         **_LOOP,
         SIMULATION: f"{_LOOP[SIMULATION]} every engine",
+        "pointing errors": "pointing accuracy",
         OUTPUT: f"plot show output-file html {_PICTURES}",
     },
     "export": {"": "FILE", OUTPUT: "output-folder robot limits name real"},
@@ -108,6 +109,7 @@ OPTIONS: dict[str, dict[str, str]] = {
         **_LOOP,
         "": "ROBOT DISPERSIONS",
         "runs": "runs seed until width confidence workers threads",
+        "pointing errors": "pointing accuracy",
         OUTPUT: f"goal worst plot output-file force html {_PICTURES}",
     },
 }
@@ -145,7 +147,7 @@ COMMON = {
     "schedule free limits duration inputs output-file plot html",
     "sweep": "grid random seed range joint velocity inputs output frame engine workers output-file",
     "montecarlo": "runs seed until width confidence workers goal worst joint rpy trajectory gain "
-    "schedule duration inputs output-file plot",
+    "schedule duration inputs pointing output-file plot",
 }
 
 _SATURATION = (
@@ -323,6 +325,8 @@ ABOUT: dict[str, str] = {
     "worst": "list the K worst runs",
     "force": "replace the file of -o, whatever it contains. Without --force, -o replaces only a "
     "file that contains a result of the same kind",
+    "pointing": "report pointing errors as in ECSS-E-ST-60-10C, for windows of this length [s]",
+    "accuracy": "angle [deg] for the settling time of --pointing",
     "json": "print the results as one JSON object",
     # Options of one command.
     "init output-file": "save the robot file (by default the URDF's name with .toml, in the "

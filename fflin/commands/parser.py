@@ -249,6 +249,8 @@ FORMS: dict[str, Form] = {
     "step": _TIME,
     "sample": _TIME,
     "duration": one(number, "T"),
+    "pointing": one(number, "WINDOW"),
+    "accuracy": one(number, "X"),
     "delay": one(number, "T", 0.0),
     "times": one(number, "T", nargs="+"),
     "attitude": one(number, "X", 90.0),

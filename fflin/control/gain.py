@@ -19,8 +19,14 @@ from fflin.base.record import Design
 from fflin.base.tables import cut, folded, grid, matrix, signals
 from fflin.base.validation import Array, Mask, Poles, Values, Vector
 from fflin.control.delayed import is_delayed, law_with_memory
-from fflin.control.optimal.disk import Loop, as_continuous, disk_gain, disk_phase
-from fflin.control.optimal.largest_gain import gain_crossings, largest_gain
+from fflin.control.optimal.disk import (
+    Loop,
+    as_continuous,
+    disk_gain,
+    disk_phase,
+    largest_scaled_gain,
+)
+from fflin.control.optimal.largest_gain import gain_crossings
 from fflin.control.optimal.riccati import Solution, rates_of
 from fflin.control.policy import Policy, System
 from fflin.dynamics.coordinates import frame_of
@@ -389,7 +395,8 @@ class Gain(ModelDesign):
     @cached_property
     def margins(self) -> Margins:
         """Gain and phase margins at the inputs, computed at first access."""
-        disk = min(1.0 / largest_gain(*asymmetry(self))[0], 2.0)
+        largest, *_ = largest_scaled_gain(asymmetry(self))
+        disk = min(1.0 / largest, 2.0)
         return Margins(disk, disk_gain(disk), disk_phase(disk))
 
 
@@ -676,8 +683,9 @@ def asymmetry(gain: Gain) -> Loop:
     """Return the loop from changes of the inputs to (S - T)/2, in continuous time.
 
     S and T are the sensitivity and the complementary sensitivity at the inputs, which are scaled by
-    sqrt(R_ii). The largest gain of the loop is the inverse of the disk margin. See Seiler, Packard
-    and Gahinet, IEEE Control Systems 40(5), 2020.
+    sqrt(R_ii). The inverse of the largest gain of the loop is a lower bound of the disk margin.
+    With the best scaling for each frequency, it is the disk margin. See Seiler, Packard and
+    Gahinet, IEEE Control Systems 40(5), 2020.
     """
     S = _regulated(gain)
     scale = np.sqrt(gain.R.diagonal())

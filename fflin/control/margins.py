@@ -23,6 +23,7 @@ from fflin.base.validation import (
 )
 from fflin.control.delayed import law_with_memory
 from fflin.control.gain import Gain
+from fflin.control.gain import Margins as GainMargins
 from fflin.control.optimal.channel_limits import (
     Crossing,
     channel_limits,
@@ -34,6 +35,7 @@ from fflin.control.optimal.disk import (
     as_continuous,
     disk_gain,
     disk_phase,
+    largest_scaled_gain,
     largest_structured_gain,
 )
 from fflin.control.optimal.largest_gain import largest_gain
@@ -56,6 +58,9 @@ _ROUNDING = 1e-9
 _FRACTIONS = 10
 _LONGEST = 40
 _MOST_SAMPLES = 500
+
+# The report of a simulation contains no margins if the loop has more states than this.
+_MOST_STATES = 250
 
 # Number of frequencies of the grid on which a continuous loop with a delay is examined.
 _GRID = 600
@@ -245,20 +250,60 @@ def margins(
     >>> slow.disk < fflin.margins(policy, lin).disk
     True
     """
-    instance("lin", lin, LinearModel, "a fflin.LinearModel")
     if not isinstance(at, str) or at not in ("inputs", "outputs"):
         raise InputError(f"at is {at!r}, expected 'inputs' or 'outputs'")
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        return closed_loop(policy, lin, delay, sample, at).margins()
+
+
+def closed_loop(
+    policy: Policy | Gain,
+    lin: LinearModel,
+    delay: float,
+    sample: float | None,
+    at: Place = "inputs",
+) -> ClosedLoop:
+    """Return the loop of a linear policy and a model; the arguments are those of `margins`."""
+    instance("lin", lin, LinearModel, "a fflin.LinearModel")
     delay = number("delay", delay)
     if delay < 0.0:
         raise InputError(f"delay is {delay:g} s, expected at least 0")
     if sample is not None:
         sample = positive("sample", sample, "s")
-    law = _law_of(policy, lin, sample)
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        return _Closed(law, lin, delay, sample, at).margins()
+    return ClosedLoop(law_in_loop(policy, lin, sample), lin, delay, sample, at)
 
 
-def _law_of(policy: Policy | Gain, lin: LinearModel, sample: float | None) -> System:
+@in_one_thread
+def margins_at_once(
+    policy: Policy, delay: float, sample: float | None
+) -> GainMargins | None:
+    """Return the margins of a policy and its model for changes of all inputs at once.
+
+    The disk margin of an unstable loop is 0. The result is None if the policy is not linear about a
+    point, if its loop has no margins, or if the loop has so many states that the computation would
+    take long.
+    """
+    lin = policy.model
+    if lin is None or policy.followed_trajectory is not None:
+        return None
+    try:
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            closed = closed_loop(policy, lin, delay, sample)
+            loop = closed.loop()
+            if len(loop[0]) > _MOST_STATES:
+                return None
+            disk = 0.0
+            if closed.is_stable(loop[0]):
+                largest, *_ = largest_scaled_gain(as_continuous(*loop, closed.dt))
+                disk = min(1.0 / largest, 2.0)
+    except (InputError, np.linalg.LinAlgError):
+        return None
+    return GainMargins(disk, disk_gain(disk), disk_phase(disk))
+
+
+def law_in_loop(
+    policy: Policy | Gain, lin: LinearModel, sample: float | None
+) -> System:
     """Return the linear law of a policy, sampled if it is continuous and `sample` [s] is given.
 
     Raise `InputError` if it does not fit the model.
@@ -295,7 +340,7 @@ def _law_of(policy: Policy | Gain, lin: LinearModel, sample: float | None) -> Sy
     return law
 
 
-class _Closed:
+class ClosedLoop:
     """Loop of a law and a model, with factors at the inputs or at the measured signals."""
 
     def __init__(
@@ -336,8 +381,12 @@ class _Closed:
             C = np.eye(len(model.A))[rows]
             D = np.zeros((len(rows), model.B.shape[1]))
         used = self.law.D.any(axis=0) | self.law.B.any(axis=0)
-        kept = _joined(model.A, model.B, C[used])
+        kept = self.kept_states(model, C[used])
         return System(model.A[np.ix_(kept, kept)], model.B[kept], C[:, kept], D)
+
+    def kept_states(self, model: LinearModel, C: Array) -> list[int]:
+        """Return the indices of the states of the plant; C is that of the used signals."""
+        return _joined(model.A, model.B, C)
 
     @property
     def is_continuous_plant(self) -> bool:
@@ -391,18 +440,29 @@ class _Closed:
         half = 0.5 * np.eye(len(kept))
         return F, G[:, kept], H[kept], J[np.ix_(kept, kept)] + half
 
-    def margins(self) -> Margins:
-        """Return the margins of all channels."""
+    @property
+    def delays(self) -> Array:
+        """Delays (nu,) [s] of the inputs."""
         delays = np.full(self.plant.B.shape[1], self.delay)
         if self.is_continuous_plant:
             delays += self.lin.delay
-        loop = self.closed(self.with_delays(delays))
+        return delays
+
+    def loop(self) -> tuple[Array, Array, Array, Array]:
+        """Return F, G, H and J of `closed`, with the delay."""
+        loop = self.closed(self.with_delays(self.delays))
         if not all(np.isfinite(matrix).all() for matrix in loop):
             raise InputError(
                 "the response of the loop overflows; give smaller gains, a shorter sample time or "
                 "a shorter delay"
             )
-        if not self._is_stable(loop[0]):
+        return loop
+
+    def margins(self) -> Margins:
+        """Return the margins of all channels."""
+        delays = self.delays
+        loop = self.loop()
+        if not self.is_stable(loop[0]):
             count = len(self.channels)
             return Margins(
                 disk=0.0,
@@ -445,7 +505,7 @@ class _Closed:
             delay=float(delays.max(initial=0.0)),
         )
 
-    def _own_rates(self) -> Array:
+    def own_rates(self) -> Array:
         """Return the magnitudes [rad/s] of the poles of the continuous loop without a delay."""
         rates: Array = np.abs(np.linalg.eigvals(self.closed(self.plant)[0]))
         return rates
@@ -458,17 +518,17 @@ class _Closed:
         """
         if self.dt or not self.delay:
             return np.zeros(0)
-        rates = self._own_rates()
+        rates = self.own_rates()
         rates = rates[rates > 0.0]
         return np.geomspace(0.01 * rates.min(), 100.0 * rates.max(), _GRID)
 
-    def _is_stable(self, F: Array) -> bool:
+    def is_stable(self, F: Array) -> bool:
         """Return whether the loop is stable, by more than rounding errors."""
         poles = np.linalg.eigvals(F)
         if self.dt:
             return bool(np.abs(poles).max(initial=0.0) < 1.0 - _ROUNDING)
         # The poles of the approximation of a short delay are fast, and are no scale for others.
-        largest = self._own_rates().max(initial=0.0)
+        largest = self.own_rates().max(initial=0.0)
         return bool(poles.real.max(initial=-np.inf) < -_ROUNDING * largest)
 
     def _frequency(self, w: float) -> float:

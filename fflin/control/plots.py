@@ -28,6 +28,7 @@ from fflin.base.pole_grid import (
     oscillates,
     spaced,
 )
+from fflin.base.process import in_one_thread
 from fflin.base.tables import counted, rounding
 from fflin.base.validation import (
     Array,
@@ -38,7 +39,10 @@ from fflin.base.validation import (
     refuse_masked,
 )
 from fflin.control.gain import Gain, asymmetry
+from fflin.control.margins import ClosedLoop, Margins, closed_loop
 from fflin.control.optimal.channel_limits import channel_limits
+from fflin.control.optimal.disk import as_continuous
+from fflin.control.policy import Policy
 from fflin.linear.check import Check
 from fflin.linear.model import LinearModel
 
@@ -57,6 +61,15 @@ _GRID_TEXT: dict[str, Any] = {
 _LABEL_SIZE = (0.075, 0.055)
 
 _POINTS = 400
+
+# Discrete-time poles z below this magnitude are those of delays, and no rates.
+_DEADBEAT = 1e-6
+
+# Rates below this fraction of the largest frequency are rounding errors.
+_SLOWEST = 1e-9
+
+# Largest loop gain of a Nichols plot [dB].
+_DECIBELS = 60.0
 
 # Vertical offset of the plotted points of each test. Without it, the points of two independent
 # computations would overlap.
@@ -328,15 +341,32 @@ def plot_poles(
 
 
 def plot_loops(
-    gain: Gain, path: str | Path | None = None, *, axes: Axes | None = None
+    policy: Policy | Gain,
+    path: str | Path | None = None,
+    *,
+    lin: LinearModel | None = None,
+    delay: float = 0.0,
+    sample: float | None = None,
+    axes: Axes | None = None,
 ) -> Figure:
-    """Plot the loop gain at each input with the other loops closed: Bode plot, margins and poles.
+    """Plot the loop gain at each input with the other loops closed, and its margins.
+
+    For a gain alone, the figure contains a Bode plot and the poles. For a policy, or if `lin`,
+    `delay` or `sample` is given, it contains a Bode plot, a Nichols plot and the sensitivity of the
+    loop with the exact sampled plant, as `margins` uses it.
 
     Parameters
     ----------
-    gain : Gain
+    policy : Policy or Gain
+        Linear law about a point, as for `margins`.
     path : str or Path, optional
         File to write, .png, .pdf or .svg. See `plot_motion` for possible errors.
+    lin : LinearModel, optional
+        Model with which the loop is closed: by default the model for which the law was designed.
+    delay : float, optional
+        Delay [s] of all inputs.
+    sample : float, optional
+        Sampling time [s] with which a continuous law is executed.
     axes : matplotlib.axes.Axes, optional
         Axes of a grid, as of ``pyplot.subplots``, in whose place the figure is drawn.
 
@@ -344,12 +374,127 @@ def plot_loops(
     -------
     matplotlib.figure.Figure
 
+    Raises
+    ------
+    InputError
+        If the policy is not linear about a point, or its model is not known.
+
     Examples
     --------
     >>> lin = fflin.linearize(fflin.load("planar_detumble"))
-    >>> figure = fflin.plot_loops(fflin.lqr(lin), "loops.png")
+    >>> gain = fflin.lqr(lin)
+    >>> figure = fflin.plot_loops(gain, "loops.png")
+    >>> policy = fflin.StateFeedback(lin, gain.K)
+    >>> figure = fflin.plot_loops(policy, "delayed.png", delay=0.1, sample=0.1)
     """
-    instance("gain", gain, Gain, "a Gain, as from fflin.lqr")
+    if not isinstance(policy, Gain | Policy):
+        raise InputError(
+            f"policy has type {type(policy).__name__}, expected a linear policy, such as a "
+            "StateFeedback, or a Gain, as from fflin.lqr"
+        )
+    if isinstance(policy, Gain) and lin is None and not delay and sample is None:
+        return _plot_gain(policy, path, axes)
+    if lin is None:
+        lin = policy._lin if isinstance(policy, Gain) else policy.model
+    if lin is None:
+        raise InputError("the model of the law is not known; give lin=")
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        closed = closed_loop(policy, lin, delay, sample)
+        w, response = loop_responses(closed)
+        margins = in_one_thread(closed.margins)()
+    return _plot_closed(closed, margins, w, response, path, axes)
+
+
+def loop_responses(closed: ClosedLoop) -> tuple[Array, Values]:
+    """Return frequencies (k,) [rad/s], and the loop gains (k, n) of the channels of a loop."""
+    loop = closed.loop()
+    if not closed.dt:
+        rates = closed.own_rates()
+        end = 100.0 * float(rates.max())
+    else:
+        poles = np.linalg.eigvals(loop[0])
+        rates = np.abs(np.log(poles[np.abs(poles) > _DEADBEAT])) / closed.dt
+        end = math.pi / closed.dt
+    rates = rates[rates > _SLOWEST * end]
+    start = 0.01 * min(float(rates.min(initial=end)), end)
+    w = np.geomspace(start, end, _POINTS)
+    system = as_continuous(*loop, closed.dt)
+    # The bilinear map of a sampled loop warps its frequencies.
+    warped = np.tan(0.5 * w * closed.dt) if closed.dt else w
+    halves = np.array([np.diag(system.at(at)) for at in warped.tolist()])
+    # Each entry is (S - T)/2 of one channel, S = 1/(1 + L) and T = L/(1 + L).
+    return w, (0.5 - halves) / (0.5 + halves)
+
+
+def _plot_closed(
+    closed: ClosedLoop,
+    margins: Margins,
+    w: Array,
+    response: Values,
+    path: str | Path | None,
+    axes: Axes | None,
+) -> Figure:
+    """Draw the Bode plot, the Nichols plot and the sensitivity of a loop."""
+    names = list(closed.names)
+    if margins.stable:
+        names = [
+            f"{one.name}: {one.phase:.0f} deg, {one.gain[0]:.2g} to {one.gain[1]:.3g}, "
+            f"delay {one.delay:.2g} s"
+            for one in margins.channels
+        ]
+    with drawing(path, 12.0, 8.5, axes=axes) as figure:
+        (sizes, nichols), (phases, sensitivity) = figure.subplots(2, 2)
+        _bode(sizes, phases, w, response)
+        colors = cycle(response.shape[1])
+        for panel in (nichols, sensitivity):
+            panel.set_prop_cycle(color=colors)
+        decibels = 20.0 * np.log10(np.abs(response))
+        angles = np.column_stack([_phase(values) for values in response.T])
+        nichols.plot(angles, decibels, lw=1.0)
+        turns = np.arange(math.floor(angles.min() / 360.0), 1)
+        critical = 360.0 * turns + 180.0
+        critical = critical[critical < max(angles.max(), 0.0)]
+        nichols.plot(critical, np.zeros(len(critical)), "+", color=_LINE, ms=10)
+        nichols.set(title="Nichols plot", xlabel="phase [deg]", ylabel="|L| [dB]")
+        nichols.set_ylim(-_DECIBELS, _DECIBELS)
+        size = np.abs(1.0 / (1.0 + response))
+        sensitivity.semilogx(w, 20.0 * np.log10(size), lw=1.0)
+        sensitivity.axhline(0.0, color=_LINE, lw=0.8)
+        sensitivity.set(
+            title="sensitivity 1/(1 + L)",
+            xlabel="frequency [rad/s]",
+            ylabel="[dB]",
+            xlim=(w[0], w[-1]),
+        )
+        figure.legend(
+            sizes.get_lines()[: len(names)],
+            names,
+            title="margins at each input: phase, gain factors, delay",
+            loc="outside lower center",
+            ncols=2,
+            fontsize=letters_of(1.3 * len(names), 200.0),
+        )
+        time = f", sampled at {closed.dt:g} s" if closed.dt else ""
+        if closed.delay:
+            time += f", delay {closed.delay:g} s"
+        together = "the loop is unstable"
+        if margins.stable:
+            low, high = margins.gain
+            together = (
+                f"margins for simultaneous changes: phase {margins.phase:.3g} deg, gain {low:.2g} "
+                f"to {high:.3g} (disk margin {margins.disk:.3g})"
+            )
+        figure.suptitle(
+            f"{margins.robot}{time}: open loop at each input, with the loops of all other inputs "
+            f"closed\n{together}",
+            x=0.02,
+            ha="left",
+        )
+    return figure
+
+
+def _plot_gain(gain: Gain, path: str | Path | None, axes: Axes | None) -> Figure:
+    """Draw the Bode plot and the poles of a gain."""
     tall = max(8.5, 1.5 + 0.12 * len(gain.K))
     with drawing(path, 11.0, tall, axes=axes) as figure:
         w, response, loops = input_loops(gain)
@@ -427,11 +572,7 @@ def _bode(sizes: Axes, phases: Axes, w: Array, response: Values) -> None:
     sizes.set_prop_cycle(color=colors)
     sizes.loglog(w, np.abs(response), lw=1.0)
     for color, values in zip(colors, response.T, strict=True):
-        angle = np.degrees(np.unwrap(np.angle(values)))
-        # Shift the curve by full turns, so that it ends between -360 deg and 0.
-        turns = math.ceil(angle[-1] / 360.0)
-        angle -= 360.0 * turns
-        phases.semilogx(w, angle, color=color, lw=1.0)
+        phases.semilogx(w, _phase(values), color=color, lw=1.0)
     sizes.axhline(1.0, color=_LINE, lw=0.8)
     phases.axhline(-180.0, color=_LINE, lw=0.8)
     phases.locator_params("y", nbins=6, steps=[1, 1.5, 3, 4.5, 6, 9, 10])
@@ -439,6 +580,13 @@ def _bode(sizes: Axes, phases: Axes, w: Array, response: Values) -> None:
     phases.set(title="loop phase", ylabel="[deg]")
     for axes in (sizes, phases):
         axes.set(xlabel="frequency [rad/s]", xlim=(w[0], w[-1]))
+
+
+def _phase(values: Values) -> Array:
+    """Return the continuous phase [deg] of a response, which ends between -360 deg and 0."""
+    angle = np.degrees(np.unwrap(np.angle(values)))
+    turns = math.ceil(angle[-1] / 360.0)
+    return np.asarray(angle - 360.0 * turns)
 
 
 def _pole_map(axes: Axes, sets: dict[str, Values], dt: float) -> None:

@@ -206,8 +206,8 @@ class Trajectory(Design):
         # The product of two unit quaternions is the cosine of half the angle between them.
         cosine = np.minimum(1.0, np.abs(q[:, 3:7] @ q[0, 3:7]))
         angle = 2.0 * np.degrees(np.arccos(cosine))
-        revolute = dict[str, Array]()
-        prismatic = dict[str, Array]()
+        revolute: dict[str, Array] = {}
+        prismatic: dict[str, Array] = {}
         for joint in robot.joints:
             if joint.mode:
                 continue

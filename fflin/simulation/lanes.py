@@ -429,10 +429,28 @@ class LaneRows(Statistics):
         self.kept[begin : begin + len(rows)] = rows[..., 0]
 
 
+class RowsOfRuns(Statistics):
+    """Recorded rows of eight runs, with the columns that `LaneLoop` describes."""
+
+    def __init__(self, times: Times, width: int) -> None:
+        self.every = times.every
+        self._rows = np.zeros((times.rows, width, LANES))
+
+    def add(self, first: int, rows: Array) -> None:
+        """Store rows; see `Statistics`."""
+        begin = -(-first // self.every)
+        self._rows[begin : begin + len(rows)] = rows
+
+    def outcome(self, done: int, stop: Array) -> dict[str, Array]:
+        """Return the rows of all runs, and the number of their steps."""
+        return {
+            "done": np.full(LANES, float(done)),
+            "kept": np.moveaxis(self._rows, -1, 0),
+        }
+
+
 def recorded(plan: Plan, runs: Runs | None = None) -> Recording:
     """Simulate a plan with the compiled loop; `runs` contains the values of one dispersed run."""
-    every = plan.times.every
-    dt = plan.times.dt
     # A replayed run of a campaign is computed with the machine code of the campaign.
     loop = LaneLoop(plan, runs, lanes=LANES if runs else 1)
     rows = LaneRows(plan.times, loop.width)
@@ -441,18 +459,42 @@ def recorded(plan: Plan, runs: Runs | None = None) -> Recording:
     except KeyboardInterrupt:
         if not loop.done:
             raise
-        stopped = f"interrupted at t = {loop.done * dt:g} s"
+        stopped = f"interrupted at t = {loop.done * plan.times.dt:g} s"
     if runs is None and not np.isfinite(loop.parts.method.u).all():
         # the Python engine raises an error that names the invalid command
         return go(plan)
-    count = -(-loop.done // every)
-    t = np.append(every * np.arange(count) * dt, loop.done * dt)
+    return _recording(plan, loop, rows.kept, loop.done, stopped)
+
+
+def recorded_runs(plan: Plan, runs: Runs, count: int) -> list[Recording]:
+    """Simulate up to eight dispersed runs with the compiled loop.
+
+    `runs` contains their values, with one row for each of the `count` runs.
+    """
+    loop = LaneLoop(plan, runs)
+    rows = RowsOfRuns(plan.times, loop.width)
+    out = {
+        "done": np.zeros(count),
+        "kept": np.zeros((count, plan.times.rows, loop.width)),
+    }
+    reasons = loop.fly(rows, out, runs)
+    return [
+        _recording(plan, loop, kept, int(done), reason)
+        for kept, done, reason in zip(out["kept"], out["done"], reasons, strict=True)
+    ]
+
+
+def _recording(
+    plan: Plan, loop: LaneLoop, kept: Array, done: int, stopped: str
+) -> Recording:
+    """Return the recording of a run that ended after `done` steps, from its recorded rows."""
+    every, dt = plan.times.every, plan.times.dt
+    count = -(-done // every)
+    t = np.append(every * np.arange(count) * dt, done * dt)
     count += not stopped.startswith(("diverged", "interrupted"))
-    q, nu, u, momentum, center, _ = np.split(rows.kept[:count], loop.ends, axis=1)
+    q, nu, u, momentum, center, _ = np.split(kept[:count], loop.ends, axis=1)
     v = plan.plant.state.spread(nu)
-    return Recording(
-        t[:count], q, v, u, momentum, center, loop.done, stopped, "compiled"
-    )
+    return Recording(t[:count], q, v, u, momentum, center, done, stopped, "compiled")
 
 
 def packed(

@@ -35,8 +35,8 @@ _LATE = 0.5
 # At most this number of windows is evaluated; their starts are then evenly distributed.
 _WINDOWS = 2000
 
-# At most about this number of rows of windows is evaluated for the relative error.
-_ROWS = 1_000_000
+# At most about this number of rows of windows is sorted for the quantiles of the relative error.
+_ROWS = 200_000
 
 # Errors of at most this size in the unit of the table are rounding errors, and shown as a dot.
 _ZERO = 1e-12
@@ -379,23 +379,29 @@ def _drifts(
 def _relative(
     t: Array, errors: Array, means: Array, starts: Array, window: float, columns: int
 ) -> PointingError:
-    """Return the statistics of the errors minus the mean of their window."""
+    """Return the statistics of the errors minus the mean of their window.
+
+    The largest error is that of all windows. For the other statistics, windows are left out if they
+    have very many rows.
+    """
     per_window = len(t) * window / (t[-1] - t[0])
     most = max(int(_ROWS / per_window), 2)
-    kept = np.unique(
-        np.linspace(0, len(starts) - 1, min(most, len(starts))).astype(int)
-    )
-    starts, means = starts[kept], means[kept]
+    step = math.ceil(len(starts) / most)
     first = np.searchsorted(t, starts - 1e-9 * window)
     after = np.searchsorted(t, starts + window * (1.0 + 1e-9), side="right")
     shares = _durations(starts)
     parts = list[Array]()
     weights = list[Array]()
-    for a, b, mean, share in zip(first, after, means, shares, strict=True):
-        durations = _durations(t[a:b])
-        parts.append(errors[a:b] - mean)
-        weights.append(share * durations / durations.sum())
-    return _statistics(np.vstack(parts), np.concatenate(weights), columns)
+    largest = np.zeros(columns)
+    for index, (a, b) in enumerate(zip(first.tolist(), after.tolist(), strict=True)):
+        apart = errors[a:b] - means[index]
+        largest = np.maximum(largest, _sizes(apart, columns).max(axis=0))
+        if index % step == 0:
+            durations = _durations(t[a:b])
+            parts.append(apart)
+            weights.append(shares[index] * durations / durations.sum())
+    statistics = _statistics(np.vstack(parts), np.concatenate(weights), columns)
+    return statistics._replace(largest=largest)
 
 
 def _durations(t: Array) -> Array:
@@ -409,14 +415,19 @@ def _durations(t: Array) -> Array:
     return durations
 
 
+def _sizes(errors: Array, columns: int) -> Array:
+    """Return the magnitudes (m, columns) of errors (m, k), and their norm in the last column."""
+    sizes = np.column_stack((np.abs(errors), np.linalg.norm(errors, axis=1)))
+    return sizes[:, -columns:]
+
+
 def _statistics(errors: Array, durations: Array, columns: int) -> PointingError:
     """Return the statistics of errors (m, k), each of which lasts for a duration (m,).
 
     The statistics have one column for each axis, and a last column for the norm of the error. If
     `columns` is 1, they have only the last column.
     """
-    sizes = np.column_stack((np.abs(errors), np.linalg.norm(errors, axis=1)))
-    sizes = sizes[:, -columns:]
+    sizes = _sizes(errors, columns)
     share = durations / durations.sum()
     order = np.argsort(sizes, axis=0)
     ordered = np.take_along_axis(sizes, order, axis=0)

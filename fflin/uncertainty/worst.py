@@ -18,6 +18,7 @@ from fflin.base.validation import Array, Mask, shaped
 from fflin.control.delayed import is_delayed
 from fflin.control.gain import Gain, gain_matrix, regulated_states
 from fflin.control.optimal.largest_gain import ACCURACY, gain_crossings, largest_gain
+from fflin.control.policy import Policy
 from fflin.uncertainty.lft import LFT
 
 if TYPE_CHECKING:
@@ -78,7 +79,9 @@ class Worst(html.Reported):
     damping : Found
         Least damping ratio of a pole.
     margin : Found
-        Least disk margin at the inputs, see `Gain.margins`; 0 if a loop is unstable.
+        Least disk margin at the inputs, with the inputs scaled by sqrt(R_ii) of a `Gain`. It is a
+        lower bound of the margin of `Gain.margins`, which has the best scaling. 0 if a loop is
+        unstable.
     gain : Found
         Largest gain over all frequencies from a disturbance at the inputs to the outputs. Outputs
         that depend on states which the gain does not regulate are excluded.
@@ -127,16 +130,9 @@ def searched(
     model: Uncertain, lft: LFT, gain: object, samples: int, seed: int
 ) -> Worst:
     """Search for the worst closed loops; see `Uncertain.worst`."""
-    if isinstance(gain, Gain) and is_delayed(gain.state_names):
-        raise InputError(
-            "the gain was designed for delayed inputs, but the uncertain model is continuous and "
-            "has no delay; give a gain of the continuous model, or the samples of the set to "
-            "fflin.margins one by one"
-        )
-    if isinstance(gain, Gain) and gain.integrals:
-        lft = _with_integrals(lft, gain)
-    K = shaped("gain", gain_matrix(gain), lft.B2.T.shape, " (nu, nx)")
-    kept = judged_states(lft, K, regulated_states(gain))
+    nu = lft.B2.shape[1]
+    lft, K, regulated = _around(lft, gain)
+    kept = judged_states(lft, K, regulated)
     lft = part_of(lft, kept)
     K = K[:, kept]
     size, loops = len(lft.repeats), Loops(lft, K)
@@ -155,10 +151,14 @@ def searched(
     tried = np.vstack((middle, corners[physical], draws))
     # The disk margin is computed from (S - T)/2, with each input scaled by sqrt(R_ii), as in
     # control.gain.
-    R = gain.R if isinstance(gain, Gain) else np.eye(len(K))
+    R = gain.R if isinstance(gain, Gain) else np.eye(nu)
     scale = np.sqrt(R.diagonal())
-    disk = Channel(-scale[:, None] * K, 0.5 * np.eye(len(K)), 1.0 / scale)
-    whole = Channel(lft.C2, np.zeros((len(lft.C2), len(K))), np.ones(len(K)))
+    # The rates of the states of a controller are no inputs that could be disturbed.
+    none = np.zeros(len(K) - nu)
+    half = np.hstack((0.5 * np.eye(nu), np.zeros((nu, len(none)))))
+    disk = Channel(-scale[:, None] * K[:nu], half, np.concatenate((1.0 / scale, none)))
+    through = np.zeros((len(lft.C2), len(K)))
+    whole = Channel(lft.C2, through, np.concatenate((np.ones(nu), none)))
     cases = []
     bar = Progress()
     undamped = Figures(
@@ -183,6 +183,70 @@ def searched(
         excluded=excluded + int((~physical).sum()),
         safe=safe,
     )
+
+
+def _around(lft: LFT, gain: object) -> tuple[LFT, Array, Sequence[str]]:
+    """Return the LFT with the states of a controller, K of u = -K x, and the judged states.
+
+    The inputs of the result are those of the robot, and then the rates of the controller's states.
+    """
+    law = None
+    if isinstance(gain, Policy):
+        law = gain.linear_law()
+        if law is None:
+            raise InputError(
+                f"gain is a {gain.kind}, expected a linear law about a point: a Gain, a "
+                "StateFeedback or a continuous LinearController"
+            )
+    if law is None or not isinstance(gain, Policy) or gain.feedback_gain is not None:
+        if isinstance(gain, Gain) and is_delayed(gain.state_names):
+            raise InputError(
+                "the gain was designed for delayed inputs, but the uncertain model is continuous "
+                "and has no delay; give a gain of the continuous model, or the samples of the set "
+                "to fflin.margins one by one"
+            )
+        if isinstance(gain, Gain) and gain.integrals:
+            lft = _with_integrals(lft, gain)
+        K = shaped("gain", gain_matrix(gain), lft.B2.T.shape, " (nu, nx)")
+        regulated = regulated_states(gain)
+        if isinstance(gain, Policy):
+            regulated = gain.fed_back
+        return lft, K, regulated
+    if law.dt:
+        raise InputError(
+            f"the law is sampled at {law.dt:g} s, but the uncertain model is continuous; give a "
+            "continuous law, such as a LinearController, or sample the robots of uncertain.draws "
+            "and call fflin.margins"
+        )
+    names = law.inputs, law.outputs
+    if names != (lft.output_names, lft.input_names):
+        raise InputError(
+            "the inputs and outputs of the law are not those of the robot; give the law of this "
+            "robot"
+        )
+    used: Mask = np.any(law.B, axis=0) | np.any(law.D, axis=0)
+    if lft.D21[used].any() or lft.D22[used].any():
+        raise InputError(
+            "the law measures outputs that depend on inputs or on uncertain parameters, such as "
+            "accelerations; give a law of outputs that depend on states only"
+        )
+    C = np.where(used[:, None], lft.C2, 0.0)
+    K = -np.block([[law.D @ C, law.C], [law.B @ C, law.A]])
+    (nx, nu), nz, nw = lft.B2.shape, len(law.A), lft.B1.shape[1]
+    states = tuple(f"controller.{index}" for index in range(nz))
+    larger = replace(
+        lft,
+        A=np.block([[lft.A, np.zeros((nx, nz))], [np.zeros((nz, nx + nz))]]),
+        B1=np.vstack((lft.B1, np.zeros((nz, nw)))),
+        B2=np.block([[lft.B2, np.zeros((nx, nz))], [np.zeros((nz, nu)), np.eye(nz)]]),
+        C1=np.hstack((lft.C1, np.zeros((nw, nz)))),
+        D12=np.hstack((lft.D12, np.zeros((nw, nz)))),
+        C2=np.hstack((lft.C2, np.zeros((len(lft.C2), nz)))),
+        D22=np.hstack((lft.D22, np.zeros((len(lft.C2), nz)))),
+        state_names=(*lft.state_names, *states),
+        input_names=(*lft.input_names, *(f"rate of {name}" for name in states)),
+    )
+    return larger, K, (*gain.fed_back, *states)
 
 
 def judged_states(lft: LFT, K: Array, regulated: Sequence[str]) -> Mask:

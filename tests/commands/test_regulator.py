@@ -241,3 +241,19 @@ def test_gravity_beyond_the_limits_is_reported_and_not_refused(capsys):
         code, out, err = run(capsys, "servicer_7dof", *options)
     assert code == 0 and says(err, "tau_m.panel_left")
     assert says(out, "tau_m.panel_left, tau_m.panel_right")
+
+
+def test_a_simulation_reports_the_margins_of_its_loop(capsys):
+    loop = ["planar_detumble", "--rpy", "0", "0", "10", "--duration", "5"]
+    assert main(["simulate", *loop, "--json"]) == 0
+    margins = json.loads(capsys.readouterr().out)["margins"]
+    assert margins["disk"] > 1.0
+    assert main(["simulate", *loop, "--sample", "0.2", "--delay", "0.2"]) == 0
+    text = capsys.readouterr().out
+    assert "margins of the linear loop" in text
+    lin = fflin.linearize(fflin.load("planar_detumble"))
+    sampled = lin.discretize(0.2)
+    expected = fflin.margins(fflin.lqr(sampled), sampled, delay=0.2).disk
+    assert f"(disk margin {expected:.3g})" in " ".join(text.split())
+    assert main(["simulate", *loop, "--free"]) == 0
+    assert "margins of the linear loop" not in capsys.readouterr().out

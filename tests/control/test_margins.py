@@ -1,14 +1,20 @@
 """What the loop of each input bears: closed forms, and the limits at which it gets unstable."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
 
 import fflin
-from fflin.control.gain import guaranteed_margin
+from fflin.control.gain import asymmetry, guaranteed_margin
 from fflin.control.lqr import regulator
+from fflin.control.optimal.disk import (
+    best_scaling,
+    largest_scaled_gain,
+    worst_perturbation,
+)
 from fflin.control.optimal.largest_gain import ACCURACY, _largest_among, largest_gain
 from fflin.control.plots import input_loops
 from tests.support.weights import unit_weights
@@ -178,12 +184,12 @@ DISKS = {
 
 
 @pytest.mark.parametrize("case", DISKS)
-def test_the_disk_margin_is_the_least_over_a_sweep_and_exact_on_both_sides(case):
+def test_the_fixed_scaling_bears_full_perturbations_exactly_up_to_its_bound(case):
     lin = DISKS[case]()
     rng = np.random.default_rng(0)
     for weights in ((), unit_weights(lin)):
         gain = fflin.lqr(lin, *weights)
-        disk, (low, high), phase = gain.margins
+        disk = 1.0 / largest_gain(*asymmetry(gain))[0]
         size, frequency = swept(gain)
         # The largest gain of the code is accurate to ACCURACY, and the refined sweep is better.
         assert abs(disk * size - 1.0) < 2.0 * ACCURACY
@@ -199,18 +205,62 @@ def test_the_disk_margin_is_the_least_over_a_sweep_and_exact_on_both_sides(case)
             delta = delta[0] + 1j * delta[1]
             delta *= 0.999 * disk / np.linalg.norm(delta, 2)
             assert beyond(gain, factors_of(delta)) < 0.0
-            gains = np.exp(rng.uniform(np.log(low), np.log(high), len(u)))
-            turns = np.radians(rng.choice([-0.999, 0.999], len(u)) * phase)
-            assert (
-                beyond(gain, np.diag(gains))
-                < 0.0
-                > beyond(gain, np.diag(np.exp(1j * turns)))
-            )
+        assert gain.margins.disk > disk * (1.0 - 2.0 * ACCURACY)
+
+
+@pytest.mark.parametrize("case", DISKS)
+def test_the_disk_margin_has_the_best_scaling_of_every_frequency(case):
+    lin = DISKS[case]()
+    rng = np.random.default_rng(1)
+    for weights in ((), unit_weights(lin)):
+        gain = fflin.lqr(lin, *weights)
+        disk, (low, high), phase = gain.margins
+        count = len(gain.K)
+        # No frequency needs a smaller disk, and one needs nearly this disk.
+        most = np.pi / gain.dt if gain.dt else 1e3
+        grid = np.geomspace(1e-4 * most, most, 60)
+        bounds = [best_scaling(M)[0] for M in balance(gain, grid)]
+        assert max(bounds) <= (1.0 + 1e-6) / disk
+        value, frequency, _ = largest_scaled_gain(asymmetry(gain))
+        assert min(1.0 / value, 2.0) == disk
+        if gain.dt:
+            frequency = 2.0 * math.atan(frequency) / gain.dt
+        # The open loop may be infinite at 0. The response is even in the frequency, so its error
+        # there is of the order 1e-8.
+        frequency = min(max(frequency, 1e-4), 1e9)
+        response = balance(gain, frequency)
+        scaling = best_scaling(response)
+        assert scaling[0] == pytest.approx(1.0 / disk, rel=1e-6)
+        # A perturbation of the channels that is at most a fifth larger makes the loop unstable.
+        reached, change = worst_perturbation(response, scaling[1], scaling[0])
+        assert reached > 1.0 / (1.2 * disk)
+        assert beyond(gain, factors_of(1.001 * np.diag(change))) > 0.0
+        assert beyond(gain, factors_of(0.999 * disk * reached * np.diag(change))) < 0.0
+        # No change of the channels within the disk makes the loop unstable.
+        for _ in range(30):
+            delta = np.exp(2j * np.pi * rng.uniform(size=count)) * 0.999 * disk
+            assert beyond(gain, factors_of(np.diag(delta))) < 0.0
+            gains = np.exp(rng.uniform(np.log(low), np.log(high), count))
+            turns = np.radians(rng.choice([-0.999, 0.999], count) * phase)
+            assert beyond(gain, np.diag(gains)) < 0.0
+            assert beyond(gain, np.diag(np.exp(1j * turns))) < 0.0
         # The limits of gain and phase are on the edge of the disk.
         for factor in (low, high, np.exp(1j * math.radians(phase))):
             assert abs(2.0 * (factor - 1.0) / (factor + 1.0)) == pytest.approx(
                 disk, rel=1e-12
             )
+        assert fflin.margins(gain, lin).disk == pytest.approx(disk, rel=1e-5)
+
+
+def test_the_disk_margin_does_not_depend_on_the_units_of_the_inputs():
+    lin = fflin.linearize(fflin.load("canadarm2"))
+    gain = fflin.acceleration_lqr(lin, 1.0, 1.0, 1.0)
+    fixed = 1.0 / largest_gain(*asymmetry(gain))[0]
+    # Here the fixed scaling states a third of the margin.
+    assert gain.margins.disk > 3.0 * fixed
+    scale = np.geomspace(0.01, 100.0, len(gain.K))
+    other = replace(gain, B=gain.B * scale, K=gain.K / scale[:, None])
+    assert other.margins.disk == pytest.approx(gain.margins.disk, rel=1e-5)
 
 
 @pytest.mark.parametrize("name", ["cubesat", "ets_vii", "planar_detumble"])

@@ -408,3 +408,55 @@ def test_states_that_affect_regulated_states_are_judged():
     assert kept.tolist() == [True, True, True, False]
     fed_back = np.array([[0.0, 0.0, 0.0, 1.0]])
     assert worst.judged_states(made, fed_back, ("x1",)).all()
+
+
+@pytest.fixture(scope="module")
+def uncertain_arm():
+    """Return a robot with two uncertain masses, and its model and gain."""
+    robot = fflin.load("planar_detumble")
+    model = fflin.uncertain(robot, {"base.density": 0.3, "*.mass": 0.1})
+    lin = fflin.linearize(robot)
+    return model, lin, fflin.lqr(lin, 1.0, 1.0)
+
+
+def test_a_state_feedback_has_the_worst_loops_of_its_gain(uncertain_arm):
+    model, lin, gain = uncertain_arm
+    worst = model.worst(gain.K, samples=5)
+    policy = model.worst(fflin.StateFeedback(lin, gain.K), samples=5)
+    assert policy == worst
+    # A controller without states is the same law.
+    static = fflin.LinearController(-gain.K, lin)
+    assert model.worst(static, samples=5) == worst
+
+
+def test_the_worst_loop_of_a_controller_with_states_is_that_of_its_closed_loop(
+    uncertain_arm,
+):
+    model, lin, gain = uncertain_arm
+    # Each command passes a low-pass filter.
+    nu, lag = len(gain.K), 0.05
+    filtered = (-np.eye(nu) / lag, gain.K / lag, -np.eye(nu), np.zeros_like(gain.K))
+    law = fflin.LinearController(filtered, lin)
+    worst = model.worst(law, samples=5)
+    poles = []
+    lft = model.lft()
+    for corner in model.draws(200, seed=3)[0]:
+        A, B, *_ = lft.at(corner[None])
+        loop = np.block([[A[0], -B[0]], [gain.K / lag, -np.eye(nu) / lag]])
+        poles.append(np.linalg.eigvals(loop))
+    ratios = [(-p.real / np.abs(p)).min() for p in poles]
+    assert worst.damping.value <= min(ratios) + 1e-9
+    A, B, *_ = lft.at(worst.damping.parameters)
+    loop = np.block([[A, -B], [gain.K / lag, -np.eye(nu) / lag]])
+    p = np.linalg.eigvals(loop)
+    assert worst.damping.value == pytest.approx((-p.real / np.abs(p)).min(), rel=1e-9)
+    assert 0.0 < worst.margin.value < model.worst(gain.K, samples=5).margin.value
+
+
+def test_a_sampled_controller_is_refused(uncertain_arm):
+    model, lin, _ = uncertain_arm
+    sampled = lin.discretize(0.1)
+    estimator = fflin.kalman(sampled, 1e-3, 1e-4)
+    compensator = fflin.lqg(fflin.lqr(sampled, 1.0, 1.0), estimator)
+    with pytest.raises(fflin.InputError, match="but the uncertain model is continuous"):
+        model.worst(fflin.OutputFeedback(sampled, compensator), samples=5)

@@ -278,7 +278,16 @@ def _starts(M: Values, d: Array) -> Iterator[Array]:
 
 
 def largest_structured_gain(loop: Loop) -> Peak:
-    """Return the largest structured singular value of a stable loop over all frequencies.
+    """Return the largest structured singular value of a stable loop over all frequencies."""
+    value, frequency, d = largest_scaled_gain(loop)
+    reached, perturbation = worst_perturbation(loop.at(frequency), d, value)
+    return Peak(value, frequency, reached, perturbation)
+
+
+def largest_scaled_gain(loop: Loop) -> tuple[float, float, Array]:
+    """Return the largest bound of the structured singular value of a stable loop.
+
+    The result also contains the frequency [rad/s] at which it occurs, and the scaling there.
 
     The value is bounded at a few frequencies near the poles. A fixed scaling then bounds it at all
     frequencies but those between the crossings of its gain, which follow from eigenvalues. These
@@ -286,8 +295,16 @@ def largest_structured_gain(loop: Loop) -> Peak:
     """
     poles = np.linalg.eigvals(loop.F)
     starts = {0.0, np.inf, *np.abs(poles).tolist(), *np.abs(poles.imag).tolist()}
-    tried = {w: best_scaling(loop.at(w)) for w in _thinned(sorted(starts))}
-    best = max(tried, key=lambda w: tried[w][0])
+    norms = {w: float(np.linalg.norm(loop.at(w), 2)) for w in _thinned(sorted(starts))}
+    tried = dict[float, tuple[float, Array]]()
+    best = max(norms, key=lambda w: norms[w])
+    for w in sorted(norms, key=lambda w: -norms[w]):
+        # The best scaling never increases the norm, so the other frequencies have lower values.
+        if tried and norms[w] <= tried[best][0]:
+            break
+        tried[w] = best_scaling(loop.at(w))
+        if tried[w][0] > tried[best][0]:
+            best = w
     intervals = [(0.0, np.inf, tried[best][1])]
     for _ in range(_DIVISIONS):
         if not intervals:
@@ -308,8 +325,7 @@ def largest_structured_gain(loop: Loop) -> Peak:
             else:
                 intervals.append((a, b, scaling))
     value, d = tried[best]
-    reached, perturbation = worst_perturbation(loop.at(best), d, value)
-    return Peak(value, best, reached, perturbation)
+    return value, best, d
 
 
 def _thinned(frequencies: list[float]) -> list[float]:

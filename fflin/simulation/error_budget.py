@@ -1,0 +1,583 @@
+"""Error budgets of linear loops: the contribution of each cause, and their total."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal, NamedTuple
+
+import numpy as np
+
+from fflin.base import html
+from fflin.base.errors import InputError
+from fflin.base.names import by_name, input_keys
+from fflin.base.process import in_one_thread
+from fflin.base.tables import folded, grid
+from fflin.base.validation import (
+    Array,
+    FrozenArrays,
+    Mask,
+    dimension,
+    instance,
+    number,
+    positive,
+    vector,
+)
+from fflin.control.gain import Gain
+from fflin.control.margins import ClosedLoop, law_in_loop
+from fflin.control.policy import Policy, System
+from fflin.dynamics.state_rows import attitude_rotations
+from fflin.linear.model import LinearModel
+from fflin.robot.inputs import BaseForce, BaseTorque, Input
+from fflin.simulation.motion import Motion
+
+if TYPE_CHECKING:
+    from fflin.robot.robot import Robot
+
+Kind = Literal["noise", "constant", "periodic"]
+
+# States of the attitude, and the name of its errors in the budget.
+_ATTITUDE = ("q_b.x", "q_b.y", "q_b.z")
+_AXES = ("attitude.x", "attitude.y", "attitude.z")
+
+# Error of the attitude [deg] per unit of the state q_b, the vector part of a quaternion.
+_DEGREES = math.degrees(2.0)
+
+# Errors of the report are in seconds of arc if all are below this angle [deg].
+_SMALL = 0.02
+_ARCSEC = 3600.0
+
+# Errors of at most this size are rounding errors, and shown as a dot.
+_ZERO = 1e-12
+
+# Fraction of a motion from which its errors are counted.
+_LATE = 0.5
+
+
+class Contribution(NamedTuple):
+    """Contribution of one cause to the errors of a budget.
+
+    Attributes
+    ----------
+    cause : str
+        Name of the cause, such as "noise of q_b" or "constant tau_b".
+    kind : {"noise", "constant", "periodic"}
+    size : ndarray (n,)
+        Standard deviation for noise, magnitude for a constant cause, amplitude for a periodic one;
+        for each of `ErrorBudget.names`.
+
+    Examples
+    --------
+    >>> lin = fflin.linearize(fflin.load("planar_detumble"))
+    >>> budget = fflin.error_budget(fflin.lqr(lin), lin, disturbance={"tau_b.z": 1e-3})
+    >>> budget.contributions[0].cause, budget.contributions[0].kind
+    ('constant tau_b.z', 'constant')
+    """
+
+    cause: str
+    kind: Kind
+    size: Array
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ErrorBudget(FrozenArrays, html.Reported):
+    """Errors of a linear loop by cause, and their total as in ECSS-E-ST-60-10C.
+
+    Constant errors have unknown signs, so their magnitudes are added. Noise and periodic errors are
+    independent, so their variances are added; a sinusoid of amplitude a has the variance a^2 / 2.
+    The total is the sum of the constants plus `factor` standard deviations.
+
+    Attributes
+    ----------
+    names, units : tuple of str (n,)
+        Errors: ``attitude.x``, ``.y`` and ``.z`` [deg], and then the other states of the loop in
+        their units.
+    contributions : tuple of Contribution
+    constant, deviation, total : ndarray (n,)
+        Sum of the constants, standard deviation of all other errors, and total.
+    factor : float
+        Number of standard deviations in the total.
+    simulated_mean, simulated_deviation : ndarray (3,) or (0,)
+        Mean and standard deviation [deg] of the attitude errors in the second half of the given
+        motion; empty without a motion.
+    dt, delay : float
+        Sampling time of the loop, 0 in continuous time, and delay of its inputs [s].
+    robot : str
+
+    Examples
+    --------
+    >>> lin = fflin.linearize(fflin.load("planar_detumble"))
+    >>> causes = {"noise": {"q_b": 1e-5}, "disturbance": {"tau_b": (0.0, 0.0, 1e-3)}}
+    >>> budget = fflin.error_budget(fflin.lqr(lin), lin, sample=0.1, **causes)
+    >>> budget.names[2], [part.cause for part in budget.contributions]
+    ('attitude.z', ['noise of q_b', 'constant tau_b'])
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    contributions: tuple[Contribution, ...]
+    constant: Array
+    deviation: Array
+    total: Array
+    factor: float
+    simulated_mean: Array
+    simulated_deviation: Array
+    dt: float
+    delay: float
+    robot: str
+
+    def error(self, name: str) -> dict[str, float]:
+        """Return {cause: size} of one of the errors `names`, and its total.
+
+        Raises
+        ------
+        UnknownNameError
+            If there is no such error.
+        """
+        from fflin.base.errors import require_known
+
+        require_known("error", [name], self.names)
+        at = self.names.index(name)
+        sizes = {part.cause: float(part.size[at]) for part in self.contributions}
+        return {**sizes, "total": float(self.total[at])}
+
+    def __str__(self) -> str:
+        return f"{folded(self._head())}\n\n{grid(self._rows(), 'll')}"
+
+    def _html_parts(self) -> list[str]:
+        return [
+            *map(html.paragraph, self._head()),
+            html.table(self._rows(), "ll"),
+        ]
+
+    def _head(self) -> list[str]:
+        time = f"sampled at {self.dt:g} s" if self.dt else "continuous"
+        if self.delay:
+            time += f", delay {self.delay:g} s"
+        return [
+            f"{self.robot}: error budget of the attitude, {time}",
+            f"total: sum of the constants plus {self.factor:g} standard deviations",
+        ]
+
+    def _rows(self) -> list[list[str]]:
+        """Return the table of the attitude errors."""
+        unit, scale = "deg", 1.0
+        if self.total[:3].max() < _SMALL:
+            unit, scale = "arcsec", _ARCSEC
+        words = {
+            "noise": "standard deviation",
+            "constant": "constant",
+            "periodic": "amplitude",
+        }
+        rows = [["cause", f"[{unit}]", "x", "y", "z"]]
+        for part in self.contributions:
+            rows.append([part.cause, words[part.kind], *_cells(scale * part.size[:3])])
+        rows.append(["all constants", "sum", *_cells(scale * self.constant[:3])])
+        rows.append(
+            ["all others", "standard deviation", *_cells(scale * self.deviation[:3])]
+        )
+        rows.append(["total", "", *_cells(scale * self.total[:3])])
+        if len(self.simulated_mean):
+            rows.append(["simulated", "mean", *_cells(scale * self.simulated_mean)])
+            deviation = _cells(scale * self.simulated_deviation)
+            rows.append(["", "standard deviation", *deviation])
+        return rows
+
+
+def _cells(values: Array) -> list[str]:
+    return [f"{x:.3g}" if abs(x) > _ZERO else "." for x in values.tolist()]
+
+
+@in_one_thread
+def error_budget(
+    policy: Policy | Gain,
+    lin: LinearModel,
+    *,
+    noise: Mapping[str, float] | None = None,
+    bias: Mapping[str, float] | None = None,
+    disturbance: Mapping[str, object] | None = None,
+    periodic: Mapping[str, tuple[float, float]] | None = None,
+    force_noise: Mapping[str, float] | None = None,
+    delay: float = 0.0,
+    sample: float | None = None,
+    factor: float = 3.0,
+    motion: Motion | None = None,
+) -> ErrorBudget:
+    r"""Return the errors of the loop of a linear policy and a model, for each cause.
+
+    By linear superposition, each cause acts alone on the closed loop
+
+    .. math:: \dot x = F x + G w,\qquad x_{k+1} = F x_k + G w_k
+
+    A constant w leads to :math:`-F^{-1} G w`, or to :math:`(E - F)^{-1} G w` in a sampled loop. A
+    sinusoid leads to the amplitude of the frequency response. White noise leads to the covariance S
+    with :math:`F S + S F^T + G W G^T = 0`, or with :math:`S = F S F^T + G W G^T`. A sampled loop
+    contains the exact sampled plant with delayed inputs, and forces act between the samples. Its
+    errors are those at the samples.
+
+    A name in a mapping is a name, a group or a pattern. The values of a group are independent: the
+    result of a group of constants is the sum of the magnitudes, and the result of a group of noises
+    or sinusoids is the root of the sum of squares. A vector ``"tau_b": (x, y, z)`` is one constant.
+
+    Parameters
+    ----------
+    policy : Policy or Gain
+        Linear law about a point, as for `margins`.
+    lin : LinearModel
+        Model of the robot. A continuous model may be given for a sampled law.
+    noise : mapping, optional
+        White noise {measured signal: size}. In a sampled loop, the size is the standard deviation
+        of each sample in the unit of the signal. In continuous time, it is the square root of the
+        intensity [unit sqrt(s)]. `StateFeedback` and gains measure the states, other laws the
+        outputs.
+    bias : mapping, optional
+        Constant errors {measured signal: bias} of sensors.
+    disturbance : mapping, optional
+        Constant generalised forces {input, ``tau_b`` or ``F_b``: value} [N m or N].
+    periodic : mapping, optional
+        Sinusoidal forces {name: (amplitude, frequency [Hz])}.
+    force_noise : mapping, optional
+        White noise of forces {name: square root of the intensity [N m sqrt(s) or N sqrt(s)]}.
+    delay : float, optional
+        Delay [s] of all inputs.
+    sample : float, optional
+        Sampling time [s] with which a continuous law is executed.
+    factor : float
+        Number of standard deviations in the total.
+    motion : Motion, optional
+        Simulated motion whose attitude errors are shown beside the budget.
+
+    Returns
+    -------
+    ErrorBudget
+
+    Raises
+    ------
+    InputError
+        If the policy is not linear about a point, the loop is unstable, or no cause is given.
+    UnknownNameError
+        If a signal or force does not exist.
+
+    References
+    ----------
+    ECSS-E-ST-60-10C, Space engineering: control performance, 2008, summation rules of error
+    budgets.
+
+    Examples
+    --------
+    >>> lin = fflin.linearize(fflin.load("planar_detumble"))
+    >>> policy = fflin.StateFeedback(lin, fflin.lqr(lin).K)
+    >>> budget = fflin.error_budget(policy, lin, disturbance={"tau_b.z": 1e-3})
+    >>> float(budget.total[2]) > 0.0, float(budget.deviation[2])
+    (True, 0.0)
+    """
+    instance("lin", lin, LinearModel, "a fflin.LinearModel")
+    delay = number("delay", delay)
+    if delay < 0.0:
+        raise InputError(f"delay is {delay:g} s, expected at least 0")
+    if sample is not None:
+        sample = positive("sample", sample, "s")
+    factor = positive("factor", factor)
+    law = law_in_loop(policy, lin, sample)
+    forces = [
+        *_given("disturbance", disturbance),
+        *_given("periodic", periodic),
+        *_given("force_noise", force_noise),
+    ]
+    loop = DisturbedLoop(law, lin, delay, sample, forces)
+    causes: list[Contribution] = []
+    for key, values in _given("noise", noise).items():
+        size = _size("noise", key, values)
+        causes.append(loop.measurement_noise(key, size))
+    for key, values in _given("bias", bias).items():
+        causes.append(loop.bias(key, number(f"bias '{key}'", values)))
+    for key, values in _given("disturbance", disturbance).items():
+        causes.append(loop.disturbance(key, values))
+    for key, values in _given("periodic", periodic).items():
+        causes.append(loop.periodic(key, *_sinusoid(key, values)))
+    for key, values in _given("force_noise", force_noise).items():
+        size = _size("force_noise", key, values)
+        causes.append(loop.force_noise(key, size))
+    if not causes:
+        raise InputError(
+            "no cause of errors is given; give noise, bias, disturbance, periodic or force_noise"
+        )
+    variance = np.zeros(len(loop.signals))
+    constant = np.zeros(len(loop.signals))
+    for part in causes:
+        if part.kind == "constant":
+            constant = constant + part.size
+        elif part.kind == "noise":
+            variance = variance + part.size**2
+        else:
+            variance = variance + 0.5 * part.size**2
+    deviation = np.sqrt(variance)
+    mean, spread = _simulated(motion)
+    return ErrorBudget(
+        names=loop.signals,
+        units=loop.signal_units,
+        contributions=tuple(causes),
+        constant=constant,
+        deviation=deviation,
+        total=constant + factor * deviation,
+        factor=factor,
+        simulated_mean=mean,
+        simulated_deviation=spread,
+        dt=loop.dt,
+        delay=delay,
+        robot=lin.robot,
+    )
+
+
+def _given(name: str, mapping: object) -> Mapping[str, object]:
+    """Return the mapping of an argument, or an empty one."""
+    if mapping is None:
+        return {}
+    checked: Mapping[str, object] = instance(
+        name, mapping, Mapping, "a mapping {name: value}"
+    )
+    return checked
+
+
+def _size(argument: str, key: str, value: object) -> float:
+    """Return a size of noise, which must not be negative."""
+    size = number(f"{argument} '{key}'", value)
+    if size < 0.0:
+        raise InputError(f"{argument} '{key}' is {size:g}, expected at least 0")
+    return size
+
+
+def _sinusoid(key: str, value: object) -> tuple[float, float]:
+    """Return the amplitude and the frequency [rad/s] of a sinusoidal force."""
+    expected = "an amplitude and a frequency [Hz]"
+    amplitude, frequency = vector(f"periodic '{key}'", value, 2, expected)
+    if not frequency > 0.0:
+        raise InputError(
+            f"periodic '{key}' has the frequency {frequency:g} Hz, expected more than 0"
+        )
+    return float(amplitude), 2.0 * math.pi * float(frequency)
+
+
+def _simulated(motion: Motion | None) -> tuple[Array, Array]:
+    """Return the mean and deviation [deg] of the attitude errors of a motion (3,), or none."""
+    if motion is None:
+        return np.zeros(0), np.zeros(0)
+    instance("motion", motion, Motion, "a Motion, as fflin.simulate returns")
+    if not motion.target.size:
+        raise InputError("the motion has no target, so it has no attitude errors")
+    errors = np.degrees(attitude_rotations(motion.x, motion.target))
+    late = errors[motion.t >= motion.t[0] + _LATE * (motion.t[-1] - motion.t[0])]
+    return late.mean(axis=0), late.std(axis=0)
+
+
+class DisturbedLoop(ClosedLoop):
+    """Closed loop on which noise, biases and forces act; `forces` are keys of all forces."""
+
+    # Continuous model of the plant, and the indices of its states that the plant contains.
+    _source: LinearModel
+    _kept: list[int]
+    # Names of the forces that can act, and their input matrix.
+    _forces: tuple[str, ...]
+    _force_inputs: Array
+
+    def __init__(
+        self,
+        law: System,
+        lin: LinearModel,
+        delay: float,
+        sample: float | None,
+        forces: Sequence[str],
+    ) -> None:
+        self._acting = forces
+        missing = [name for name in _ATTITUDE if name not in lin.state_names]
+        if missing:
+            raise InputError(
+                f"the model has no state {missing[0]}; give a model that contains the attitude of "
+                "the base"
+            )
+        super().__init__(law, lin, delay, sample, "outputs")
+        if not self.is_continuous_plant:
+            raise InputError(
+                "lin is sampled and its continuous model is unknown, so forces between the samples "
+                "cannot be computed; give the continuous model"
+            )
+        delays = np.full(self.plant.B.shape[1], delay)
+        self._delayed = self.with_delays(delays)
+        self.F = self.closed(self._delayed)[0]
+        if not self.is_stable(self.F):
+            raise InputError(
+                "the loop is unstable or does not control the attitude, so its errors are not "
+                "bounded; give a law that stabilises the attitude"
+            )
+        states = [self._source.state_names[index] for index in self._kept]
+        units = [self._source.state_units[index] for index in self._kept]
+        attitude = [states.index(name) for name in _ATTITUDE]
+        others = [index for index in range(len(states)) if index not in attitude]
+        self._rows = np.array([*attitude, *others])
+        self._factors = np.array([_DEGREES] * 3 + [1.0] * len(others))
+        self.signals = (*_AXES, *(states[index] for index in others))
+        self.signal_units = ("deg",) * 3 + tuple(units[index] for index in others)
+        self._force_inputs = self._force_inputs[self._kept]
+
+    def kept_states(self, model: LinearModel, C: Array) -> list[int]:
+        """Return the indices of the states of the plant.
+
+        They are the attitude, and the states that inputs or the given forces reach, if they affect
+        the attitude or a used signal.
+        """
+        self._source = model
+        self._forces, self._force_inputs = _forces_of(model)
+        attitude = [model.state_names.index(name) for name in _ATTITUDE]
+        reached: Mask = np.any(model.B, axis=1)
+        for key in self._acting:
+            at = self._signals("force", key, self._forces)
+            reached = reached | self._force_inputs[:, at].any(axis=1)
+        seen: Mask = np.any(C, axis=0)
+        seen[attitude] = True
+        for _ in model.A:
+            reached = reached | model.A[:, reached].any(axis=1)
+            seen = seen | model.A[seen].any(axis=0)
+        kept: Mask = reached & seen
+        kept[attitude] = True
+        self._kept = np.flatnonzero(kept).tolist()
+        return self._kept
+
+    def measurement_noise(self, key: str, size: float) -> Contribution:
+        """Return the effect of white noise of measured signals."""
+        at = self._signals("measured signal", key, self.law.inputs)
+        G = size * self._from_measurements()[:, at]
+        return Contribution(f"noise of {key}", "noise", self._deviation(G @ G.T))
+
+    def bias(self, key: str, size: float) -> Contribution:
+        """Return the effect of constant errors of measured signals."""
+        at = self._signals("measured signal", key, self.law.inputs)
+        G = size * self._from_measurements()[:, at]
+        return Contribution(f"bias of {key}", "constant", self._constants(G))
+
+    def disturbance(self, key: str, value: object) -> Contribution:
+        """Return the effect of constant forces."""
+        at = self._signals("force", key, self._forces)
+        label = f"disturbance '{key}'"
+        inputs = self._force_inputs[:, at]
+        if dimension(label, value):
+            values = vector(label, value, len(at), "one value for each force")
+            inputs = inputs @ values[:, None]
+        else:
+            inputs = inputs * number(label, value)
+        G = self._held(inputs, 0.0).real
+        return Contribution(f"constant {key}", "constant", self._constants(G))
+
+    def periodic(self, key: str, amplitude: float, w: float) -> Contribution:
+        """Return the effect of sinusoidal forces with a frequency [rad/s]."""
+        at = self._signals("force", key, self._forces)
+        G = self._held(amplitude * self._force_inputs[:, at], w)
+        point = np.exp(1j * w * self.dt) if self.dt else 1j * w
+        response = np.linalg.solve(point * np.eye(len(self.F)) - self.F, G)
+        amplitudes = np.linalg.norm(response, axis=1)
+        hertz = w / (2.0 * math.pi)
+        cause = f"{key} at {hertz:.4g} Hz"
+        return Contribution(cause, "periodic", self._errors(amplitudes))
+
+    def force_noise(self, key: str, size: float) -> Contribution:
+        """Return the effect of white noise of forces."""
+        at = self._signals("force", key, self._forces)
+        G = size * self._force_inputs[:, at]
+        W = np.zeros_like(self.F)
+        count = len(self.plant.A)
+        W[:count, :count] = self._covariance(G @ G.T)
+        return Contribution(f"white {key}", "noise", self._deviation(W))
+
+    def _signals(self, kind: str, key: str, names: Sequence[str]) -> list[int]:
+        return sorted(by_name(kind, {key: None}, names))
+
+    def _from_measurements(self) -> Array:
+        """Return the matrix from errors of the measured signals to the states of the loop."""
+        _, B, _, D, *_ = self._delayed
+        law = self.law
+        return np.vstack((B @ law.D, law.B + law.B @ D @ law.D))
+
+    def _held(self, inputs: Array, w: float) -> Array:
+        """Return the matrix from forces (nx, k) to the states of the loop.
+
+        In a sampled loop, it is the effect of e^(j w t) over a sample.
+        """
+        from scipy.linalg import expm
+
+        count, columns = inputs.shape
+        if self.dt:
+            block = np.zeros((count + columns, count + columns), complex)
+            block[:count, :count] = self.plant.A
+            block[:count, count:] = inputs
+            block[count:, count:] = 1j * w * np.eye(columns)
+            inputs = expm(block * self.dt)[:count, count:]
+        G = np.zeros((len(self.F), columns), complex)
+        G[:count] = inputs
+        return G
+
+    def _covariance(self, W: Array) -> Array:
+        """Return the covariance that white noise of intensity W adds to the states in a sample."""
+        from scipy.linalg import expm
+
+        if not self.dt:
+            return W
+        # C. F. Van Loan, IEEE Trans. Automatic Control 23(3), 1978
+        A = self.plant.A
+        count = len(A)
+        block = np.block([[-A, W], [np.zeros((count, count)), A.T]])
+        exponential = expm(block * self.dt)
+        transition = exponential[count:, count:].T
+        covariance: Array = transition @ exponential[:count, count:]
+        return covariance
+
+    def _constants(self, G: Array) -> Array:
+        """Return the sum of the magnitudes of the constant errors that the columns of G cause."""
+        unit = np.eye(len(self.F))
+        inner = unit - self.F if self.dt else -self.F
+        return self._errors(np.abs(np.linalg.solve(inner, G)).sum(axis=1))
+
+    def _deviation(self, W: Array) -> Array:
+        """Return the standard deviations for noise of intensity or covariance W of the states."""
+        from scipy.linalg import solve_continuous_lyapunov, solve_discrete_lyapunov
+
+        if self.dt:
+            return self._standard(solve_discrete_lyapunov(self.F, W))
+        return self._standard(solve_continuous_lyapunov(self.F, -W))
+
+    def _standard(self, S: Array) -> Array:
+        """Return the standard deviations of a covariance of the states of the loop."""
+        return self._errors(np.sqrt(np.maximum(S.diagonal(), 0.0)))
+
+    def _errors(self, states: Array) -> Array:
+        """Return the errors of the budget from sizes of the states of the loop."""
+        errors: Array = self._factors * states[self._rows]
+        return errors
+
+
+def _forces_of(model: LinearModel) -> tuple[tuple[str, ...], Array]:
+    """Return the names of forces, and their input matrix (nx, k).
+
+    The forces are the inputs, and the torque and force on the base if the robot is known.
+    """
+    from fflin.linear.linearization import linearize
+
+    robot: Robot | None = model._robot
+    if robot is None:
+        return input_keys(model), model.B
+    groups = {name.partition(".")[0] for name in model.input_names}
+    added = list[Input]()
+    if "tau_b" not in groups:
+        added.append(BaseTorque())
+    if "F_b" not in groups:
+        added.append(BaseForce())
+    if not added:
+        return input_keys(model), model.B
+    larger = linearize(
+        robot.replace(inputs=[*robot.inputs, *added]),
+        model.q,
+        model.v,
+        frame=model.frame,
+        reference=model.reference,
+    )
+    rows = [larger.state_names.index(name) for name in model.state_names]
+    return input_keys(larger), larger.B[rows]

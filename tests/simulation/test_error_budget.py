@@ -1,0 +1,240 @@
+"""Error budgets equal closed forms, brute-force recursions and simulated motions."""
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+from scipy.stats import chi2
+
+import fflin
+from fflin.base.errors import InputError, UnknownNameError
+
+DEGREES = np.degrees(1.0)
+
+
+@pytest.fixture(scope="module")
+def satellite():
+    """Return the model of a satellite with a torque, and its gain."""
+    robot = fflin.load("cubesat", inputs=[fflin.BaseTorque()])
+    lin = fflin.linearize(robot)
+    return robot, lin, fflin.lqr(lin)
+
+
+def double_integrator(lin, gain, axis):
+    """Return a, b and L of the loop angle'' = -a angle - b rate + L torque about an axis."""
+    names = lin.state_names
+    row = "xyz".index(axis)
+    L = lin.B[names.index(f"omega_b.{axis}"), row]
+    kp = gain.K[row, names.index(f"q_b.{axis}")]
+    kd = gain.K[row, names.index(f"omega_b.{axis}")]
+    return 0.5 * L * kp, L * kd, L
+
+
+def test_a_double_integrator_has_the_variances_of_its_closed_form(satellite):
+    _, lin, gain = satellite
+    a, b, L = double_integrator(lin, gain, "y")
+    n = 1e-4
+    budget = fflin.error_budget(gain, lin, force_noise={"tau_b.y": n})
+    angle = budget.error("attitude.y")["white tau_b.y"]
+    assert angle == pytest.approx(DEGREES * L * n / np.sqrt(2.0 * a * b), rel=1e-9)
+    rate = budget.error("omega_b.y")["white tau_b.y"]
+    assert rate == pytest.approx(L * n / np.sqrt(2.0 * b), rel=1e-9)
+    budget = fflin.error_budget(gain, lin, noise={"q_b": n, "omega_b": 2.0 * n})
+    errors = budget.error("attitude.y")
+    expected = DEGREES * n * np.sqrt(2.0 * a / b)
+    assert errors["noise of q_b"] == pytest.approx(expected, rel=1e-9)
+    expected = DEGREES * 2.0 * n * np.sqrt(b / (2.0 * a))
+    assert errors["noise of omega_b"] == pytest.approx(expected, rel=1e-9)
+
+
+def test_constants_and_sinusoids_have_the_gains_of_the_closed_form(satellite):
+    _, lin, gain = satellite
+    a, b, L = double_integrator(lin, gain, "z")
+    d, w = 2e-5, 2.0 * np.pi * 0.03
+    budget = fflin.error_budget(
+        gain,
+        lin,
+        disturbance={"tau_b.z": d},
+        bias={"omega_b.z": 3e-5, "q_b.z": 1e-4},
+        periodic={"tau_b.z": (d, 0.03)},
+    )
+    errors = budget.error("attitude.z")
+    assert errors["constant tau_b.z"] == pytest.approx(DEGREES * L * d / a, rel=1e-9)
+    bias = errors["bias of omega_b.z"]
+    assert bias == pytest.approx(DEGREES * 3e-5 * b / a, rel=1e-9)
+    assert errors["bias of q_b.z"] == pytest.approx(DEGREES * 2e-4, rel=1e-9)
+    gain_at = L / abs(a - w**2 + 1j * b * w)
+    amplitude = errors["tau_b.z at 0.03 Hz"]
+    assert amplitude == pytest.approx(DEGREES * d * gain_at, rel=1e-9)
+    constant = errors["constant tau_b.z"] + bias + errors["bias of q_b.z"]
+    expected = constant + 3.0 * amplitude / np.sqrt(2.0)
+    assert errors["total"] == pytest.approx(expected, rel=1e-12)
+    assert abs(budget.total[0]) < 1e-9
+
+
+def test_a_vector_of_forces_keeps_its_signs_and_a_group_does_not():
+    robot = fflin.load("planar_detumble")
+    lin = fflin.linearize(robot)
+    gain = fflin.lqr(lin)
+    single = [
+        fflin.error_budget(gain, lin, disturbance={f"tau_b.{axis}": 1e-3}).constant
+        for axis in "xyz"
+    ]
+    group = fflin.error_budget(gain, lin, disturbance={"tau_b": 1e-3}).constant
+    assert group == pytest.approx(sum(single), rel=1e-9, abs=1e-12)
+    one = fflin.error_budget(gain, lin, disturbance={"tau_b": (1e-3, -2e-3, 0)})
+    other = fflin.error_budget(gain, lin, disturbance={"tau_b": (-1e-3, 2e-3, 0)})
+    assert one.constant == pytest.approx(other.constant)
+    assert (one.constant <= single[0] + 2.0 * single[1] + 1e-12).all()
+    noisy = [
+        fflin.error_budget(gain, lin, force_noise={f"tau_b.{axis}": 1e-3}).deviation
+        for axis in "xyz"
+    ]
+    group = fflin.error_budget(gain, lin, force_noise={"tau_b": 1e-3}).deviation
+    expected = np.sqrt(np.sum(np.square(noisy), axis=0))
+    assert group == pytest.approx(expected, rel=1e-9, abs=1e-12)
+
+
+def recursion(lin, gain, axis, delay, h, parts):
+    """Return the step functions of one axis, with inputs that are late by whole parts of h."""
+    a, b, L = double_integrator(lin, gain, axis)
+    A = np.array([[0.0, 1.0], [0.0, 0.0]])
+    B = np.array([[0.0], [1.0]])
+    small = h / parts
+    block = expm(np.block([[A, B], [np.zeros((1, 3))]]) * small)
+    late = round(delay / small)
+    return a, b, L, block[:2, :2], block[:2, 2], late
+
+
+def test_a_sampled_loop_with_delay_equals_a_recursion_over_many_seeds(satellite):
+    _, lin, gain = satellite
+    h, delay, parts, runs = 0.2, 0.15, 4, 4000
+    n = 1e-4
+    a, b, _, phi, gamma, late = recursion(lin, gain, "x", delay, h, parts)
+    rng = np.random.default_rng(1)
+    state = np.zeros((2, runs))
+    commands = [np.zeros(runs)] * (late + 1)
+    for _ in range(400):
+        angle = state[0] + 2.0 * n * rng.standard_normal(runs)
+        command = -a * angle - b * (state[1] + 3.0 * n * rng.standard_normal(runs))
+        for _ in range(parts):
+            commands = [*commands[1:], command]
+            state = phi @ state + np.outer(gamma, commands[0])
+    noise = {"q_b": n, "omega_b": 3.0 * n}
+    budget = fflin.error_budget(gain, lin, noise=noise, sample=h, delay=delay)
+    measured = DEGREES * state[0].std()
+    # The ratio of the variances has a chi-squared distribution; its two tails have 1e-6.
+    low, high = np.sqrt(chi2.ppf((1e-6, 1.0 - 1e-6), runs) / runs)
+    assert low < measured / budget.deviation[0] < high
+    assert budget.dt == h and budget.delay == delay
+
+
+def test_sinusoids_act_between_the_samples(satellite):
+    _, lin, gain = satellite
+    h, delay, parts = 0.2, 0.15, 400
+    a, b, L, phi, gamma, late = recursion(lin, gain, "x", delay, h, parts)
+    w, size = 2.0 * np.pi * 0.7, 1e-3
+    state = np.zeros(2)
+    commands = [0.0] * (late + 1)
+    angles = []
+    for k in range(600):
+        angles.append(state[0])
+        command = -a * state[0] - b * state[1]
+        for i in range(parts):
+            commands = [*commands[1:], command]
+            t = (k + (i + 0.5) / parts) * h
+            push = L * size * np.cos(w * t)
+            state = phi @ state + gamma * (commands[0] + push)
+    late_angles = np.array(angles[300:])
+    t = h * np.arange(300, 600)
+    basis = np.column_stack((np.cos(w * t), np.sin(w * t)))
+    fit = np.linalg.lstsq(basis, late_angles, rcond=None)[0]
+    periodic = {"tau_b.x": (size, 0.7)}
+    budget = fflin.error_budget(gain, lin, periodic=periodic, sample=h, delay=delay)
+    amplitude = budget.contributions[0].size[0]
+    # The midpoint rule over 400 parts has a relative error of (w h / 400)^2 / 24 = 2e-7.
+    assert amplitude == pytest.approx(DEGREES * np.hypot(*fit), rel=1e-5)
+
+
+def test_force_noise_of_a_sampled_loop_tends_to_that_of_the_continuous_loop(satellite):
+    _, lin, gain = satellite
+    noise = {"tau_b": 1e-4}
+    continuous = fflin.error_budget(gain, lin, force_noise=noise).deviation
+    sampled = [
+        fflin.error_budget(gain, lin, force_noise=noise, sample=h).deviation
+        for h in (0.02, 0.01)
+    ]
+    far, near = (np.abs(x / continuous - 1.0).max() for x in sampled)
+    # The error of the hold is of first order in h.
+    assert near < 0.02 and near == pytest.approx(0.5 * far, rel=0.05)
+
+
+def test_an_output_feedback_and_its_constant_torque(satellite):
+    robot, lin, _ = satellite
+    sampled = lin.discretize(0.2)
+    law = fflin.OutputFeedback(
+        sampled, fflin.lqg(fflin.lqr(sampled), fflin.kalman(sampled, 1e-6, 1e-6))
+    )
+    torque = {"tau_b": (1e-5, -2e-5, 3e-5)}
+    options = {"disturbance": torque, "duration": 200.0, "dt": 0.1}
+    motion = fflin.simulate(robot, law, **options)
+    budget = fflin.error_budget(law, lin, disturbance=torque, motion=motion)
+    final = np.abs(2.0 * DEGREES * motion.x[-1, :3])
+    # The angles are below 1 deg, so the nonlinear terms are of the order 1e-4.
+    assert budget.constant[:3] == pytest.approx(final, rel=1e-3)
+    assert np.abs(budget.simulated_mean) == pytest.approx(final, rel=1e-2)
+    assert "simulated" in str(budget)
+
+
+def test_wheels_hold_a_torque_on_the_base():
+    inputs = fflin.load_inputs("cubesat")
+    wheels = [item for item in inputs if isinstance(item, fflin.ReactionWheel)]
+    robot = fflin.load("cubesat", inputs=wheels)
+    lin = fflin.linearize(robot)
+    gain = fflin.lqr(lin)
+    torque = {"tau_b": (0.0, 0.0, 1e-6)}
+    budget = fflin.error_budget(gain, lin, disturbance=torque, sample=0.25)
+    law = fflin.StateFeedback(lin, gain.K)
+    options = {"disturbance": torque, "duration": 150.0, "dt": 0.25, "sample": 0.25}
+    motion = fflin.simulate(robot, law, **options)
+    final = abs(2.0 * DEGREES * motion.x[-1, 2])
+    assert budget.constant[2] == pytest.approx(final, rel=1e-3)
+    assert budget.constant[2] > 0.0
+
+
+@pytest.mark.compiled
+def test_noise_of_a_campaign_has_the_predicted_deviation(satellite):
+    robot, lin, _ = satellite
+    sampled = lin.discretize(0.5)
+    law = fflin.StateFeedback(sampled, fflin.lqr(sampled).K)
+    count = 512
+    options = {"duration": 80.0, "dt": 0.25, "delay": 0.25, "engine": "compiled"}
+    runs = fflin.monte_carlo(robot, law, {"q_b.noise": 1e-5}, runs=count, **options)
+    budget = fflin.error_budget(law, lin, noise={"q_b": 1e-5}, delay=0.25)
+    measured = 2.0 * DEGREES * np.array(runs.x)[:, :3].std(axis=0)
+    low, high = np.sqrt(chi2.ppf((1e-6, 1.0 - 1e-6), count) / count)
+    ratio = measured / budget.deviation[:3]
+    assert (low < ratio).all() and (ratio < high).all()
+
+
+def test_the_report_and_the_refusals(satellite):
+    _, lin, gain = satellite
+    budget = fflin.error_budget(
+        gain, lin, noise={"q_b": 1e-6}, disturbance={"tau_b": (1e-7, 0, 0)}
+    )
+    text = str(budget)
+    assert "[arcsec]" in text and "noise of q_b" in text
+    assert max(map(len, text.splitlines())) <= 80
+    card = budget._repr_html_()
+    assert "constant tau_b" in card and "arcsec" in card
+    with pytest.raises(InputError, match="no cause of errors"):
+        fflin.error_budget(gain, lin)
+    with pytest.raises(InputError, match="unstable"):
+        fflin.error_budget(gain, lin, noise={"q_b": 1e-6}, sample=1.0, delay=500.0)
+    with pytest.raises(UnknownNameError):
+        fflin.error_budget(gain, lin, noise={"q_c": 1e-6})
+    with pytest.raises(InputError, match="at least 0"):
+        fflin.error_budget(gain, lin, noise={"q_b": -1.0})
+    with pytest.raises(InputError, match="more than 0"):
+        fflin.error_budget(gain, lin, periodic={"tau_b.x": (1.0, 0.0)})
+    with pytest.raises(UnknownNameError, match="error"):
+        budget.error("attitude.w")
