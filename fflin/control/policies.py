@@ -417,7 +417,7 @@ class StateFeedback(LinearLaw):
     def fed_back(self) -> tuple[str, ...]:
         """Names of the states that the law feeds back or integrates."""
         used = np.vstack((self.system.D, self.system.B))
-        return states_of_gain(self.lin.state_names, used)
+        return states_of_gain(self.lin.robot_states, used)
 
     def loop_notes(self, held: float = 0.0) -> tuple[str, ...]:
         """Return notes on unstable poles of the linear loop."""
@@ -425,6 +425,9 @@ class StateFeedback(LinearLaw):
             return super().loop_notes(held)
         A, B, C, D = self.system[:4]
         loop = self.loop
+        # The law does not measure the commands that are on their way in the plant.
+        unmeasured = len(loop) - len(A) - D.shape[1]
+        D, B = (np.pad(matrix, ((0, 0), (0, unmeasured))) for matrix in (D, B))
         used = np.block([[D, C], [B, np.eye(len(A))]])
         part = loop[block_of_feedback(loop, used)]
         return unstable_note("linear loop", part, self.sample_time, "")
