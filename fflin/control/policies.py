@@ -43,7 +43,7 @@ from fflin.dynamics.integrators import held_exponential
 from fflin.dynamics.outputs import Measuring
 from fflin.dynamics.state import Actuation, StateMap, selection
 from fflin.dynamics.state_rows import readout
-from fflin.kernel.allocation import nearest
+from fflin.kernel.allocation import nearest, nearest_unbounded
 from fflin.linear.fit import about_point, require_configuration_size, require_fit
 from fflin.linear.holding import held_if_possible, wheel_notes
 from fflin.linear.model import LinearModel, gain_map
@@ -684,7 +684,6 @@ class AllocatedPolicy(BoundLaw):
         """
         allocated, scaled, asked = self._shortfall
         lack = scaled[:, :-1] @ (allocated + difference) - scaled[:, -1]
-        free = np.full(asked.shape[1], np.inf)
         assert self._inner is not None
         assert self._inner.correct is not None
-        self._inner.correct(nearest(asked, lack, -free, free))
+        self._inner.correct(nearest_unbounded(asked, lack))

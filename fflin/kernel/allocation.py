@@ -246,7 +246,7 @@ def write_difference(allocation, point, commanded):
             lack = lack + load(point.u, index) * load(achieved, index * size + k)
         store(back.columns, inputs * size + k, lack)
     for lane in range(vec.lane_count(commanded)):
-        solve(back, size, lane)
+        solve_unbounded(back, size, lane)
         for index in range(inputs):
             vec.poke(commanded, index, lane, back.x[index])
 
@@ -312,6 +312,38 @@ def solve(problem, size, lane):
         _solve_scaled(problem, size, free, kept)
     for j in range(count):
         x[j] = min(max(x[j] / scale, least[j]), most[j]) + 0.0 * force
+
+
+@called
+def solve_unbounded(problem, size, lane):
+    """Write the solution without bounds for one lane to `problem.x`, as `solve` does with bounds.
+
+    `solve` could do the same, but its code would be compiled once more, for half a minute.
+    """
+    x, s = problem.x, problem.s
+    A, wanted = problem.A, problem.wanted
+    count = len(x)
+    last = count * size
+    write_scaled(problem.columns, lane, 1.0, A)
+    unit = root(row_product(A, 0, A, 0, last))
+    force = root(row_product(A, last, A, last, size))
+    for j in range(count):
+        s[j] = 0.0
+        problem.state[j] = _FREE
+        problem.order[j] = j
+    scale = 0.0
+    if unit > 0.0 and force > 0.0:
+        scale = force / unit
+        write_scaled(A[last:], 0, 1.0 / force, wanted)
+        write_scaled(A, 0, 1.0 / unit, A)
+        _fit(problem, size, count, 0)
+        # The second solution is for the force of the first one, as in `solve`.
+        wanted[:] = 0.0
+        for j in range(count):
+            add_row(wanted, 0, s[j], A, j * size, size)
+        _fit(problem, size, count, count)
+    for j in range(count):
+        x[j] = s[j] * scale + 0.0 * force
 
 
 @called
@@ -438,11 +470,25 @@ def nearest(A: Array, b: Array, least: Array, most: Array) -> Array:
 
     If several u are equally good, the u with the smallest norm is returned.
     """
+    problem = _problem_of(A, b, least, most)
+    solve(problem, len(b), 0)
+    return np.array(problem.x)
+
+
+def nearest_unbounded(A: Array, b: Array) -> Array:
+    """Return the u (k,) with the smallest norm for which A u is nearest to b."""
+    bound = np.full(A.shape[1], np.inf)
+    problem = _problem_of(A, b, -bound, bound)
+    solve_unbounded(problem, len(b), 0)
+    return np.array(problem.x)
+
+
+def _problem_of(A: Array, b: Array, least: Array, most: Array) -> LeastSquares:
+    """Return the problem in which A u must be nearest to b."""
     numbers = [0.0] * len(least)
-    size = len(b)
     # Reading an entry is faster for lists than for arrays, so lists replace the arrays that are
     # read entry by entry.
-    problem = least_squares(least.tolist(), most.tolist(), size)._replace(
+    return least_squares(least.tolist(), most.tolist(), len(b))._replace(
         columns=np.concatenate((A.T.ravel(), b)),
         state=[0] * len(least),
         order=[0] * len(least),
@@ -451,5 +497,3 @@ def nearest(A: Array, b: Array, least: Array, most: Array) -> Array:
         low=numbers.copy(),
         high=numbers.copy(),
     )
-    solve(problem, size, 0)
-    return np.array(problem.x)

@@ -8,6 +8,7 @@ import pytest
 import fflin
 from fflin.control.policies import LinearLaw
 from fflin.control.policy import System
+from fflin.kernel.allocation import nearest_unbounded
 from tests.support.motions import displaced
 from tests.support.policies import JETS, coarse
 
@@ -206,3 +207,17 @@ def test_both_engines_allocate_a_law_with_memory_equally(dt):
         for engine in ("python", "compiled")
     )
     assert np.abs(one.x - other.x).max() < 1e-10
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_nearest_inputs_without_bounds_are_those_of_the_pseudoinverse(seed):
+    """Also if inputs depend on each other, with forces of any size."""
+    rng = np.random.default_rng(seed)
+    rows, columns = rng.integers(2, 9, 2)
+    A = rng.normal(size=(rows, columns))[:, rng.integers(0, columns, columns)]
+    b = 1e-6 * rng.normal(size=rows)
+    expected = np.linalg.pinv(A) @ b
+    found = nearest_unbounded(A, b)
+    assert np.abs(found - expected).max() < 1e-9 * np.abs(expected).max()
+    assert not nearest_unbounded(A, 0.0 * b).any()
+    assert np.isnan(nearest_unbounded(A, np.nan * b)).all()
