@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from fflin.base.errors import FileError, InputError, listed, located, unknown
-from fflin.base.names import undotted
+from fflin.base.names import undotted, without_past
 from fflin.base.record import read_record, reading, texts
 from fflin.base.validation import (
     ArrayLike,
@@ -262,16 +262,33 @@ class OutputFeedback(LinearController):
         )
         windup = compensator.E if compensator.E.any() else None
         super().__init__(compensator, lin, noise=noise, anti_windup=windup)
+        _require_same_delays(compensator, self.lin)
         self.compensator = compensator
-        known = self.lin.state_names
-        if self.lin.added and {*compensator.state_names} <= {*known}:
-            # The estimate contains earlier commands, as they are after limits are applied.
-            self.windup = self.lin.B[[*map(known.index, compensator.state_names)]]
         if not lin.dt:
             raise InputError(
                 "the model must be sampled; use lin.discretize(dt), and design the gain and the "
                 "estimator for it"
             )
+
+
+def _require_same_delays(compensator: Compensator, lin: LinearModel) -> None:
+    """Raise `InputError` if a compensator does not estimate the commands on their way in a model.
+
+    A command that has no effect on the feedback is not estimated.
+    """
+    names = compensator.state_names
+    past = [name for name in names if name not in without_past(names)]
+    unknown_commands = [name for name in past if name not in lin.added]
+    if not unknown_commands and bool(past) == bool(lin.added):
+        return
+    found = "without delayed inputs"
+    if past:
+        found = f"with the delayed inputs {listed(past)}"
+    raise InputError(
+        f"the compensator was designed for a model {found}, but the given model has "
+        f"{listed(lin.added) or 'none'}; give the model of the design, and "
+        "simulate(delay=) for another delay of the plant"
+    )
 
 
 def _system_of(given: Any) -> System:
