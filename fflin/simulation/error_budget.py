@@ -24,6 +24,7 @@ from fflin.base.validation import (
     positive,
     vector,
 )
+from fflin.control.data_sheet import output_keys
 from fflin.control.gain import Gain
 from fflin.control.margins import ClosedLoop, delayed_model, law_in_loop
 from fflin.control.policy import Policy, System
@@ -442,13 +443,13 @@ class DisturbedLoop(ClosedLoop):
 
     def measurement_noise(self, key: str, size: float) -> Contribution:
         """Return the effect of white noise of measured signals."""
-        at = self._signals("measured signal", key, self.law.inputs)
+        at = self._measured(key)
         G = size * self._from_measurements()[:, at]
         return Contribution(f"noise of {key}", "noise", self._deviation(G @ G.T))
 
     def bias(self, key: str, size: float) -> Contribution:
         """Return the effect of constant errors of measured signals."""
-        at = self._signals("measured signal", key, self.law.inputs)
+        at = self._measured(key)
         G = size * self._from_measurements()[:, at]
         return Contribution(f"bias of {key}", "constant", self._constants(G))
 
@@ -484,6 +485,11 @@ class DisturbedLoop(ClosedLoop):
         count = len(self.plant.A)
         W[:count, :count] = self._covariance(G @ G.T)
         return Contribution(f"white {key}", "noise", self._deviation(W))
+
+    def _measured(self, key: str) -> list[int]:
+        """Return the indices of measured signals; a quantity such as "gyroscope" is a name."""
+        names = self.law.inputs
+        return self._signals("measured signal", output_keys([key], names)[key], names)
 
     def _signals(self, kind: str, key: str, names: Sequence[str]) -> list[int]:
         return sorted(by_name(kind, {key: None}, names))

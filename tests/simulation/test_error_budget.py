@@ -259,3 +259,19 @@ def test_the_delay_of_the_model_or_of_the_law_is_in_the_budget(satellite):
     )
     more = fflin.error_budget(policy, late, delay=0.1, **causes)
     assert more.delay == pytest.approx(tau + 0.1)
+
+
+def test_a_measured_quantity_names_its_components_as_in_the_filter():
+    robot = fflin.load(
+        "cubesat",
+        inputs=[fflin.BaseTorque()],
+        outputs=[fflin.BasePose(), fflin.Gyroscope("base")],
+    )
+    model = fflin.linearize(robot).discretize(0.25)
+    noise = {"q_b": 1e-9, "r_b": 1e-4, "gyroscope": 1e-9}
+    estimator = fflin.kalman(model, {"omega_b": 1e-9}, noise)
+    policy = fflin.OutputFeedback(model, fflin.lqg(fflin.lqr(model), estimator))
+    named = fflin.error_budget(policy, model, noise={"gyroscope": 1e-5})
+    listed = fflin.error_budget(policy, model, noise={"*.gyroscope.*": 1e-5})
+    assert named.total.tolist() == listed.total.tolist()
+    assert named.total[0] > 0.0
