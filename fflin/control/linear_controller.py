@@ -130,6 +130,7 @@ class LinearController(OutputSensing, LinearLaw):
             raise InputError(
                 f"noise is {self.noise!r}, expected noise(t) -> (ny,), a function"
             )
+        self._remembers = _remembers_commands(self.system)
         controller = _system_of(self.system)
         # Expand the system to all outputs and inputs of the model, and multiply its output by the
         # sign of the feedback.
@@ -191,8 +192,15 @@ class LinearController(OutputSensing, LinearLaw):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Note on the momentum that wheels gain while they hold the robot at the point."""
-        return wheel_notes(self.lin)
+        """Notes on delayed inputs, and on the momentum that wheels gain at the point."""
+        notes = wheel_notes(self.lin)
+        if self._remembers and not self.lin.added:
+            notes = (
+                *notes,
+                "the controller was designed for delayed inputs, but its model has no delay: "
+                "commands act at once unless a delay is given (delay=, --delay)",
+            )
+        return notes
 
     @property
     def sensors(self) -> tuple[str, ...]:
@@ -269,6 +277,19 @@ class OutputFeedback(LinearController):
                 "the model must be sampled; use lin.discretize(dt), and design the gain and the "
                 "estimator for it"
             )
+
+
+def _remembers_commands(given: Any) -> bool:
+    """Return whether the states of a controller, or of one in a file, contain earlier commands."""
+    names: tuple[str, ...] = ()
+    if isinstance(given, Compensator):
+        names = given.state_names
+    if isinstance(given, str | Path):
+        path = as_path(given)
+        check_ending(path, RECORDS)
+        with reading(path, "controller"):
+            names = texts(read_record(path)[0].get("state_names", ()))
+    return without_past(names) != names
 
 
 def _require_same_delays(compensator: Compensator, lin: LinearModel) -> None:

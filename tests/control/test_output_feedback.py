@@ -89,3 +89,20 @@ def test_the_compensator_of_a_delayed_model_needs_this_delay():
     np.testing.assert_array_equal(of_late.E[past], np.eye(3))
     assert np.array_equal(fflin.OutputFeedback(late, of_late).windup, of_late.E)
     assert not of_early.E.any()
+
+
+def test_a_controller_for_delayed_inputs_notes_that_its_model_has_no_delay(tmp_path):
+    robot = fflin.load("cubesat", inputs=[fflin.BaseTorque()], outputs=["base"])
+    lin = fflin.linearize(robot)
+    late = lin.discretize(0.25, delay=0.25)
+    estimator = fflin.kalman(late, {"omega_b": 1e-9}, 1e-6)
+    compensator = fflin.lqg(fflin.lqr(late), estimator)
+    compensator.save(tmp_path / "law.npz")
+    for given in (compensator, tmp_path / "law.npz"):
+        policy = fflin.LinearController(given, lin)
+        motion = fflin.simulate(robot, policy, duration=1.0)
+        assert any("designed for delayed inputs" in note for note in motion.notes)
+        motion = fflin.simulate(
+            robot, fflin.LinearController(given, late), duration=1.0
+        )
+        assert not any("delayed inputs" in note for note in motion.notes)
