@@ -682,7 +682,7 @@ class AllocatedPolicy(BoundLaw):
         return chart.to_reference(actuation.held, B.T).T
 
     def _correct(self, difference: Array) -> None:
-        """Tell the inner policy which of its commands are not achieved.
+        """Correct the inner policy by the part of its commands that is not achieved.
 
         The difference of the achieved and the wanted generalised force is mapped to the inputs of
         `design` whose force is nearest to it.

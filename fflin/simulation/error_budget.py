@@ -248,7 +248,7 @@ def error_budget(
     factor : float
         Number of standard deviations in the total.
     motion : Motion, optional
-        Simulated motion whose attitude errors are shown beside the budget.
+        Simulated motion whose attitude errors are compared with the budget.
 
     Returns
     -------
@@ -359,7 +359,7 @@ def _sinusoid(key: str, value: object) -> tuple[float, float]:
 
 
 def _simulated(motion: Motion | None) -> tuple[Array, Array]:
-    """Return the mean and deviation [deg] of the attitude errors of a motion (3,), or none."""
+    """Return the mean and deviation [deg] of the attitude errors (3,); empty without a motion."""
     if motion is None:
         return np.zeros(0), np.zeros(0)
     instance("motion", motion, Motion, "a Motion, as fflin.simulate returns")

@@ -517,3 +517,10 @@ def test_a_model_without_delay_gets_the_delay_of_the_law(tmp_path):
         fflin.margins(loaded, lin)
     assert fflin.margins(loaded, late).disk == pytest.approx(expected.disk, rel=1e-9)
     assert fflin.margins(loaded, lin, delay=0.4).stable
+
+
+def test_the_margins_of_an_allocation_are_those_of_its_inner_policy():
+    robot, lin = satellite()
+    policy = fflin.StateFeedback(lin, fflin.lqr(lin))
+    with pytest.raises(fflin.InputError, match="policy whose commands are allocated"):
+        fflin.margins(fflin.Allocation(policy, robot), lin)
