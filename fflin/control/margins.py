@@ -359,12 +359,9 @@ def law_in_loop(
             given = given.held_for(sample)
         linear = given.linear_law()
         if linear is None:
-            hint = ""
-            if given.inner is not given and given.inner.linear_law() is not None:
-                hint = "; give the policy whose commands are allocated, and the model of its design"
             raise InputError(
                 f"policy is a {given.kind}, expected a linear law about a point: a StateFeedback, "
-                f"an OutputFeedback, a LinearController or a Gain{hint}"
+                "an OutputFeedback, a LinearController or a Gain"
             )
         law = linear
         outputs = given.senses_outputs

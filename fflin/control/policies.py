@@ -578,6 +578,10 @@ class Allocation(Policy):
         """Return the poles of the inner policy's loop along its trajectory."""
         return self.inner.poles_along()
 
+    def linear_law(self) -> System | None:
+        """Return the law of the inner policy, without limits."""
+        return self.inner.linear_law()
+
     def closed_loop(self) -> tuple[Array, float] | None:
         """Return the closed loop of the inner policy, without limits."""
         return self.inner.closed_loop()

@@ -521,6 +521,10 @@ def test_a_model_without_delay_gets_the_delay_of_the_law(tmp_path):
 
 def test_the_margins_of_an_allocation_are_those_of_its_inner_policy():
     robot, lin = satellite()
-    policy = fflin.StateFeedback(lin, fflin.lqr(lin))
-    with pytest.raises(fflin.InputError, match="policy whose commands are allocated"):
-        fflin.margins(fflin.Allocation(policy, robot), lin)
+    late = lin.discretize(0.25, delay=0.1)
+    for gain in (fflin.lqr(late), fflin.lqr(late, integral_action=["q_b"])):
+        policy = fflin.StateFeedback(late, gain)
+        expected = fflin.margins(policy, late)
+        for model in (lin, late):
+            found = fflin.margins(fflin.Allocation(policy, robot), model)
+            assert found.disk == pytest.approx(expected.disk, rel=1e-9)
