@@ -487,6 +487,11 @@ class ClosedLoop:
             delays += self.lin.delay
         return delays
 
+    @property
+    def longest_delay(self) -> float:
+        """Largest delay [s] of an input, also if the matrices of the model contain it."""
+        return self.delay + float(self.lin.delay.max(initial=0.0))
+
     def loop(self) -> tuple[Array, Array, Array, Array]:
         """Return F, G, H and J of `closed`, with the delay."""
         loop = self.closed(self.with_delays(self.delays))
@@ -515,7 +520,7 @@ class ClosedLoop:
                 at=self.at,
                 robot=self.lin.robot,
                 dt=self.dt,
-                delay=float(delays.max(initial=0.0)),
+                delay=self.longest_delay,
             )
         system = as_continuous(*loop, self.dt)
         grid = self._grid()
@@ -541,7 +546,7 @@ class ClosedLoop:
             at=self.at,
             robot=self.lin.robot,
             dt=self.dt,
-            delay=float(delays.max(initial=0.0)),
+            delay=self.longest_delay,
         )
 
     def own_rates(self) -> Array:

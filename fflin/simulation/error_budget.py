@@ -324,7 +324,7 @@ def error_budget(
         simulated_mean=mean,
         simulated_deviation=spread,
         dt=loop.dt,
-        delay=float(loop.delays.max(initial=0.0)),
+        delay=loop.longest_delay,
         robot=lin.robot,
     )
 

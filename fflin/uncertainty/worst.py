@@ -15,6 +15,7 @@ from fflin.base.errors import InputError
 from fflin.base.process import Progress, in_one_thread
 from fflin.base.tables import folded
 from fflin.base.validation import Array, Mask, shaped
+from fflin.control.compensator import Compensator
 from fflin.control.delayed import is_delayed
 from fflin.control.gain import Gain, gain_matrix, regulated_states
 from fflin.control.optimal.largest_gain import ACCURACY, gain_crossings, largest_gain
@@ -191,6 +192,11 @@ def _around(lft: LFT, gain: object) -> tuple[LFT, Array, Sequence[str]]:
     The inputs of the result are those of the robot, and then the rates of the controller's states.
     """
     law = None
+    if isinstance(gain, Compensator):
+        raise InputError(
+            "gain is a Compensator, which does not contain its model; give "
+            "fflin.LinearController(compensator, lin)"
+        )
     if isinstance(gain, Policy):
         law = gain.linear_law()
         if law is None:
@@ -218,19 +224,22 @@ def _around(lft: LFT, gain: object) -> tuple[LFT, Array, Sequence[str]]:
             "continuous law, such as a LinearController, or sample the robots of uncertain.draws "
             "and call fflin.margins"
         )
+    signals, measured = lft.state_names, np.eye(len(lft.A))
+    if gain.senses_outputs:
+        signals, measured = lft.output_names, lft.C2
     names = law.inputs, law.outputs
-    if names != (lft.output_names, lft.input_names):
+    if names != (signals, lft.input_names):
         raise InputError(
             "the inputs and outputs of the law are not those of the robot; give the law of this "
             "robot"
         )
     used: Mask = np.any(law.B, axis=0) | np.any(law.D, axis=0)
-    if lft.D21[used].any() or lft.D22[used].any():
+    if gain.senses_outputs and (lft.D21[used].any() or lft.D22[used].any()):
         raise InputError(
             "the law measures outputs that depend on inputs or on uncertain parameters, such as "
             "accelerations; give a law of outputs that depend on states only"
         )
-    C = np.where(used[:, None], lft.C2, 0.0)
+    C = np.where(used[:, None], measured, 0.0)
     K = -np.block([[law.D @ C, law.C], [law.B @ C, law.A]])
     (nx, nu), nz, nw = lft.B2.shape, len(law.A), lft.B1.shape[1]
     states = tuple(f"controller.{index}" for index in range(nz))
