@@ -423,7 +423,7 @@ def static_loop(
     # Near s = 0, the transfer function is G(s) = gain - s slope. For a first-order loop with the
     # time constant T, slope = T gain. In general, the time constants are the eigenvalues of
     # slope gain^+. For a sampled model, z - 1 replaces s, and the times are in samples.
-    # s times the identity, at s = 0; for a sampled model z times the identity, at z = 1
+    # `at_zero_frequency` is s I at s = 0, or z I at z = 1.
     at_zero_frequency = np.eye(len(loop)) if dt else np.zeros_like(loop)
     scaled_B = np.linalg.solve(factor, B.T).T
     static_states = np.linalg.solve(at_zero_frequency - loop, scaled_B)
