@@ -134,8 +134,8 @@ def differentiate(work, tree):
         turned = vec.plus(vec.cross(axis_i[0], moment), vec.cross(axis_i[1], force))
         by_q = vec.plus6(by_q, (turned, vec.cross(axis_i[0], force)))
         # by_v = 2 B_i S_i + 2 I_i Psi'_i
-        half = inertia_times(work, inertia, psi_i)
-        by_v = vec.plus6(_coriolis(work, at, axis_i[0]), vec.plus6(half, half))
+        inertial = inertia_times(work, inertia, psi_i)
+        by_v = vec.plus6(_coriolis(work, at, axis_i[0]), vec.plus6(inertial, inertial))
         above = body
         while above > 0:
             place = offsets.places + above * PLACE
