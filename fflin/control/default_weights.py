@@ -202,8 +202,9 @@ def _of_inertia(
         fastest = float(modal.frequencies[-1])
         sampling = Limit(pace.held / (pace.hold * fastest), "the sampling time")
     damped = bool((lin.M != M).any())
-    # Springs, dampers, gravity or a motion at the operating point add terms to the model of a mass
-    # without forces. The velocities then have weights too, and the efforts are computed from poles.
+    # In A of a free mass at rest, only the rates of the coordinates depend on the velocities.
+    # Springs, dampers, gravity or a motion at the operating point add terms to A. Then velocities
+    # have weights too, and `_slowed` checks the efforts of the closed loop.
     rate = rate_matrix(lin)
     if rate[m:].any() or rate[:m, :m].any():
         growth, mode = _growth(lin)
