@@ -603,6 +603,7 @@ def along(robot: fflin.Robot, arguments: Namespace) -> fflin.TrajectoryFeedback:
         "the models = fflin.linearize_trajectory(robot, motion) of a trajectory",
     )
     refuse(arguments, (*regulator, "joint", "rpy", "position", "velocity"), why)
+    refuse(arguments, ("integral",), "a law along a trajectory has no integral action")
     if arguments.schedule is None:
         models = models_along(arguments, robot)
         weights = weights_of(arguments)

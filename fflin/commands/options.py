@@ -256,7 +256,7 @@ ABOUT: dict[str, str] = {
     "horizon": "number of samples in the horizon of --mpc",
     "free": "simulate the robot without a regulator and without inputs",
     "delay": "delay [s] between a sample and the application of the command that is computed from "
-    "this sample",
+    "this sample; the regulator is designed without it",
     "offset": "initial error with respect to the start of the trajectory, in base axes. NAME is a "
     "state, a group or a pattern, such as r_b.x, q_m or omega_b.z (SI units), or it is roll, pitch "
     "or yaw [deg]",

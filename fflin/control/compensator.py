@@ -39,8 +39,8 @@ class Compensator(ModelDesign):
         Outputs and inputs at the operating point.
     E : ndarray (nz, nu)
         Gain of the anti-windup: ``E (u_applied - u)`` is added to dz/dt, or to the next z of a
-        sampled compensator, if limits change the command. Zero without integral action and
-        without estimated disturbances.
+        sampled compensator, if limits change the command. Zero without integral action, estimated
+        disturbances and delayed inputs.
     dt : float
         Sampling time [s]; 0 for continuous time.
     state_names, input_names, output_names : tuple of str

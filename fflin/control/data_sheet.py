@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import NamedTuple, TypeAlias
 
 from fflin.base.errors import InputError, require_known
@@ -61,7 +61,7 @@ def measurement_noise(lin: LinearModel, V: Noises) -> Weight:
     """Return V of `kalman` with covariances or intensities in place of figures of data sheets."""
     if not isinstance(V, Mapping):
         return V
-    keys = _output_keys(V, lin.output_names)
+    keys = output_keys(V, lin.output_names)
     figures = any(isinstance(value, Mapping) for value in V.values())
     if not figures:
         return {keys[key]: value for key, value in V.items()}  # type: ignore[misc]
@@ -89,7 +89,7 @@ def bias_intensities(
     expected = "a mapping {output: intensity}"
     noise = {} if noise is None else noise
     noise = instance("bias_noise", noise, Mapping, expected)
-    keys = _output_keys(noise, lin.output_names)
+    keys = output_keys(noise, lin.output_names)
 
     def intensity(key: str, value: Sheet, unit: str) -> float:
         what = f"bias_noise of '{key}'"
@@ -102,7 +102,7 @@ def bias_intensities(
     return {i: values[lin.output_names[i]] for i in at}
 
 
-def _output_keys(given: Mapping[str, object], names: Sequence[str]) -> dict[str, str]:
+def output_keys(given: Iterable[str], names: Sequence[str]) -> dict[str, str]:
     """Return the key that `by_name` understands for each key, such as "*.gyroscope.*"."""
     keys = {}
     for key in given:

@@ -14,7 +14,7 @@ from scipy.linalg import block_diag
 from fflin.analysis.ranks import DECAY
 from fflin.base import html, svg
 from fflin.base.errors import InputError, listed, require_known
-from fflin.base.names import group_of, input_keys, with_units
+from fflin.base.names import group_of, input_keys, with_units, without_past
 from fflin.base.record import Design
 from fflin.base.tables import cut, folded, grid, matrix, signals
 from fflin.base.validation import Array, Mask, Poles, Values, Vector
@@ -458,6 +458,11 @@ def model_of(gain: Gain, robot: Robot, made: str, reference: pin.SE3) -> LinearM
     """
     from fflin.linear.linearization import linearize
 
+    if without_past(gain.model_states) != gain.model_states:
+        raise InputError(
+            f"{made} with delayed inputs, whose delay the gain does not contain; linearise the "
+            "robot in Python, and use fflin.StateFeedback(lin.discretize(dt, delay=...), gain)"
+        )
     frame = frame_of(robot, gain.frame)
     state = StateMap(robot, reference=reference, frame=frame)
     count = len(gain.model_states)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from fflin.base.errors import FileError, InputError, listed, located, unknown
-from fflin.base.names import undotted
+from fflin.base.names import undotted, without_past
 from fflin.base.record import read_record, reading, texts
 from fflin.base.validation import (
     ArrayLike,
@@ -130,6 +130,7 @@ class LinearController(OutputSensing, LinearLaw):
             raise InputError(
                 f"noise is {self.noise!r}, expected noise(t) -> (ny,), a function"
             )
+        self._remembers = _remembers_commands(self.system)
         controller = _system_of(self.system)
         # Expand the system to all outputs and inputs of the model, and multiply its output by the
         # sign of the feedback.
@@ -191,8 +192,15 @@ class LinearController(OutputSensing, LinearLaw):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Note on the momentum that wheels gain while they hold the robot at the point."""
-        return wheel_notes(self.lin)
+        """Notes on delayed inputs, and on the momentum that wheels gain at the point."""
+        notes = wheel_notes(self.lin)
+        if self._remembers and not self.lin.added:
+            notes = (
+                *notes,
+                "the controller was designed for delayed inputs, but its model has no delay: "
+                "commands act at once unless a delay is given (delay=, --delay)",
+            )
+        return notes
 
     @property
     def sensors(self) -> tuple[str, ...]:
@@ -262,16 +270,46 @@ class OutputFeedback(LinearController):
         )
         windup = compensator.E if compensator.E.any() else None
         super().__init__(compensator, lin, noise=noise, anti_windup=windup)
+        _require_same_delays(compensator, self.lin)
         self.compensator = compensator
-        known = self.lin.state_names
-        if self.lin.added and {*compensator.state_names} <= {*known}:
-            # The estimate contains earlier commands, as they are after limits are applied.
-            self.windup = self.lin.B[[*map(known.index, compensator.state_names)]]
         if not lin.dt:
             raise InputError(
                 "the model must be sampled; use lin.discretize(dt), and design the gain and the "
                 "estimator for it"
             )
+
+
+def _remembers_commands(given: Any) -> bool:
+    """Return whether the states of a controller, or of one in a file, contain earlier commands."""
+    names: tuple[str, ...] = ()
+    if isinstance(given, Compensator):
+        names = given.state_names
+    if isinstance(given, str | Path):
+        path = as_path(given)
+        check_ending(path, RECORDS)
+        with reading(path, "controller"):
+            names = texts(read_record(path)[0].get("state_names", ()))
+    return without_past(names) != names
+
+
+def _require_same_delays(compensator: Compensator, lin: LinearModel) -> None:
+    """Raise `InputError` if a compensator does not estimate the commands on their way in a model.
+
+    A command that has no effect on the feedback is not estimated.
+    """
+    names = compensator.state_names
+    past = [name for name in names if name not in without_past(names)]
+    unknown_commands = [name for name in past if name not in lin.added]
+    if not unknown_commands and bool(past) == bool(lin.added):
+        return
+    found = "without delayed inputs"
+    if past:
+        found = f"with the delayed inputs {listed(past)}"
+    raise InputError(
+        f"the compensator was designed for a model {found}, but the given model has "
+        f"{listed(lin.added) or 'none'}; give the model of the design, and "
+        "simulate(delay=) for another delay of the plant"
+    )
 
 
 def _system_of(given: Any) -> System:

@@ -8,7 +8,7 @@ from itertools import compress
 import numpy as np
 
 from fflin.base.errors import InputError, listed
-from fflin.base.names import chosen, group_of
+from fflin.base.names import chosen, group_of, without_past
 from fflin.base.validation import Array, instance
 from fflin.control.compensator import Compensator
 from fflin.control.estimator import DISTURBANCE, Estimator
@@ -45,8 +45,9 @@ def lqg(
     are its last states: u - u0 = -K xh - K_i xi. A constant disturbance then leaves no error in
     these outputs, although it leaves an error in the estimate.
 
-    If limits change the commands of a compensator that integrates or rejects disturbances, the
-    filter uses the limited inputs, and the integrals are corrected as in `StateFeedback`.
+    If limits change the commands of a compensator that integrates, rejects disturbances or has
+    delayed inputs, the filter uses the limited inputs, and the integrals are corrected as in
+    `StateFeedback`.
 
     Parameters
     ----------
@@ -97,10 +98,11 @@ def lqg(
     B: Array = S @ e.L
     C: Array = feedback @ S.T
     # A filter without integrators forgets a limited command, but the estimate of a disturbance
-    # would wind up, so this filter uses the limited inputs.
+    # would wind up, so this filter uses the limited inputs. The commands on their way to delayed
+    # inputs are limited, too.
     driven = S @ (e.B - e.L @ e.D)
     E = np.zeros_like(driven)
-    if e.disturbances:
+    if e.disturbances or without_past(names) != names:
         E = driven
     if gain.integrals:
         A, B, C = _with_integrals(gain, e, A, B, C, driven)
@@ -159,8 +161,8 @@ def require_one_integrator(
         both = listed(integrals), listed(disturbances)
         raise InputError(
             f"the gain has integral action ({both[0]}) and the estimator estimates disturbances "
-            f"({both[1]}), which makes two integrators for one channel; omit integral_action or "
-            "disturbance_noise"
+            f"({both[1]}), which makes two integrators for one channel; omit disturbance_noise, or "
+            "integral_action and the entry integral of the robot's weights"
         )
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from fflin.base.errors import InputError
 from fflin.base.html import Reported
+from fflin.base.names import input_keys
 from fflin.base.process import in_one_thread
 from fflin.base.tables import cut, folded, grid
 from fflin.base.validation import (
@@ -21,7 +22,7 @@ from fflin.base.validation import (
     number,
     positive,
 )
-from fflin.control.delayed import law_with_memory
+from fflin.control.delayed import is_delayed, law_with_memory
 from fflin.control.gain import Gain
 from fflin.control.gain import Margins as GainMargins
 from fflin.control.optimal.channel_limits import (
@@ -197,7 +198,7 @@ class Margins(FrozenArrays, Reported):
 def margins(
     policy: Policy | Gain,
     lin: LinearModel,
-    delay: float = 0.0,
+    delay: float | None = None,
     sample: float | None = None,
     *,
     at: Place = "inputs",
@@ -222,7 +223,9 @@ def margins(
         Model of the robot with which the loop is closed. A continuous model may be given for a
         sampled law.
     delay : float, optional
-        Delay [s] of all inputs. A delay of the model, see `LinearModel.discretize`, is added.
+        Delay [s] of all inputs. A delay of `lin`, see `LinearModel.discretize`, is added. By
+        default, the delay is that of `lin`. If `lin` has none, it is the delay of the policy's
+        model, as in `simulate`.
     sample : float, optional
         Sampling time [s] with which a continuous law is executed.
     at : {"inputs", "outputs"}, optional
@@ -259,23 +262,59 @@ def margins(
 def closed_loop(
     policy: Policy | Gain,
     lin: LinearModel,
-    delay: float,
+    delay: float | None,
     sample: float | None,
     at: Place = "inputs",
 ) -> ClosedLoop:
     """Return the loop of a linear policy and a model; the arguments are those of `margins`."""
-    instance("lin", lin, LinearModel, "a fflin.LinearModel")
-    delay = number("delay", delay)
-    if delay < 0.0:
-        raise InputError(f"delay is {delay:g} s, expected at least 0")
+    lin, delay = delayed_model(policy, lin, delay)
     if sample is not None:
         sample = positive("sample", sample, "s")
     return ClosedLoop(law_in_loop(policy, lin, sample), lin, delay, sample, at)
 
 
+def delayed_model(
+    policy: Policy | Gain, lin: LinearModel, delay: float | None
+) -> tuple[LinearModel, float]:
+    """Return the model with which a loop is closed, and the delay [s] in addition to its own.
+
+    If no delay is given and the model has none, the model gets the delay of the policy's model.
+    """
+    instance("lin", lin, LinearModel, "a fflin.LinearModel")
+    if delay is not None:
+        delay = number("delay", delay)
+        if delay < 0.0:
+            raise InputError(f"delay is {delay:g} s, expected at least 0")
+        return lin, delay
+    known = policy._lin if isinstance(policy, Gain) else as_policy(policy).model
+    if lin.delay.any():
+        return lin, 0.0
+    if known is None:
+        if isinstance(policy, Gain) and is_delayed(policy.state_names):
+            raise InputError(
+                "the gain was designed for delayed inputs, but lin has no delay; give the model "
+                "of the gain, lin.discretize(dt, delay=...), or give delay="
+            )
+        return lin, 0.0
+    source = lin.generator if lin.dt else lin
+    if (
+        not known.delay.any()
+        or known.input_names != lin.input_names
+        or (lin.dt and not math.isclose(lin.dt, known.dt))
+    ):
+        return lin, 0.0
+    if source is None:
+        raise InputError(
+            "the law was designed for delayed inputs, but lin is sampled without a delay and its "
+            "continuous model is unknown; give the continuous model, or delay=0"
+        )
+    delays = dict(zip(input_keys(lin), known.delay.tolist(), strict=True))
+    return source.discretize(known.dt, delay=delays), 0.0
+
+
 @in_one_thread
 def margins_at_once(
-    policy: Policy, delay: float, sample: float | None
+    policy: Policy, delay: float | None, sample: float | None
 ) -> GainMargins | None:
     """Return the margins of a policy and its model for changes of all inputs at once.
 

@@ -36,12 +36,12 @@ from fflin.control.policy import BoundLaw, Command, Noise
 from fflin.control.tracking import TrajectoryFeedback
 from fflin.control.trajectory_end import rest_or_fall, steady_regulator
 from fflin.control.tvlqr import asks_steady, held_stages, tvlqr
-from fflin.control.weights import Rule, Weight, sampled_cost, weight
+from fflin.control.weights import Rule, Weight, sampled_cost, warn_of_integral, weight
 from fflin.dynamics.outputs import Measuring
 from fflin.dynamics.state import StateMap
 from fflin.linear.fit import require_fit
 from fflin.linear.linear_trajectory import LinearTrajectory, along
-from fflin.linear.model import LinearModel
+from fflin.linear.model import LinearModel, refuse_delayed
 from fflin.robot.fields import chosen_limits, input_limits, range_of
 from fflin.robot.robot import Robot
 
@@ -175,6 +175,8 @@ def mpc(
         (LinearModel, LinearTrajectory),
         "a LinearModel or a LinearTrajectory",
     )
+    if isinstance(lin, LinearModel):
+        refuse_delayed(lin, "model predictive control")
     samples = whole("horizon", horizon, 1)
     if sample is not None and dt is not None:
         raise InputError(
@@ -196,6 +198,8 @@ def mpc(
             "lin is sampled with another dt, or the model before sampling is not known; give the "
             "continuous model and sample="
         )
+    if disturbance is None and isinstance(source, LinearModel):
+        warn_of_integral(source, (Q, R), weights, "mpc")
     cost = (Q, R, Qf, weights)
     stageless = _stageless_horizon(source, limits, samples, dt)
     if isinstance(source, LinearTrajectory):

@@ -345,7 +345,7 @@ def plot_loops(
     path: str | Path | None = None,
     *,
     lin: LinearModel | None = None,
-    delay: float = 0.0,
+    delay: float | None = None,
     sample: float | None = None,
     axes: Axes | None = None,
 ) -> Figure:
@@ -364,7 +364,7 @@ def plot_loops(
     lin : LinearModel, optional
         Model with which the loop is closed: by default the model for which the law was designed.
     delay : float, optional
-        Delay [s] of all inputs.
+        Delay [s] of all inputs, as in `margins`.
     sample : float, optional
         Sampling time [s] with which a continuous law is executed.
     axes : matplotlib.axes.Axes, optional
@@ -475,8 +475,8 @@ def _plot_closed(
             fontsize=letters_of(1.3 * len(names), 200.0),
         )
         time = f", sampled at {closed.dt:g} s" if closed.dt else ""
-        if closed.delay:
-            time += f", delay {closed.delay:g} s"
+        if margins.delay:
+            time += f", delay {margins.delay:g} s"
         together = "the loop is unstable"
         if margins.stable:
             low, high = margins.gain

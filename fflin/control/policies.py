@@ -528,6 +528,11 @@ class Allocation(Policy):
         return self.inner.model
 
     @property
+    def input_delays(self) -> dict[str, float]:
+        """Delays of the inputs of `design` for which the inner policy was designed."""
+        return self.inner.input_delays
+
+    @property
     def feedback_gain(self) -> Array | None:
         """Gain of the inner policy."""
         return self.inner.feedback_gain

@@ -220,6 +220,14 @@ class Policy(ABC):
         return None
 
     @property
+    def input_delays(self) -> dict[str, float]:
+        """Delay [s] of each input for which the law was designed, by name; empty without delays."""
+        lin = self.model
+        if lin is None or not lin.delay.any():
+            return {}
+        return dict(zip(lin.input_names, lin.delay.tolist(), strict=True))
+
+    @property
     def feedback_gain(self) -> Array | None:
         """Gain K (nu, nx) of the states of `model`; None if the law is not a constant gain."""
         return None

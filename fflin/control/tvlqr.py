@@ -19,7 +19,14 @@ from fflin.control.default_weights import pace_along
 from fflin.control.gain import ModelDesign
 from fflin.control.optimal import differential_riccati as riccati
 from fflin.control.trajectory_end import steady_end, steady_regulator
-from fflin.control.weights import Rule, Weight, cost_weights, rule_weights, weight
+from fflin.control.weights import (
+    Rule,
+    Weight,
+    cost_weights,
+    rule_weights,
+    warn_of_integral,
+    weight,
+)
 from fflin.dynamics.integrators import held_cost
 from fflin.dynamics.state import StateMap
 from fflin.linear.fit import require_same
@@ -362,7 +369,9 @@ def tvlqr(
     names = traj.state_names
     if Q is None and R is None:
         pace = pace_along(float(traj.t[-1] - traj.t[0]), dt)
-        Q, R, _, rule = rule_weights(steady_end(traj).model, weights, pace)
+        end = steady_end(traj).model
+        warn_of_integral(end, (Q, R), weights, "a law along a trajectory")
+        Q, R, _, rule = rule_weights(end, weights, pace)
     elif weights is not None or Q is None or R is None:
         raise InputError(
             "give either both Q and R, or only weights='urdf' or 'identity'"

@@ -1,6 +1,7 @@
 """Weights of a quadratic cost, given by the user or computed by a rule."""
 
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Any, NamedTuple, TypeAlias
@@ -15,7 +16,7 @@ from fflin.analysis.reduction import (
     rigid_forces,
     without,
 )
-from fflin.base.errors import InputError, listed, require_known, unknown
+from fflin.base.errors import FflinWarning, InputError, listed, require_known, unknown
 from fflin.base.names import by_name, input_keys, matching, stands_for_any
 from fflin.base.validation import (
     Array,
@@ -461,6 +462,23 @@ def integrated(lin: LinearModel, given: Rule | None) -> Any:
     if own is None and isinstance(lin, LinearModel):
         own = lin.weights.get("integral")
     return own
+
+
+def warn_of_integral(
+    lin: LinearModel, cost: tuple[object, ...], given: Rule | None, design: str
+) -> None:
+    """Warn that a design without integral action ignores the integrals in the weights.
+
+    `cost` are the weights Q and R from the user, with which the weights of the robot have no
+    effect.
+    """
+    if all(matrix is None for matrix in cost) and integrated(lin, given):
+        warnings.warn(
+            f"{design} has no integral action, so the entry integral of the weights is ignored, "
+            "and a constant disturbance leaves an error",
+            FflinWarning,
+            stacklevel=4,
+        )
 
 
 def _limited_wheels(lin: LinearModel, wheels: Indices) -> Indices:

@@ -271,6 +271,12 @@ class CLaw(Policy):
         return self.dt
 
     @property
+    def input_delays(self) -> dict[str, float]:
+        """Delay [s] of each input in the model for which the law was designed."""
+        names, _ = self._about["signals"]["input"]
+        return dict(zip(names, self._about.get("delay", ()), strict=False))
+
+    @property
     def axes(self) -> tuple[Frame | None, pin.SE3 | None]:
         """Frame and reference of the code."""
         return self.frame, self.origin
@@ -500,6 +506,8 @@ def _texts(law: Law, name: str, real: str) -> tuple[str, dict[str, str]]:
         about["nq"] = len(lin.q)
         about["reference"] = lin.placement.tolist()
         about["point"] = [lin.q.tolist(), lin.v.tolist()]
+        if lin.delay.any():
+            about["delay"] = lin.delay.tolist()
     about["sha256"] = digest_of(about, header.encode(), source.encode())
     code = {".h": header, ".c": source, "_test.c": _filled("test.c", words)}
     return title, {**code, ".json": json.dumps(about, indent=1) + "\n"}

@@ -24,8 +24,9 @@ from fflin.base.validation import (
     positive,
     vector,
 )
+from fflin.control.data_sheet import output_keys
 from fflin.control.gain import Gain
-from fflin.control.margins import ClosedLoop, law_in_loop
+from fflin.control.margins import ClosedLoop, delayed_model, law_in_loop
 from fflin.control.policy import Policy, System
 from fflin.dynamics.state_rows import attitude_rotations
 from fflin.linear.model import LinearModel
@@ -199,7 +200,7 @@ def error_budget(
     disturbance: Mapping[str, object] | None = None,
     periodic: Mapping[str, tuple[float, float]] | None = None,
     force_noise: Mapping[str, float] | None = None,
-    delay: float = 0.0,
+    delay: float | None = None,
     sample: float | None = None,
     factor: float = 3.0,
     motion: Motion | None = None,
@@ -240,7 +241,8 @@ def error_budget(
     force_noise : mapping, optional
         White noise of forces {name: square root of the intensity [N m sqrt(s) or N sqrt(s)]}.
     delay : float, optional
-        Delay [s] of all inputs.
+        Delay [s] of all inputs, as in `margins`. The default is the delay of `lin` or, if it has
+        none, of the policy's model.
     sample : float, optional
         Sampling time [s] with which a continuous law is executed.
     factor : float
@@ -272,10 +274,7 @@ def error_budget(
     >>> float(budget.total[2]) > 0.0, float(budget.deviation[2])
     (True, 0.0)
     """
-    instance("lin", lin, LinearModel, "a fflin.LinearModel")
-    delay = number("delay", delay)
-    if delay < 0.0:
-        raise InputError(f"delay is {delay:g} s, expected at least 0")
+    lin, delay = delayed_model(policy, lin, delay)
     if sample is not None:
         sample = positive("sample", sample, "s")
     factor = positive("factor", factor)
@@ -325,7 +324,7 @@ def error_budget(
         simulated_mean=mean,
         simulated_deviation=spread,
         dt=loop.dt,
-        delay=delay,
+        delay=float(loop.delays.max(initial=0.0)),
         robot=lin.robot,
     )
 
@@ -402,8 +401,7 @@ class DisturbedLoop(ClosedLoop):
                 "lin is sampled and its continuous model is unknown, so forces between the samples "
                 "cannot be computed; give the continuous model"
             )
-        delays = np.full(self.plant.B.shape[1], delay)
-        self._delayed = self.with_delays(delays)
+        self._delayed = self.with_delays(self.delays)
         self.F = self.closed(self._delayed)[0]
         if not self.is_stable(self.F):
             raise InputError(
@@ -445,13 +443,13 @@ class DisturbedLoop(ClosedLoop):
 
     def measurement_noise(self, key: str, size: float) -> Contribution:
         """Return the effect of white noise of measured signals."""
-        at = self._signals("measured signal", key, self.law.inputs)
+        at = self._measured(key)
         G = size * self._from_measurements()[:, at]
         return Contribution(f"noise of {key}", "noise", self._deviation(G @ G.T))
 
     def bias(self, key: str, size: float) -> Contribution:
         """Return the effect of constant errors of measured signals."""
-        at = self._signals("measured signal", key, self.law.inputs)
+        at = self._measured(key)
         G = size * self._from_measurements()[:, at]
         return Contribution(f"bias of {key}", "constant", self._constants(G))
 
@@ -487,6 +485,11 @@ class DisturbedLoop(ClosedLoop):
         count = len(self.plant.A)
         W[:count, :count] = self._covariance(G @ G.T)
         return Contribution(f"white {key}", "noise", self._deviation(W))
+
+    def _measured(self, key: str) -> list[int]:
+        """Return the indices of measured signals; a quantity such as "gyroscope" is a name."""
+        names = self.law.inputs
+        return self._signals("measured signal", output_keys([key], names)[key], names)
 
     def _signals(self, kind: str, key: str, names: Sequence[str]) -> list[int]:
         return sorted(by_name(kind, {key: None}, names))

@@ -14,7 +14,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.errors import FflinWarning, InputError
+from fflin.base.errors import FflinWarning, InputError, listed
 from fflin.base.names import by_name, group_of
 from fflin.base.validation import (
     Array,
@@ -464,7 +464,7 @@ def delays_of(
 ) -> tuple[float, ...]:
     """Return the delay [s] of all inputs, or of each input.
 
-    The argument `delay` takes precedence over the delay of the policy's model.
+    The argument `delay` takes precedence over the delay for which the policy was designed.
     """
     if isinstance(delay, Mapping):
         keys = input_keys_of(plant.robot)
@@ -473,18 +473,16 @@ def delays_of(
         return tuple(value_at.get(index, 0.0) for index in range(len(keys)))
     if delay is not None:
         return (number("delay", delay),)
-    lin = None if policy is None else policy.model
-    if lin is None or not lin.delay.any():
-        return (0.0,)
-    delays = lin.delay.tolist()
-    if len({*delays}) == 1:
-        return (delays[0],)
-    if lin.input_names != plant.actuation.names:
+    delay_of = {} if policy is None else policy.input_delays
+    delays = tuple(delay_of.values())
+    if len({*delays}) < 2:
+        return delays[:1] or (0.0,)
+    if tuple(delay_of) != plant.actuation.names:
         raise InputError(
-            f"the model of the policy has different delays of the inputs of '{lin.robot}', which "
-            "are not the inputs of the simulated robot; give delay= with one delay for all"
+            f"the model of the policy has different delays of {listed([*delay_of])}, which are not "
+            "the inputs of the simulated robot; give delay= with one delay for all"
         )
-    return tuple(delays)
+    return delays
 
 
 def step_of(

@@ -244,6 +244,10 @@ def saturated(
         if not enforced:
             continue
         for limit in curve.levels:
+            # A speed whose limit is not enforced passes it, and is not held there.
+            beyond = curve.values * np.sign(limit) > (1.0 + margin) * abs(limit)
+            if curve.group == "speed" and beyond.any():
+                continue
             spent = held[np.abs(curve.values - limit) <= margin * abs(limit)]
             if limit and spent.any():
                 share = float(spent.sum() / held.sum())

@@ -209,6 +209,7 @@ def test_a_sampled_trajectory_of_a_mat_file_is_followed_past_its_end(flown):
         (("--offset", "q_b=0.8"), "1.39"),
         (("--offset", "jaw=1"), "'jaw'"),
         (("--schedule", "other.npz"), "remove --trajectory"),
+        (("--integral", "q_b"), "no integral action"),
         (("--schedule", "other.npz", "--q", "q_b=1"), "remove --trajectory, --q"),
         (("--allocate",), "thrusters"),
     ],

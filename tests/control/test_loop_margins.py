@@ -495,3 +495,25 @@ def test_loops_without_gain_and_delays_of_many_samples_are_refused():
         K[lin.input_names.index(f"tau_m.joint_{joint}")] *= factor
         margins = fflin.margins(fflin.StateFeedback(lin, K), lin, sample=sample)
         assert not margins.stable or min(x.delay for x in margins.channels) < 0.2
+
+
+def test_a_model_without_delay_gets_the_delay_of_the_law(tmp_path):
+    """The margins belong to the loop that `simulate` flies, unless a delay is given."""
+    _, lin = satellite()
+    late = lin.discretize(0.25, delay={"tau_b.x": 0.1, "tau_b.y": 0.25, "tau_b.z": 0.4})
+    gain = fflin.lqr(late)
+    expected = fflin.margins(gain, late)
+    early = fflin.margins(gain, lin, delay=0.0)
+    assert early.disk > expected.disk + 1e-3
+    for law in (gain, fflin.StateFeedback(late, gain)):
+        for model in (lin, lin.discretize(0.25)):
+            found = fflin.margins(law, model)
+            assert found.delay == pytest.approx(0.4)
+            assert found.disk == pytest.approx(expected.disk, rel=1e-9)
+    # A gain from a file does not know how long the delay is.
+    gain.save(tmp_path / "gain.npz")
+    loaded = fflin.Gain.load(tmp_path / "gain.npz")
+    with pytest.raises(fflin.InputError, match="designed for delayed inputs"):
+        fflin.margins(loaded, lin)
+    assert fflin.margins(loaded, late).disk == pytest.approx(expected.disk, rel=1e-9)
+    assert fflin.margins(loaded, lin, delay=0.4).stable

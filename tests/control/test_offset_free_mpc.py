@@ -1,5 +1,7 @@
 """Model predictive control from the estimate of a filter, with estimated disturbances."""
 
+import warnings
+
 import numpy as np
 import pytest
 
@@ -103,3 +105,26 @@ def test_estimators_that_do_not_fit_are_refused(satellite, designs):
     along = fflin.linearize_trajectory(satellite, motion.trajectory())
     with pytest.raises(fflin.InputError, match="about a point"):
         fflin.mpc(along, sample=0.1, disturbance=estimator)
+
+
+def test_a_model_with_delayed_inputs_is_refused(designs):
+    """The prediction would leave the delay out without a message."""
+    lin, _, _ = designs
+    with pytest.raises(fflin.InputError, match="delayed inputs"):
+        fflin.mpc(lin.discretize(SAMPLE, delay=0.1), horizon=5)
+
+
+def test_integrals_in_the_weights_are_ignored_with_a_warning(satellite, designs):
+    robot = satellite.replace(weights={"integral": ["q_b"]})
+    lin = fflin.linearize(robot)
+    with pytest.warns(fflin.FflinWarning, match="mpc has no integral action"):
+        fflin.mpc(lin, sample=SAMPLE, horizon=5)
+    motion = fflin.simulate(robot, duration=1.0, every=10)
+    along = fflin.linearize_trajectory(robot, motion.trajectory())
+    with pytest.warns(fflin.FflinWarning, match="no integral action"):
+        fflin.tvlqr(along, sample=0.1)
+    # The filter replaces the integrals, and other weights leave them out.
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        fflin.mpc(lin, sample=SAMPLE, horizon=5, disturbance=designs[2])
+        fflin.mpc(lin, 1.0, 1e4, sample=SAMPLE, horizon=5)

@@ -68,3 +68,41 @@ def test_compensators_that_do_not_fit_are_refused():
     short = fflin.OutputFeedback(lin, compensator, lambda t: np.zeros(3))
     with pytest.raises(fflin.InputError, match="output"):
         fflin.simulate(robot, short, duration=1.0)
+
+
+def test_the_compensator_of_a_delayed_model_needs_this_delay():
+    """A compensator without the commands on their way would fly another loop than its design."""
+    robot = fflin.load("cubesat", inputs=[fflin.BaseTorque()], outputs=["base"])
+    lin = fflin.linearize(robot)
+    designs = []
+    for delay in (0.0, 0.25):
+        model = lin.discretize(0.25, delay=delay)
+        estimator = fflin.kalman(model, {"omega_b": 1e-9}, 1e-6)
+        designs.append((model, fflin.lqg(fflin.lqr(model), estimator)))
+    (early, of_early), (late, of_late) = designs
+    for model, compensator in ((early, of_late), (late, of_early)):
+        with pytest.raises(fflin.InputError, match="delayed inputs"):
+            fflin.OutputFeedback(model, compensator)
+    # The estimate contains the commands after limits, and the compensator itself says so.
+    past = [name.startswith("past_") for name in of_late.state_names]
+    assert sum(past) == 3
+    np.testing.assert_array_equal(of_late.E[past], np.eye(3))
+    assert np.array_equal(fflin.OutputFeedback(late, of_late).windup, of_late.E)
+    assert not of_early.E.any()
+
+
+def test_a_controller_for_delayed_inputs_notes_that_its_model_has_no_delay(tmp_path):
+    robot = fflin.load("cubesat", inputs=[fflin.BaseTorque()], outputs=["base"])
+    lin = fflin.linearize(robot)
+    late = lin.discretize(0.25, delay=0.25)
+    estimator = fflin.kalman(late, {"omega_b": 1e-9}, 1e-6)
+    compensator = fflin.lqg(fflin.lqr(late), estimator)
+    compensator.save(tmp_path / "law.npz")
+    for given in (compensator, tmp_path / "law.npz"):
+        policy = fflin.LinearController(given, lin)
+        motion = fflin.simulate(robot, policy, duration=1.0)
+        assert any("designed for delayed inputs" in note for note in motion.notes)
+        motion = fflin.simulate(
+            robot, fflin.LinearController(given, late), duration=1.0
+        )
+        assert not any("delayed inputs" in note for note in motion.notes)

@@ -59,7 +59,7 @@ def test_the_code_equals_python_over_ten_thousand_samples(tmp_path, kind):
 @pytest.mark.process
 @needs_compiler
 def test_a_motion_with_the_code_equals_the_motion_with_the_law(tmp_path):
-    """The code does not know the delay of the plant, so `simulate` is given it."""
+    """The description of the code states the delays, so `simulate` applies them to both."""
     robot, late, law = designed("states")
     code = CLaw(fflin.write_c(law, tmp_path, limits=LIMITS))
     run = {
@@ -69,8 +69,11 @@ def test_a_motion_with_the_code_equals_the_motion_with_the_law(tmp_path):
         "dt": 0.01,
     }
     one = fflin.simulate(robot, law, **run)
-    other = fflin.simulate(robot, code, **run, delay=DELAY)
-    assert np.abs(one.x - other.x).max() < 1e-11
+    for delay in (DELAY, None):
+        other = fflin.simulate(robot, code, **run, delay=delay)
+        assert np.abs(one.x - other.x).max() < 1e-11
+    assert code.input_delays == law.input_delays
+    assert set(code.input_delays.values()) == set(DELAY.values())
 
 
 @pytest.mark.process

@@ -238,3 +238,40 @@ def test_the_report_and_the_refusals(satellite):
         fflin.error_budget(gain, lin, periodic={"tau_b.x": (1.0, 0.0)})
     with pytest.raises(UnknownNameError, match="error"):
         budget.error("attitude.w")
+
+
+def test_the_delay_of_the_model_or_of_the_law_is_in_the_budget(satellite):
+    """Four ways to give one delay have one result, as `simulate` has one motion."""
+    _, lin, _ = satellite
+    h, tau = 0.25, 0.4
+    late = lin.discretize(h, delay=tau)
+    policy = fflin.StateFeedback(late, fflin.lqr(late))
+    causes = {"noise": {"q_b": 1e-4}, "periodic": {"tau_b.y": (1e-5, 0.05)}}
+    expected = fflin.error_budget(policy, lin, delay=tau, **causes)
+    assert expected.delay == pytest.approx(tau)
+    for model in (lin, lin.discretize(h), late):
+        budget = fflin.error_budget(policy, model, **causes)
+        assert budget.delay == pytest.approx(tau)
+        np.testing.assert_allclose(budget.total, expected.total, rtol=1e-9, atol=1e-15)
+    early = fflin.error_budget(policy, lin, delay=0.0, **causes)
+    assert early.error("attitude.y")["noise of q_b"] != pytest.approx(
+        expected.error("attitude.y")["noise of q_b"], rel=1e-3
+    )
+    more = fflin.error_budget(policy, late, delay=0.1, **causes)
+    assert more.delay == pytest.approx(tau + 0.1)
+
+
+def test_a_measured_quantity_names_its_components_as_in_the_filter():
+    robot = fflin.load(
+        "cubesat",
+        inputs=[fflin.BaseTorque()],
+        outputs=[fflin.BasePose(), fflin.Gyroscope("base")],
+    )
+    model = fflin.linearize(robot).discretize(0.25)
+    noise = {"q_b": 1e-9, "r_b": 1e-4, "gyroscope": 1e-9}
+    estimator = fflin.kalman(model, {"omega_b": 1e-9}, noise)
+    policy = fflin.OutputFeedback(model, fflin.lqg(fflin.lqr(model), estimator))
+    named = fflin.error_budget(policy, model, noise={"gyroscope": 1e-5})
+    listed = fflin.error_budget(policy, model, noise={"*.gyroscope.*": 1e-5})
+    assert named.total.tolist() == listed.total.tolist()
+    assert named.total[0] > 0.0
