@@ -134,8 +134,8 @@ def simulate(
         Time [s] from a sample until its command takes effect, a multiple of dt: one for all inputs,
         or {name, group or pattern: delay}. The default is the delay of the policy's model or C
         code, see `LinearModel.discretize`. Until the first command takes effect, the input is u0 of
-        the policy's model or C code, or zero for a function. If `delay` is given without `sample`, the
-        policy is sampled every dt.
+        the policy's model or C code, or zero for a function. If `delay` is given without `sample`,
+        the policy is sampled every dt.
     limits : "urdf", float, mapping or list of them, optional
         Limits at which the inputs saturate. By default, inputs do not saturate. Limits are one of
 
