@@ -129,24 +129,41 @@ def split_by_poles(
 def _fixed_poles(
     rates: Values, unit: float, shapes: Values, dt: float, margin: ranks.Margin
 ) -> ranks.FixedPoles:
-    """Return the poles ``rates / unit`` with the shapes (nx, k), and whether they decay.
+    """Return the poles of the uncontrollable or unobservable part, and whether they decay.
 
-    If dt is not 0, `rates` belong to (A - I)/dt, and the returned poles belong to A.
+    `rates` (k,) are the eigenvalues of this part in the unit of time `unit` [s]. If dt is not 0,
+    they are eigenvalues of (A - I)/dt, and the returned poles are eigenvalues of A. Column i of
+    `shapes` (nx, k) is the motion with eigenvalue i. `margin` is the margin of the rank decisions.
     """
-    poles = rates / unit
-    decay = -rates.real
+    poles: Values
     if dt:
         poles = 1.0 + dt * rates / unit
         decay = 1.0 - np.abs(poles)
-    least, most = int(decay.argmin()), int(decay.argmax())
-    slow = ranks.Decision(max(float(decay[least]), 0.0) / ranks.DECAY, shapes[:, least])
-    if dt and abs(poles[most]) < _DEAD:
-        # The motion `shapes[:, most]` decays to rounding error within one sample. The samples
-        # cannot distinguish two such motions, so the rank is undecided.
-        dead = ranks.Margin((ranks.Decision(1.0, shapes[:, most]),))
-        margin &= dead.transformed(1.0, halved=True)
-    settling = ranks.Margin((slow,)).transformed(1.0, halved=True)
-    return ranks.FixedPoles(poles, bool(decay[least] > ranks.DECAY), margin, settling)
+    else:
+        poles = rates / unit
+        decay = -rates.real
+    slowest = int(decay.argmin())
+    fastest = int(decay.argmax())
+    if dt and abs(poles[fastest]) < _DEAD:
+        # This motion decays to rounding error within one sample. The samples cannot distinguish two
+        # such motions, so the rank is undecided.
+        margin &= _decision(1.0, shapes[:, fastest])
+    ratio = max(float(decay[slowest]), 0.0) / ranks.DECAY
+    return ranks.FixedPoles(
+        poles=poles,
+        decays=bool(decay[slowest] > ranks.DECAY),
+        margin=margin,
+        settling=_decision(ratio, shapes[:, slowest]),
+    )
+
+
+def _decision(ratio: float, state: Values) -> ranks.Margin:
+    """Return the margin of one decision about a motion `state` (nx,).
+
+    The motion is reported by its positions (nv,) or by its rates (nv,), whichever are larger.
+    """
+    decision = ranks.Margin((ranks.Decision(ratio, state),))
+    return decision.transformed(1.0, halved=True)
 
 
 def _left_vectors(A: Array, B: Array, tolerance: float) -> tuple[Array, ranks.Margin]:

@@ -91,24 +91,28 @@ def of_campaign(outcomes: Mapping[str, Array]) -> dict[str, Array]:
 
 
 def kinds_of(state: StateMap, wheels: Collection[str]) -> Indices:
-    """Return the index into KINDS of each state (nx,); `wheels` are the joints flown as wheels.
+    """Return the kind of error of each state (nx,); `wheels` are the joints flown as wheels.
 
-    The index is -1 for the angles of wheels, whose errors are not counted. The index is 0 for the
-    attitude and for the states without a kind, which are modes and wheel speeds. States with index
-    0 do not affect the error of any kind, because the attitude error is the rotation angle.
+    - 1 to 5: the error of the state counts as an error of this kind, an index into KINDS.
+    - 0: the error of the state counts in `largest_x` only. This is so for the attitude, whose error
+      is the rotation angle, and for the modes and the wheel speeds, which have no kind.
+    - -1: the error of the state does not count. This is so for the angles of wheels.
     """
     kind = np.zeros(state.nx, dtype=np.intp)
     groups, modes = state.groups, state.robot.modes
-    for number, group in enumerate(
-        (groups.r_b, groups.q_m, groups.omega_b, groups.v_b), 1
-    ):
-        kind[group] = number
-    kind[groups.qdot_m] = len(KINDS) - 1
+    kind[groups.r_b] = 1
+    kind[groups.q_m] = 2
+    kind[groups.omega_b] = 3
+    kind[groups.v_b] = 4
+    kind[groups.qdot_m] = 5
     for index, joint in enumerate(state.robot.joints):
-        if joint in modes or joint.name in wheels:
-            kind_of_position = 0 if joint in modes else -1
-            kind[groups.q_m.start + index] = kind_of_position
-            kind[groups.qdot_m.start + index] = 0
+        angle, rate = groups.q_m.start + index, groups.qdot_m.start + index
+        if joint in modes:
+            kind[angle] = 0
+            kind[rate] = 0
+        elif joint.name in wheels:
+            kind[angle] = -1
+            kind[rate] = 0
     return kind
 
 
@@ -386,27 +390,25 @@ class CampaignJob:
 
 
 class RunStatistics(lanes.Statistics):
-    """Statistics of eight parallel runs of a job in compiled code."""
+    """Statistics of eight parallel runs of a job in compiled code.
 
-    span = LOOK
+    They are the `loop.RunStatistics` of the kernel. Errors are deviations from the target of the
+    job. They are computed with a law that controls nothing: it computes the states and the errors,
+    and its path contains the reference.
+    """
 
     def __init__(self, job: CampaignJob) -> None:
         self._job = job
-        self._state = job.plant.state
+        self._state = state = job.plant.state
+        # number of steps after which `over` is checked
+        self.span = _LONG if job.over is None else LOOK
         target = job.target
-        if job.over is None:
-            self.span = _LONG
-        state = self._state
+        first = target if target.ndim == 1 else target[0]
         initial = job.plan.initial
         kinds = len(KINDS)
         times = len(job.steps)
-        first = target if target.ndim == 1 else target[0]
-        x, y, z = first[:3].tolist()
-        attitude = np.array((x, y, z, math.sqrt(max(0.0, 1.0 - x * x - y * y - z * z))))
         law = lanes.no_law(state, initial)
-        law.path.point.q[3:7] = quaternion_product(
-            conjugate(state.origin_quaternion), attitude
-        )
+        law.path.point.q[3:7] = _attitude_of(state, first)
         q_ref, nu_ref = job.path or (np.zeros(0), np.zeros(0))
         marks = loop.RunStatistics(
             robot=lanes.mechanics_of(job.plant),
@@ -478,6 +480,15 @@ class RunStatistics(lanes.Statistics):
             end=np.full(LANES, done * self._job.plan.times.dt),
             state_errors=_by_run(marks.states, times, self._state.nx),
         )
+
+
+def _attitude_of(state: StateMap, x: Array) -> Array:
+    """Return the base attitude of a state x (nx,) as a quaternion (x, y, z, w) in q."""
+    # q_b is the vector part of the attitude quaternion relative to the origin of the state.
+    a, b, c = x[:3].tolist()
+    scalar = math.sqrt(max(0.0, 1.0 - a * a - b * b - c * c))
+    attitude = np.array((a, b, c, scalar))
+    return quaternion_product(conjugate(state.origin_quaternion), attitude)
 
 
 def _by_run(values: Array, *shape: int) -> Array:

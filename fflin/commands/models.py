@@ -253,8 +253,8 @@ def model_report(lin: fflin.LinearModel) -> str:
     # Report unstable poles only for a continuous model at an equilibrium. Away from an equilibrium,
     # poles do not determine stability. If A^2 = 0, do not compute the poles, because all of them
     # are zero.
-    moving = stays and not lin.dt and (lin.A @ lin.A).any()
-    growing = fflin.modes(lin).unstable if moving else ()
+    has_poles = stays and not lin.dt and (lin.A @ lin.A).any()
+    growing = fflin.modes(lin).unstable if has_poles else ()
     if growing:
         shown = ", ".join(f"{mode.pole:.5g}" for mode in growing)
         parts.append(folded([f"unstable poles (positive real part): {shown}"]))

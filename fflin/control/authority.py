@@ -234,6 +234,8 @@ def least_reach(W: Array, low: Array, high: Array, kept: Array) -> float:
     kept : ndarray (m, p)
         Orthonormal columns, which span the subspace of the directions.
     """
+    # Rows of W may have different units, so the facets are computed from scaled rows. A normal n of
+    # scaled wrenches is the normal n / scale of wrenches.
     scale = np.linalg.norm(W, axis=1)
     columns = W / scale[:, None]
     columns /= np.linalg.norm(columns, axis=0)
@@ -246,9 +248,10 @@ def least_reach(W: Array, low: Array, high: Array, kept: Array) -> float:
         ]
         normals = np.stack(minors, axis=1) * (-1.0) ** np.arange(len(W))
         normals = normals[np.linalg.norm(normals, axis=1) > _ROUNDING]
-        within = np.linalg.norm(normals / scale @ kept, axis=1)
-        crossing = within > _ROUNDING * np.linalg.norm(normals / scale, axis=1)
-        along = (normals / scale)[crossing] @ W
+        unscaled = normals / scale
+        within = np.linalg.norm(unscaled @ kept, axis=1)
+        crossing = within > _ROUNDING * np.linalg.norm(unscaled, axis=1)
+        along = unscaled[crossing] @ W
         for components in (along, -along):
             reach = (
                 np.maximum(components * low, components * high).sum(axis=1)

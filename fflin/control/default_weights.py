@@ -154,12 +154,34 @@ def _damping(lin: LinearModel) -> Array:
     return damping
 
 
+class ModalCost(NamedTuple):
+    """Cost (10.7) for a bandwidth of 1 rad/s, and the m modes of the closed loop.
+
+    The cost is scaled so that the slowest mode has the frequency 1 rad/s.
+    """
+
+    on_inputs: Array  # (nu,), diagonal of R
+    on_positions: Array  # (m, m), weight on the coordinates
+    scale: float  # factor by which the cost was multiplied
+    gain: Array  # (nu, m), from coordinates to inputs
+    frequencies: Array  # (m,) [rad/s], ascending
+    # (m, m), columns of T V Lambda^(-1/2) of (10.7): velocities of the model per rate of a mode
+    modes: Array
+    to_modes: Array  # (m, m), from coordinates to modes
+    mass: Array  # (m,), inertia of each mode without the damping term B / w
+    input_momenta: Array  # (nu, m), momentum that each input adds per rate of a mode
+
+
 def _of_inertia(
-    lin: LinearModel, M: Array, inverse: Array, pace: Pace, momenta: Mapping[str, float]
+    lin: LinearModel,
+    M: Array,
+    to_velocities: Array,
+    pace: Pace,
+    momenta: Mapping[str, float],
 ) -> Weights:
     """Return the weights (10.7) for the inertia M (m, m), which includes the damping term B / w.
 
-    `inverse` (m, m) maps the rates of the coordinates to the velocities of the model.
+    `to_velocities` (m, m) maps the rates of the coordinates to the velocities of the model.
     """
     h = lin.dt or 1.0
     m = len(M)
@@ -167,64 +189,138 @@ def _of_inertia(
     # The displacements are rotations about the centre of mass, displacements of the centre of mass,
     # and joint displacements. `shift` maps them to the coordinates of the model.
     X = _about_center_of_mass(lin)
-    shift = np.linalg.solve(inverse, X @ inverse)
-    D = _upper_bound(lin, M, X, np.abs(inverse) @ size)
-    S = lin.M @ lin.B[m:] / h
-    cost = _input_costs(lin, S, D)
-    idle = _idle(X.T @ S, cost, X.T @ D @ X)
-    reach = _definite((S / cost) @ S.T, D)
-    ratios, T = _modes(M, _definite(_reference_effect(lin, S, D), D), reach)
-    back = np.linalg.inv(T)
-    # Scale the cost so that the frequency of the slowest mode is the bandwidth w.
-    unit = ratios[0]
-    cost, reach, ratios = cost * unit, reach / unit, ratios / unit
-    to_modes = back @ inverse
-    on_positions = to_modes.T @ (np.sqrt(ratios)[:, None] * to_modes)
-    on_positions = 0.5 * (on_positions + on_positions.T)
-    # Gain (nu, m) from coordinates to inputs, for a bandwidth of 1 rad/s.
-    gain = (S / cost).T @ np.linalg.solve(
-        reach, M @ T @ (ratios[:, None] ** 0.75 * to_modes)
-    )
-    rates = ratios**0.375
-    damped = (lin.M != M).any()
-    mass = np.diag(back @ np.linalg.solve(M, lin.M @ T)) if damped else np.ones(m)
-    room, motors = _speed_limits(lin, momenta)
-    added = (S / cost).T @ np.linalg.solve(reach, lin.M @ T)
-    taken = np.vstack((T, added[motors]))
-    use = _largest_use(gain @ shift, size, lin.state_names)
-    speeds = _limits_on(
-        "speed", room, _fastest(taken, rates, to_modes @ shift, size, lin, mass), 1.0
-    )
-    efforts = _limits_on("effort", _efforts_left(lin), use, 2.0)
-    limit = min([Limit(pace.bandwidth, ""), *speeds, *efforts])
-    achieved = ""
-    rate = rate_matrix(lin)
-    loaded = rate[m:].any() or rate[:m, :m].any()
-    if loaded:
-        growth, mode = _growth(lin)
-        limit = max(limit, Limit(_OF_GROWTH * growth, mode))
+    shift = np.linalg.solve(to_velocities, X @ to_velocities)
+    D = _upper_bound(lin, M, X, np.abs(to_velocities) @ size)
+    S = lin.M @ lin.B[m:] / h  # (m, nu), generalised forces of the inputs
+    on_inputs = _input_costs(lin, S, D)
+    modal = _modal_cost(lin, M, to_velocities, S, D, on_inputs)
+    largest_inputs = _largest_use(modal.gain @ shift, size, lin.state_names)
+    limits = _bandwidth_limits(lin, modal, shift, size, momenta, largest_inputs)
+    limit = min([Limit(pace.bandwidth, ""), *limits])
+    sampling = Limit(math.inf, "")
     if pace.hold:
-        limit = min(
-            limit,
-            Limit(pace.held / (pace.hold * float(rates[-1])), "the sampling time"),
-        )
-    on_velocities = _on_velocities(lin, S, cost, D / unit, damped) if loaded else None
-
-    def costs(w: float) -> tuple[Array, Array]:
-        Q = np.zeros_like(lin.A)
-        Q[:m, :m] = h * on_positions
-        if on_velocities:
-            Q[m:, m:] = h * on_velocities(w)
-        return Q, np.diag(h * cost / w**4)
-
-    if loaded:
+        fastest = float(modal.frequencies[-1])
+        sampling = Limit(pace.held / (pace.hold * fastest), "the sampling time")
+    damped = bool((lin.M != M).any())
+    # In A of a free mass at rest, only the rates of the coordinates depend on the velocities.
+    # Springs, dampers, gravity or a motion at the operating point add terms to A. Then velocities
+    # have weights too, and `_slowed` checks the efforts of the closed loop.
+    rate = rate_matrix(lin)
+    if rate[m:].any() or rate[:m, :m].any():
+        growth, mode = _growth(lin)
+        limit = min(max(limit, Limit(_OF_GROWTH * growth, mode)), sampling)
         least = min(Limit(_LEAST_OF_GROWTH * growth, mode), limit)
+        costs = _costs(
+            lin, modal, _on_velocities(lin, S, modal.on_inputs, D / modal.scale, damped)
+        )
+        idle = _idle(X.T @ S, on_inputs, X.T @ D @ X)
         limit, achieved = _slowed(lin, costs, shift, size, size * ~idle, limit, least)
+    else:
+        limit = min(limit, sampling)
+        costs = _costs(lin, modal, None)
+        achieved = ""
     rule = _rule(lin, size, limit, achieved, pace.fraction * ROTATION)
     if damped:
         rule += "; joint damping is included"
-    terms = h * np.append(np.tile(on_positions.diagonal() * size**2, 2), cost * use**2)
+    position_terms = modal.on_positions.diagonal() * size**2
+    input_terms = modal.on_inputs * largest_inputs**2
+    terms = h * np.append(np.tile(position_terms, 2), input_terms)
     return *costs(limit.bandwidth), rule, limit.bandwidth, terms
+
+
+def _modal_cost(
+    lin: LinearModel,
+    M: Array,
+    to_velocities: Array,
+    S: Array,
+    D: Array,
+    on_inputs: Array,
+) -> ModalCost:
+    """Return the cost (10.7) for a bandwidth of 1 rad/s.
+
+    M, D and S are the matrices of (10.7). `on_inputs` (nu,) is the diagonal of R before scaling.
+    """
+    reach = _definite((S / on_inputs) @ S.T, D)
+    eigenvalues, modes = _modes(M, _definite(_reference_effect(lin, S, D), D), reach)
+    # Scale the cost so that the frequency of the slowest mode is the bandwidth.
+    scale = eigenvalues[0]
+    on_inputs = on_inputs * scale
+    reach = reach / scale
+    eigenvalues = eigenvalues / scale
+    from_velocities = np.linalg.inv(modes)
+    to_modes = from_velocities @ to_velocities
+    on_positions = to_modes.T @ (np.sqrt(eigenvalues)[:, None] * to_modes)
+    # The inputs R^-1 S' (S R^-1 S')^-1 f exert the generalised forces f.
+    stiffness = M @ modes @ (eigenvalues[:, None] ** 0.75 * to_modes)
+    gain = (S / on_inputs).T @ np.linalg.solve(reach, stiffness)
+    input_momenta = (S / on_inputs).T @ np.linalg.solve(reach, lin.M @ modes)
+    mass = np.ones(len(M))
+    if (lin.M != M).any():
+        mass = np.diag(from_velocities @ np.linalg.solve(M, lin.M @ modes))
+    return ModalCost(
+        on_inputs=on_inputs,
+        on_positions=0.5 * (on_positions + on_positions.T),
+        scale=scale,
+        gain=gain,
+        frequencies=eigenvalues**0.375,
+        modes=modes,
+        to_modes=to_modes,
+        mass=mass,
+        input_momenta=input_momenta,
+    )
+
+
+def _costs(
+    lin: LinearModel,
+    modal: ModalCost,
+    on_velocities: Callable[[float], Array] | None,
+) -> Callable[[float], tuple[Array, Array]]:
+    """Return a function that maps a bandwidth to the weights Q (nx, nx) and R (nu, nu).
+
+    `on_velocities` maps a bandwidth to the weight (m, m) on velocities, which is zero by default.
+    """
+    h = lin.dt or 1.0
+    m = len(lin.M)
+
+    def costs(w: float) -> tuple[Array, Array]:
+        Q = np.zeros_like(lin.A)
+        Q[:m, :m] = h * modal.on_positions
+        if on_velocities:
+            Q[m:, m:] = h * on_velocities(w)
+        return Q, np.diag(h * modal.on_inputs / w**4)
+
+    return costs
+
+
+def _bandwidth_limits(
+    lin: LinearModel,
+    modal: ModalCost,
+    shift: Array,
+    size: Array,
+    momenta: Mapping[str, float],
+    largest_inputs: Array,
+) -> list[Limit]:
+    """Return the bandwidths at which speeds, wheel momenta and efforts reach their limits.
+
+    `shift` (m, m) maps the displacements with the magnitudes `size` (m,) to the coordinates of the
+    model. The displacements require inputs of at most `largest_inputs` (nu,) if the bandwidth is
+    1 rad/s.
+    """
+    speed_limits, motors = _speed_limits(lin, momenta)
+    speeds_and_momenta = np.vstack((modal.modes, modal.input_momenta[motors]))
+    largest_speeds = _fastest(
+        speeds_and_momenta,
+        modal.frequencies,
+        modal.to_modes @ shift,
+        size,
+        lin,
+        modal.mass,
+    )
+    # Speeds are proportional to the bandwidth, and efforts to its square.
+    return [
+        *_limits_on("speed", speed_limits, largest_speeds, 1.0),
+        *_limits_on("effort", _efforts_left(lin), largest_inputs, 2.0),
+    ]
 
 
 def _speed_limits(
@@ -448,30 +544,36 @@ def displacements(lin: LinearModel, fraction: float) -> Array:
 
 
 def _fastest(
-    T: Array, rates: Array, to_modes: Array, size: Array, lin: LinearModel, mass: Array
+    to_speeds: Array,
+    frequencies: Array,
+    to_modes: Array,
+    size: Array,
+    lin: LinearModel,
+    mass: Array,
 ) -> Array:
     """Return the largest speeds and wheel momenta (k,) during the return from displacements.
 
-    The displacements have the magnitudes `size` (m,), and the bandwidth is 1 rad/s. T (k, m) maps
-    the rates of the modes to the speeds and the wheel momenta.
+    The displacements have the magnitudes `size` (m,), and the bandwidth is 1 rad/s. `to_speeds`
+    (k, m) maps the rates of the modes to the speeds and the wheel momenta.
     """
     # In closed loop, each mode x obeys ``mass x'' + damping x' + stiffness x = 0``. The modes are
     # normalised with M + B / w, so `mass` (m,) is 1 without dampers, and at most 1 with dampers.
     # The dampers alone have the coefficient 1 - mass.
-    stiffness = rates**2
+    stiffness = frequencies**2
     damping = np.sqrt((1.0 - mass) ** 2 + 2.0 * mass * stiffness)
     # The imaginary part avoids a division by zero if a mode is critically damped.
     root = np.sqrt(damping**2 - 4.0 * mass * stiffness + 1e-12j)
-    # A light mode with dampers decays at up to rates^2, a mode without dampers at about `rates`.
-    fastest = rates[-1]
+    # A light mode with dampers decays at up to its frequency^2, a mode without dampers at about
+    # its frequency.
+    fastest = frequencies[-1]
     if (mass != 1.0).any():
-        fastest = rates[-1] ** 2
+        fastest = frequencies[-1] ** 2
     time = np.geomspace(0.1 / fastest, 3.0, 60)[:, None]
     slow = np.exp((root - damping) * time / (2.0 * mass))
     fast = np.exp((-root - damping) * time / (2.0 * mass))
     # Speed -x' of each mode at each time, after a start from rest with x = 1.
     mode_speeds = (stiffness * (slow - fast) / root).real
-    rows = T @ (mode_speeds[..., None] * to_modes)
+    rows = to_speeds @ (mode_speeds[..., None] * to_modes)
     use = _largest_use(rows, size, lin.state_names)
     largest: Array = use.max(axis=0)
     return largest

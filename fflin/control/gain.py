@@ -414,18 +414,23 @@ class StaticLoop(NamedTuple):
 def static_loop(
     loop: Array, B: Array, H: Array, factor: Array, dt: float
 ) -> StaticLoop:
-    """Return the static gain of a closed loop from its scaled inputs to H x.
+    """Return the static gain and the slowest time constant of a closed loop.
 
-    `factor` (nu, nu) is the lower Cholesky factor of a weight of the inputs. The inputs are scaled
-    such that this weight is the identity.
+    The loop is from its scaled inputs to H x. `loop` (nx, nx) is A - B K, for the sampling time dt
+    [s], or for continuous time if dt is 0. `factor` (nu, nu) is the lower Cholesky factor of a
+    weight of the inputs. The inputs are scaled such that this weight is the identity.
     """
-    one = np.eye(len(loop)) if dt else np.zeros_like(loop)
-    driven = np.linalg.solve(factor, B.T).T
-    held = np.linalg.solve(one - loop, driven)
-    gain = H @ held
-    delayed = H @ np.linalg.solve(one - loop, held)
-    times = np.linalg.eigvals(delayed @ np.linalg.pinv(gain))
-    terms = np.abs(H) @ np.linalg.norm(held, axis=1)
+    # Near s = 0, the transfer function is G(s) = gain - s slope. For a first-order loop with the
+    # time constant T, slope = T gain. In general, the time constants are the eigenvalues of
+    # slope gain^+. For a sampled model, z - 1 replaces s, and the times are in samples.
+    # `at_zero_frequency` is s I at s = 0, or z I at z = 1.
+    at_zero_frequency = np.eye(len(loop)) if dt else np.zeros_like(loop)
+    scaled_B = np.linalg.solve(factor, B.T).T
+    static_states = np.linalg.solve(at_zero_frequency - loop, scaled_B)
+    gain = H @ static_states
+    slope = H @ np.linalg.solve(at_zero_frequency - loop, static_states)
+    times = np.linalg.eigvals(slope @ np.linalg.pinv(gain))
+    terms = np.abs(H) @ np.linalg.norm(static_states, axis=1)
     return StaticLoop(gain, terms, float(np.abs(times).max()) * (dt or 1.0))
 
 

@@ -253,10 +253,12 @@ class LinearLaw(Feedback):
     def around(self, lin: LinearModel) -> tuple[LinearModel, Array, Array]:
         """Return the model with the law's states added, and K and u of the law u + K e.
 
-        The inputs of this model are the limited inputs, which also drive the anti-windup.
+        e contains the errors x - x0 of the model, and the states z of the law. The inputs of the
+        returned model are the limited inputs, which also drive the anti-windup.
         """
         A, B, C, D, u0, y0, _, E = self.terms()
         measured, through, values = self._measured(lin)
+        # y - y0 = measured (x - x0) + through (u_a - lin.u0) + apart
         apart = values - y0
         gains = np.hstack((D @ measured, C))
         offset = u0 + D @ apart
@@ -264,6 +266,7 @@ class LinearLaw(Feedback):
         rows = np.hstack((B @ measured, A))
         inputs, drift = B @ through, B @ apart
         if E.size:
+            # Add E (u_a - u), where u_a are the inputs of the model and u = offset + gains e.
             rows = rows - E @ gains
             inputs = inputs + E
             drift = drift - E @ (offset - lin.u0)

@@ -53,14 +53,25 @@ class SteadyEnd(NamedTuple):
         return v
 
     def of_trajectory(self, robot: Robot) -> LinearModel:
-        """Return the model of the errors of the trajectory of a robot."""
+        """Return the linear model of the errors of the trajectory of a robot.
+
+        The errors of `model` are T times the errors of the trajectory, see `map`. So the returned
+        model has the matrices A' = T^-1 A T and B' = T^-1 B. The outputs are linearised again,
+        because the outputs of `model` are for the velocity relative to the falling axes.
+        """
         lin, T = self.model, self.map
         if not self.fall.any():
             return lin
-        back = 2.0 * np.eye(len(T)) - T  # the inverse, because (T - I)^2 = 0
+        inverse = 2.0 * np.eye(len(T)) - T  # because (T - I)^2 = 0
         outputs = Linearizer(robot, moving=True)(lin.q, self.v, lin.u0)
-        output_fields = {name: getattr(outputs, name) for name in ("C", "D", "y0")}
-        return replace(lin, A=back @ lin.A @ T, B=back @ lin.B, **output_fields)
+        return replace(
+            lin,
+            A=inverse @ lin.A @ T,
+            B=inverse @ lin.B,
+            C=outputs.C,
+            D=outputs.D,
+            y0=outputs.y0,
+        )
 
 
 def steady_end(traj: LinearTrajectory, end: int = -1) -> SteadyEnd:

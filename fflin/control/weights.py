@@ -499,44 +499,72 @@ def _of_regulated(
     The costs are the contributions of the states and inputs to the cost function at their largest
     values. The cost is 0 for states and inputs without a largest value in the rule.
     """
+    # `lin` contains all states, and `part` the regulated states, which may include wheel speeds.
+    # `body` contains the regulated states of the robot without its ignorable wheels. The default
+    # weights are computed for `body`, and the wheel speeds of `part` get their weight afterwards.
     part = regulated_part(lin, wheel_speeds)
     wheels, _ = ignorable_wheels(lin)
     body = lin
     if part is not lin:
         body = regulated_part(without(lin, wheels))
-    at = _limited_wheels(lin, wheels)
-    names = [lin.state_names[i + len(lin.M)] for i in at]
-    spin = np.abs(lin.x0[at + len(lin.M)])
-    most = np.array([lin.limits[name] for name in names])
-    # For a wheel that is already at its speed limit, `room` is computed as for a wheel at rest. The
-    # report names the wheel.
-    room = (
-        np.where(spin < most, most - spin, most) / np.linalg.inv(lin.M).diagonal()[at]
-    )
-    momenta = dict(zip(names, room, strict=True))
+    momenta, beyond = _momenta_left(lin, wheels)
     Q, R, rule, bandwidth, terms = default_weights(body, pace, momenta)
-    if beyond := [
-        name for name, x, y in zip(names, spin, most, strict=True) if x >= y > 0.0
-    ]:
+    if beyond:
         rule += (
             "; wheel speeds already at or beyond the URDF limit at the operating point: "
             f"{listed(beyond)}"
         )
-    S = selection(body.state_names, lin.state_names)
-    Q = S.T @ Q @ S
-    terms = np.append(terms[: len(S)] @ S, terms[len(S) :])
+    to_body = selection(body.state_names, lin.state_names)
+    nx = len(body.state_names)
+    Q = to_body.T @ Q @ to_body
+    terms = np.append(terms[:nx] @ to_body, terms[nx:])
     if speeds := [name for name in part.state_names if name not in body.state_names]:
-        S = selection(speeds, lin.state_names)
         slow = _SPEEDS * bandwidth
-        # The combinations of inputs in the null space of `forces` accelerate the wheels, but exert
-        # no force on the robot without its wheels. X maps coordinates in this null space to the
-        # accelerations of the wheels.
-        root, forces = np.sqrt(R.diagonal()), rigid_forces(without(lin, wheels))
-        idle, _ = null_space(forces @ np.diag(1.0 / root))
-        X = S @ lin.B / root @ idle / (lin.dt or 1.0)
-        Q += slow**2 * S.T @ np.linalg.pinv(X @ X.T, 1e-9, hermitian=True) @ S
+        Q += _wheel_speed_cost(lin, wheels, speeds, R, slow)
         rule = f"{rule}; wheel speeds regulated with a bandwidth of {slow:.3g} rad/s"
     return Q, R, rule, terms
+
+
+def _momenta_left(
+    lin: LinearModel, wheels: Indices
+) -> tuple[dict[str, float], list[str]]:
+    """Return {wheel speed: largest momentum [N m s] that the motor may add to the wheel}.
+
+    `wheels` are the indices of the ignorable wheels. The momentum of wheel i is the difference
+    between its speed limit and its present speed, divided by (M^-1)_ii. The second result contains
+    the names of the wheel speeds that are at or beyond their limits. The momentum of such a wheel
+    is computed as if the wheel were at rest.
+    """
+    limited = _limited_wheels(lin, wheels)
+    names = [lin.state_names[i + len(lin.M)] for i in limited]
+    speeds = np.abs(lin.x0[limited + len(lin.M)])
+    limits = np.array([lin.limits[name] for name in names])
+    speeds_left = np.where(speeds < limits, limits - speeds, limits)
+    momenta = speeds_left / np.linalg.inv(lin.M).diagonal()[limited]
+    beyond = [
+        name
+        for name, speed, limit in zip(names, speeds, limits, strict=True)
+        if speed >= limit > 0.0
+    ]
+    return dict(zip(names, momenta, strict=True)), beyond
+
+
+def _wheel_speed_cost(
+    lin: LinearModel, wheels: Indices, speeds: list[str], R: Array, bandwidth: float
+) -> Array:
+    """Return the weight w^2 S' (X X')^+ S (nx, nx) that regulates wheel speeds.
+
+    S selects the wheel speeds named `speeds`, and w [rad/s] is `bandwidth`. X maps combinations of
+    inputs to the accelerations of these wheels. The combinations are orthonormal with respect to R,
+    and exert no force on the rigid motions of the robot without the ignorable `wheels`.
+    """
+    S = selection(speeds, lin.state_names)
+    root, forces = np.sqrt(R.diagonal()), rigid_forces(without(lin, wheels))
+    forceless, _ = null_space(forces @ np.diag(1.0 / root))
+    X = S @ lin.B / root @ forceless / (lin.dt or 1.0)
+    inverse = np.linalg.pinv(X @ X.T, 1e-9, hermitian=True)
+    cost: Array = bandwidth**2 * S.T @ inverse @ S
+    return cost
 
 
 def _weights_of(

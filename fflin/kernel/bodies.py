@@ -34,6 +34,8 @@ def _inertia(work, at, place, bodies, first):
     axes = vec.get_columns(work, place)
     store(work, at, load(bodies, first))
     vec.put3(work, at + 1, vec.product(axes, vec.get3(bodies, first + 1)))
+    # R I R^T with the rotation R = `axes`: u, v and w are the columns of R I, and each product with
+    # a row of R I is a column of the symmetric result. Only six entries of the result are kept.
     (xx, xy, xz), (yy, yz, zz) = vec.get6(bodies, first + 4)
     u = vec.product(axes, (xx, xy, xz))
     v = vec.product(axes, (xy, yy, yz))

@@ -18,6 +18,11 @@ m v r^T over the mass points of the subtree. Each mass point has the mass m, the
 position r from the joint. Let s be a motion vector with the angular part w. The force part of 2 B s
 is 2 w x p. The moment part is 2 (tr(G) E - G) w + w x h, with the identity matrix E.
 
+The equations also hold for the angular velocity omega_b of the base, with one change. In general,
+2 I Psi' in the second and fourth equation is I (Psi' + dS/dt). A joint axis is fixed in the parent,
+so dS/dt = v x S = Psi'. The base has no parent, so Psi' = 0. Its axes e are fixed in the base, so
+dS/dt = omega_b x e. Therefore I (Psi' + dS/dt) is the single term I (omega_b x e).
+
 References
 ----------
 S. Singh, R. P. Russell and P. M. Wensing, Efficient analytical derivatives of rigid-body dynamics
@@ -104,7 +109,7 @@ def differentiate(work, tree):
     width = 2 * len(tree.row)
     zero = 0.0
     one = 1.0
-    spin = vec.get3(work, offsets.motion)
+    omega_b = vec.get3(work, offsets.motion)
     _write_springs(work, tree, width)
     # The path of a joint i is the base, the joints before joint i, and joint i itself. For each
     # joint i, write the derivatives of the forces of its path with respect to the position and rate
@@ -114,53 +119,64 @@ def differentiate(work, tree):
         at = offsets.load + body * LOAD
         moving = offsets.motion + body * MOTION
         inertia = offsets.subtree_inertias + body * INERTIA
-        column = tree.coordinate[body]
-        axis = joint_axis(work, tree, body)
-        psi, psi2 = vec.get6(work, moving + PSI), vec.get6(work, moving + PSI2)
-        momentum = inertia_times(work, inertia, axis)
-        coriolis = _coriolis_transposed(work, at, axis)
+        column_i = tree.coordinate[body]
+        row_i = offsets.lower + column_i * width
+        axis_i = joint_axis(work, tree, body)
+        psi_i, psi2_i = vec.get6(work, moving + PSI), vec.get6(work, moving + PSI2)
+        # I_i S_i, and the moment part of 2 B_i^T S_i, whose force part is zero
+        momentum = inertia_times(work, inertia, axis_i)
+        coriolis = _coriolis_transposed(work, at, axis_i)
+        # by_q = 2 B_i Psi'_i + I_i Psi''_i + S_i x* f_i
         moment, force = vec.get6(work, at + FORCE)
         by_q = vec.plus6(
-            _coriolis(work, at, psi[0]), inertia_times(work, inertia, psi2)
+            _coriolis(work, at, psi_i[0]), inertia_times(work, inertia, psi2_i)
         )
-        turned = vec.plus(vec.cross(axis[0], moment), vec.cross(axis[1], force))
-        by_q = vec.plus6(by_q, (turned, vec.cross(axis[0], force)))
-        weight = inertia_times(work, inertia, psi)
-        by_v = vec.plus6(_coriolis(work, at, axis[0]), vec.plus6(weight, weight))
-        joint_row = offsets.lower + column * width
+        turned = vec.plus(vec.cross(axis_i[0], moment), vec.cross(axis_i[1], force))
+        by_q = vec.plus6(by_q, (turned, vec.cross(axis_i[0], force)))
+        # by_v = 2 B_i S_i + 2 I_i Psi'_i
+        inertial = inertia_times(work, inertia, psi_i)
+        by_v = vec.plus6(_coriolis(work, at, axis_i[0]), vec.plus6(inertial, inertial))
         above = body
         while above > 0:
             place = offsets.places + above * PLACE
-            other = tree.coordinate[above]
-            axis = joint_axis(work, tree, above)
-            row = offsets.lower + other * width
-            vec.add(work, row + column, vec.dot6(axis, by_q))
-            vec.add(work, row + (column + 6 + n), vec.dot6(axis, by_v))
+            column_j = tree.coordinate[above]
+            row_j = offsets.lower + column_j * width
+            axis_j = joint_axis(work, tree, above)
+            # dtau_j/dq_i
+            vec.add(work, row_j + column_i, vec.dot6(axis_j, by_q))
+            # dtau_j/dq'_i
+            vec.add(work, row_j + (column_i + 6 + n), vec.dot6(axis_j, by_v))
             if above != body:
                 moving = offsets.motion + above * MOTION
-                psi, psi2 = vec.get6(work, moving + PSI), vec.get6(work, moving + PSI2)
+                psi_j = vec.get6(work, moving + PSI)
+                psi2_j = vec.get6(work, moving + PSI2)
+                # dtau_i/dq_j
                 vec.add(
                     work,
-                    joint_row + other,
-                    vec.dot(coriolis, psi[0]) + vec.dot6(momentum, psi2),
+                    row_i + column_j,
+                    vec.dot(coriolis, psi_j[0]) + vec.dot6(momentum, psi2_j),
                 )
-                value = vec.dot6(momentum, psi)
-                value = vec.dot(coriolis, axis[0]) + (value + value)
-                vec.add(work, joint_row + (other + 6 + n), value)
+                # dtau_i/dq'_j
+                half = vec.dot6(momentum, psi_j)
+                value = vec.dot(coriolis, axis_j[0]) + (half + half)
+                vec.add(work, row_i + (column_j + 6 + n), value)
+            # Move the moments and the momentum from joint j to its parent.
             momentum = at_parent(work, place, momentum)
             by_q, by_v = at_parent(work, place, by_q), at_parent(work, place, by_v)
             above = tree.parent[above]
+        # dtau_i/domega_b, with (I_i S_i)^T (omega_b x e) = e^T (I_i S_i x omega_b) for each axis e
         vec.add3(
-            work, joint_row + (6 + n), vec.plus(coriolis, vec.cross(momentum[0], spin))
+            work, row_i + (6 + n), vec.plus(coriolis, vec.cross(momentum[0], omega_b))
         )
-        bodies.add_column(work, offsets.lower + column, width, by_q)
-        bodies.add_column(work, offsets.lower + (column + 6 + n), width, by_v)
-    # Write the derivatives of the base's moment and force with respect to omega_b.
+        # Derivatives of the base's moment and force: dtau_b/dq_i and dtau_b/dq'_i
+        bodies.add_column(work, offsets.lower + column_i, width, by_q)
+        bodies.add_column(work, offsets.lower + (column_i + 6 + n), width, by_v)
+    # dtau_b/domega_b = 2 B e + I (omega_b x e) for each axis e of the base
     axes = (one, zero, zero), (zero, one, zero), (zero, zero, one)
     for index in range(3):
-        turning = vec.cross(spin, axes[index]), (zero, zero, zero)
-        weight = inertia_times(work, offsets.subtree_inertias, turning)
-        total = vec.plus6(_coriolis(work, offsets.load, axes[index]), weight)
+        axis_rate = vec.cross(omega_b, axes[index]), (zero, zero, zero)
+        inertial = inertia_times(work, offsets.subtree_inertias, axis_rate)
+        total = vec.plus6(_coriolis(work, offsets.load, axes[index]), inertial)
         bodies.add_column(work, offsets.lower + (6 + n + index), width, total)
 
 

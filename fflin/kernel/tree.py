@@ -379,7 +379,11 @@ def _contributions(
     paths: list[list[int]],
     row: NDArray[np.intp],
 ) -> tuple[list[int], list[float]]:
-    """Return the fields `target` and `share`: the contributions of the bodies to M."""
+    """Return the fields `target` and `share` of `Tree`: the contributions of the bodies to M.
+
+    `paths[i]` contains the columns of the entries of M that are packed in row i, and `row[i]` is
+    the offset of this row.
+    """
     target: list[int] = []
     share: list[float] = []
     for body in range(len(parent) - 1, 0, -1):
@@ -387,9 +391,13 @@ def _contributions(
         while above > 0:
             low, high = sorted((coordinate[body], coordinate[above]))
             target.append(row[high] + paths[high].index(low))
+            # With a mimic joint, two bodies on one path can move with the same coordinate. M is
+            # symmetric, so this pair contributes to the diagonal entry twice, once in each order.
+            # Off the diagonal, the two orders contribute to two entries, of which one is packed.
             twice = 2.0 if low == high and above != body else 1.0
             share.append(twice * factor[body] * factor[above])
             above = parent[above]
+        # the six entries that couple the coordinate to the base, which begin each packed row
         target.append(row[coordinate[body]])
         share.append(factor[body])
     return target, share

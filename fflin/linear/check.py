@@ -249,8 +249,9 @@ class References:
         self._outputs: OutputReference | None = None
         if robot.outputs != (FullState(),):
             # Large steps are accurate, because the kinematics consist of sines and cosines.
-            steps = self._steps(lin, joints=0.03, modes=0.1)[: len(lin.x0)]
-            self._outputs = OutputReference(self._model, self.route, lin, steps)
+            steps = self._steps(lin, joints=0.03, modes=0.1)
+            state_steps = steps[: len(lin.x0)]
+            self._outputs = OutputReference(self._model, self.route, lin, state_steps)
 
     def matrices(self) -> dict[str, Reference]:
         """Return A and B by ABA, and C and D if the output is not the state."""

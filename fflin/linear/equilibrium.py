@@ -738,6 +738,9 @@ def relative_equilibria(
         squares = np.array([-pitch, larger, smaller], dtype=complex)
         roots = n * np.sqrt(squares)
         poles = np.column_stack((roots, -roots)).ravel()
+        # No pole is unstable if all values of mu are real and negative. For pitch, mu = -`pitch`.
+        # For roll and yaw, the sum of both values is -b, their product is c, and they are real if
+        # b^2 - 4 c is positive.
         margin = float(min(pitch, c, b, b * b - 4.0 * c) / rounding)
         stable = None if abs(margin) <= 1.0 else margin > 0.0
         equilibria.append(RelativeEquilibrium(at, moments, poles, stable, margin))

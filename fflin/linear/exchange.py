@@ -401,7 +401,9 @@ def euler_step(
     else:
         K[:6, :6] = pin.exp6(-moved[:6]).toActionMatrix()
         G[:6, :6] = h * pin.Jexp6(moved[:6])
-    A, B = h * A[nv:] + np.eye(nv, 2 * nv, nv), h * B[nv:]
+    # The step computes the new velocities first, and from them the new positions.
+    old_velocities = np.eye(nv, 2 * nv, nv)  # [0 I]
+    A, B = h * A[nv:] + old_velocities, h * B[nv:]
     A, B = np.vstack((G @ A, A)), np.vstack((G @ B, B))
     A[:nv, :nv] += K
     return A, B, np.concatenate((moved, h * a))

@@ -283,9 +283,10 @@ def _robot(
     followers = tuple(
         Follower(by_name[x], by_name[m.leader], *m[1:]) for x, m in mimics.items()
     )
-    # In depth-first order, the joint indices of each subtree are consecutive.
+    # In depth-first order, the joint indices of each subtree are consecutive: the last index
+    # exceeds the first by the number of joints minus 1.
     if any(
-        subtree[len(subtree) - 1] - subtree[0] >= len(subtree)
+        subtree[len(subtree) - 1] - subtree[0] > len(subtree) - 1
         for subtree in model.subtrees
     ):
         raise ModelError(

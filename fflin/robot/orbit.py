@@ -114,6 +114,7 @@ class CircularOrbit:
             ground = positive("body_radius", self.body_radius)
         if self.altitude is None:
             n = positive("mean_motion", self.mean_motion)
+            # The radius is (mu / n^2)^(1/3), computed without overflow of n^2.
             altitude = (mu / n) ** (1.0 / 3.0) / n ** (1.0 / 3.0) - ground
         else:
             altitude = number("altitude", self.altitude)

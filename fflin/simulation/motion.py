@@ -328,10 +328,16 @@ class Motion(StatesAndInputs, Design):
         Raises
         ------
         InputError
-            If a phase does not begin at the end of the phase before it, has another frame or more
-            inputs than this motion, or was read from a file.
+            If no phase is given, or the last phase is an impact. Also if a phase does not begin at
+            the end of the phase before it, has another frame or more inputs than this motion, or
+            was read from a file.
         """
-        if not later or isinstance(later[-1], Impact):
+        if not later:
+            raise InputError(
+                "no later phase is given, expected Motion or Impact objects; give the motion "
+                "after this one"
+            )
+        if isinstance(later[-1], Impact):
             raise InputError(
                 "the last phase is an impact, expected a Motion; simulate the robot after the "
                 "impact"

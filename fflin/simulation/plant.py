@@ -171,7 +171,7 @@ class Plant(Aba):
                     f"{label} is a function, expected a number; for a disturbance that changes in "
                     f"time, give a function of (t, q, v) that returns {{'{key}': number}}"
                 )
-            if key in ("tau_b", "F_b") and dimension(label, value):
+            if key in ("tau_b", "F_b") and dimension(label, value) > 0:
                 rows = ANGULAR if key == "tau_b" else LINEAR
                 total[rows] = vector(label, value, 3, "the components x, y and z")
             else:

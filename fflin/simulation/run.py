@@ -358,7 +358,7 @@ def ending_of(plan: Plan, stop: StopConditions) -> Callable[[float, Array, Array
     """
     # Use lists, because reading an entry of a list is faster than reading an entry of an array.
     stop = stop._replace(squares=stop.squares.tolist())
-    anywhere = stop._replace(sign=[0.0])
+    any_attitude = stop._replace(sign=[0.0])
     origin = [0.0, 0.0, 0.0, *plan.plant.state.origin_quaternion.tolist()]
 
     def ending(t: float, q: Array, v: Array) -> str:
@@ -377,7 +377,8 @@ def ending_of(plan: Plan, stop: StopConditions) -> Callable[[float, Array, Array
                 if margin <= 0.0:
                     return f"{getattr(event, '__name__', 'event')} at t = {t:g} s"
             return ""
-        if goes_on(anywhere, origin, place, rates):
+        # If the velocities alone do not end the run, the attitude does.
+        if goes_on(any_attitude, origin, place, rates):
             return f"left the chart at t = {t:g} s: the base rotated by 180 deg from the reference"
         dt = plan.times.dt
         turn = float(np.abs(v[plan.plant.turning]).max()) * plan.times.dt

@@ -151,8 +151,19 @@ class Sensitivity:
         if not named:
             raise InputError("direction is empty, expected {parameter: change}")
         matrices = self._derivatives.over([self.parameters[name] for name in named])
-        changes = (np.tensordot([*named.values()], x, 1) for x in matrices)
-        return Derivatives(" + ".join(given), "1", 0.0, *changes)
+        changes = [*named.values()]
+        dA, dB, dC, dD, df0, dy0 = (np.tensordot(changes, x, 1) for x in matrices)
+        return Derivatives(
+            name=" + ".join(given),
+            unit="1",
+            value=0.0,
+            dA=dA,
+            dB=dB,
+            dC=dC,
+            dD=dD,
+            df0=df0,
+            dy0=dy0,
+        )
 
     @cached_property
     def _all(self) -> tuple[Array, ...]:

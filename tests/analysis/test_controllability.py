@@ -8,7 +8,8 @@ from scipy.linalg import null_space
 
 import fflin
 from fflin import BaseForce, BaseTorque
-from fflin.analysis.controllability import _dominant, _named
+from fflin.analysis.controllability import _named
+from fflin.analysis.lasting_modes import _dominant
 from tests.support import exact
 from tests.support.mechanisms import mechanical, motors
 from tests.support.messages import says

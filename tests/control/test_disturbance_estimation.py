@@ -10,6 +10,7 @@ import fflin
 from fflin.control.lqg import require_one_integrator
 from fflin.control.rejection import rejection
 from tests.support.c_code import needs_compiler
+from tests.support.marks import exhaustive
 from tests.support.quadrotor import quadrotor
 
 DEGREE = np.pi / 180.0
@@ -564,6 +565,7 @@ def test_reports_and_files_keep_disturbances_and_biases(ending, tmp_path):
     assert compensator.to_control().nstates == len(compensator.A)
 
 
+@exhaustive
 @needs_compiler
 def test_the_exported_law_equals_python_over_ten_thousand_samples(tmp_path):
     robot = satellite()

@@ -9,6 +9,7 @@ import pytest
 from scipy.linalg import solve_continuous_are, solve_discrete_are
 
 import fflin
+from tests.support.marks import exhaustive
 from tests.support.motions import displaced
 
 TORQUE = 2e-5  # [N m], such as of solar pressure
@@ -171,6 +172,7 @@ def test_a_constant_torque_leaves_no_error(satellite):
     assert errors[False][1] < 1e-3
 
 
+@exhaustive
 def test_with_anti_windup_the_overshoot_is_smaller_and_the_integral_returns(body):
     robot, lin = body
     gain = fflin.lqr(lin, integral_action=["q_b", "r_b"])
@@ -319,6 +321,7 @@ def compensated(robot, lin, dt, action):
     return seen, held, gain, fflin.lqg(gain, estimator)
 
 
+@exhaustive
 def test_output_feedback_integrates_the_measured_outputs(satellite):
     robot, _, _ = satellite
     seen, held, gain, compensator = compensated(robot, None, 0.25, ["q_b"])
@@ -392,6 +395,7 @@ def unmeasured(gain, estimator, held):
     return fflin.lqg(gain, replace(estimator, **rows, **shapes, V=V))
 
 
+@exhaustive
 def test_validity_flies_the_integrals_and_predicts_them(arm):
     robot, lin = arm
     gain = fflin.lqr(lin, integral_action=["q_b"])
@@ -443,6 +447,7 @@ def test_a_robot_file_names_the_integrated_signals(tmp_path):
         assert np.array_equal(fflin.lqr(lin).K, given.K)
 
 
+@exhaustive
 def test_an_allocated_satellite_returns_from_a_constant_torque():
     robot = fflin.load("cubesat", inputs=fflin.load_inputs("cubesat"))
     wheels = [x for x in robot.inputs if isinstance(x, fflin.ReactionWheel)]

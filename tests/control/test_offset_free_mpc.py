@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import fflin
+from tests.support.marks import exhaustive
 
 SAMPLE = 0.25
 NOISE = {"q_b": 1e-9, "r_b": 1e-4, "gyroscope": 1e-9}
@@ -56,6 +57,7 @@ def test_without_active_limits_it_equals_the_compensator(satellite, designs):
     assert np.abs(ours.estimate[at] - other.estimate).max() < 1e-6 * size
 
 
+@exhaustive
 def test_a_constant_torque_leaves_no_error_within_the_limits(satellite, designs):
     """The torque is 40 % of the limit, which the slew reaches."""
     lin, _, estimator = designs

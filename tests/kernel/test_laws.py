@@ -24,7 +24,7 @@ def acting(limits, commands, delay=0, nu=None, initial=None, channels=None):
     """
     size = commands.shape[1]
     channel = channel_of(
-        limits, np.zeros(size) if initial is None else initial, SAMPLE, delay
+        limits, np.zeros(size) if initial is None else initial, SAMPLE, [delay]
     )
     rows = []
     for step in range(SAMPLE * len(commands)):
@@ -112,7 +112,7 @@ def test_a_thruster_fires_its_least_impulse_despite_a_rounding_error(factor, fir
 
 
 def test_pulses_begin_only_in_lanes_in_which_a_command_arrives():
-    channel = channel_of(pulsed(False, 2.0, 0.0), np.zeros(1), SAMPLE, 0)
+    channel = channel_of(pulsed(False, 2.0, 0.0), np.zeros(1), SAMPLE, [0])
     values = (channel.pulses.left, channel.pulses.level, channel.pulses.end)
     for fresh in (0.0, 1.0):
         for value in values:

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import fflin
+from tests.support.marks import exhaustive
 
 H = 0.1  # sampling time [s]
 
@@ -271,6 +272,7 @@ def test_the_default_step_is_accurate_for_the_delayed_loop():
     assert steps[1] == pytest.approx(steps[0])
 
 
+@exhaustive
 def test_integral_action_of_a_delayed_law():
     """The integrals remove the error under a constant torque; the poles are those of the gain."""
     robot, lin = satellite()

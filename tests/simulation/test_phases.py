@@ -207,7 +207,7 @@ def test_a_file_that_cannot_be_continued_gives_a_one_line_error(flown):
         pushed, None, q0=approach.q[-1], v0=approach.v[-1], duration=0.1
     )
     for call, message in [
-        (approach.then, "last phase"),
+        (approach.then, "no later phase is given"),
         (lambda: approach.then(caught), "last phase"),
         (lambda: approach.then(3), "Motion"),
         (lambda: approach.then(away, held), "begin"),

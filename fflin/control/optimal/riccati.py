@@ -254,7 +254,8 @@ def structured(equation: Riccati, apart: float = 0.0) -> Solution | None:
             return None
         A, Q, cross = source.A, source.Q, source.cross
         if cross is not None:
-            # If u + R^-1 N' x is regarded as the input, the cost has no cross term.
+            # If u + R^-1 N' x is regarded as the input, the cost has no cross term. `cross` is
+            # L^-1 N' with R = L L', so A becomes A - B R^-1 N', and Q becomes Q - N R^-1 N'.
             A = A - source.B @ dtrtrs(source.R_factor, cross, lower=1, trans=1)[0]
             Q = Q - cross.T @ cross
         scale = np.ones(len(A))
@@ -292,6 +293,7 @@ def _bilinear(equation: Riccati) -> Riccati | None:
     # because it uses the original equation.
     Bc[np.abs(Bc).max(axis=1) <= 1e-12 * np.abs(Bc).max()] = 0.0
     N = 2.0**0.5 * F.T @ (N - Q @ FB)
+    # The equation is sampled, so `equation.rate` is A - I.
     continuous = Riccati(F @ equation.rate, Bc, 2.0 * F.T @ Q @ F, R, N, 0.0)
     if not continuous.definite:
         return None
