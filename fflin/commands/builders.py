@@ -9,8 +9,6 @@ from functools import partial, reduce
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-import numpy as np
-
 import fflin
 from fflin.base.errors import InputError, UnknownNameError, located
 from fflin.base.names import joints_by_name, rates_by_name
@@ -545,6 +543,8 @@ def about_point(
 
 def _state_feedback(model: fflin.LinearModel, gain: fflin.Gain) -> fflin.StateFeedback:
     """Return the feedback of a gain about the point of a model, which may be another point."""
+    import numpy as np
+
     if not gain.integrals:
         return fflin.StateFeedback(model, gain.K)
     none = np.zeros(len(gain.integrals))
