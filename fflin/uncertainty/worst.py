@@ -224,9 +224,11 @@ def _around(lft: LFT, gain: object) -> tuple[LFT, Array, Sequence[str]]:
             "continuous law, such as a LinearController, or sample the robots of uncertain.draws "
             "and call fflin.margins"
         )
-    signals, measured = lft.state_names, np.eye(len(lft.A))
+    signals = lft.state_names
+    measured: Array = np.eye(len(lft.A))
     if gain.senses_outputs:
-        signals, measured = lft.output_names, lft.C2
+        signals = lft.output_names
+        measured = lft.C2
     names = law.inputs, law.outputs
     if names != (signals, lft.input_names):
         raise InputError(
