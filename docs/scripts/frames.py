@@ -33,7 +33,7 @@ def settled(robot: fflin.Robot, design: str, degrees: float) -> str:
         x = loop.displaced(np.random.default_rng(k), degrees, 0.5 * degrees / 90.0, 0.0)
         x = (x - loop.start)[None]
         for frame in FRAMES:
-            there = Loop(robot, replace(lin, frame=frame), loop.K)
+            there = Loop(robot, replace(lin, frame=frame), loop.policy.K)
             runs_of = partial(there.runs, False, None, 0.0, "python")
             arrays = settle(runs_of, x, Execution())
             counts[frame] += OUTCOMES[int(arrays["outcome"][0])] == "settled"

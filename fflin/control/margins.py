@@ -495,11 +495,7 @@ class ClosedLoop:
     def loop(self) -> tuple[Array, Array, Array, Array]:
         """Return F, G, H and J of `closed`, with the delay."""
         loop = self.closed(self.with_delays(self.delays))
-        if not all(np.isfinite(matrix).all() for matrix in loop):
-            raise InputError(
-                "the response of the loop overflows; give smaller gains, a shorter sample time or "
-                "a shorter delay"
-            )
+        _require_finite(*loop)
         return loop
 
     def margins(self) -> Margins:
@@ -568,6 +564,7 @@ class ClosedLoop:
 
     def is_stable(self, F: Array) -> bool:
         """Return whether the loop is stable, by more than rounding errors."""
+        _require_finite(F)
         poles = np.linalg.eigvals(F)
         if self.dt:
             return bool(np.abs(poles).max(initial=0.0) < 1.0 - _ROUNDING)
@@ -745,6 +742,15 @@ def _joined(A: Array, B: Array, C: Array) -> list[int]:
         reached = reached | A[:, reached].any(axis=1)
         seen = seen | A[seen].any(axis=0)
     return np.flatnonzero(reached & seen).tolist()
+
+
+def _require_finite(*matrices: Array) -> None:
+    """Raise `InputError` if the matrices of a loop are not finite."""
+    if not all(np.isfinite(matrix).all() for matrix in matrices):
+        raise InputError(
+            "the response of the loop overflows; give smaller gains, a shorter sample time or "
+            "a shorter delay"
+        )
 
 
 def _delayed(plant: System, delays: Array) -> System:

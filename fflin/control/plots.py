@@ -426,6 +426,8 @@ def loop_responses(closed: ClosedLoop) -> tuple[Array, Values]:
     return w, (0.5 - halves) / (0.5 + halves)
 
 
+# A loop gain of zero has no finite decibels, and its point is not drawn.
+@np.errstate(divide="ignore", invalid="ignore")
 def _plot_closed(
     closed: ClosedLoop,
     margins: Margins,

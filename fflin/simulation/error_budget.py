@@ -190,6 +190,8 @@ def _cells(values: Array) -> list[str]:
     return [f"{x:.3g}" if abs(x) > _ZERO else "." for x in values.tolist()]
 
 
+# NumPy's warnings are not needed, because a loop that overflows is refused.
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")
 @in_one_thread
 def error_budget(
     policy: Policy | Gain,

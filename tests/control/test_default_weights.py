@@ -424,7 +424,7 @@ def test_a_gain_that_bears_little_is_warned_of_wherever_it_is_shown():
         "lqr",
         "ets_vii",
         "--sample",
-        "0.5",
+        "2",
         *options,
     ]
     done = finished(command, capture_output=True, text=True, check=True)
