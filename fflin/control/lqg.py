@@ -126,13 +126,13 @@ def _with_integrals(
 ) -> tuple[Array, Array, Array]:
     """Return A, B and C of a compensator with the integrals of measured outputs as last states.
 
-    A, B and C are without integrals, and `driven` is the effect of the inputs on the estimate.
+    The given A, B and C have no integrals. `driven` is the effect of the inputs on the estimate.
     """
     k = len(gain.integrals)
     nx = len(gain.model_states)
     H = np.hstack((gain.H, np.zeros((k, len(e.A) - nx))))
-    undelayed = ~e.D.any(axis=1)
-    measured = e.C[undelayed]
+    without_feedthrough = ~e.D.any(axis=1)
+    measured = e.C[without_feedthrough]
     # combination of outputs whose value is H (x - x0)
     rows = np.linalg.lstsq(measured[:, :nx].T, gain.H.T, rcond=None)[0].T
     lack = np.abs(rows @ measured - H).max(axis=1) > 1e-9 * np.abs(H).max()
@@ -143,7 +143,7 @@ def _with_integrals(
             "measures it, or leave it out of integral_action"
         )
     combined = np.zeros((k, len(e.C)))
-    combined[:, undelayed] = rows
+    combined[:, without_feedthrough] = rows
     corner = np.eye(k) if gain.dt else np.zeros((k, k))
     A = np.block([[A, -driven @ gain.K_i], [np.zeros((k, len(A))), corner]])
     B = np.vstack((B, (gain.dt or 1.0) * combined))

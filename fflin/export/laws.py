@@ -199,36 +199,51 @@ def _state_law(
     title: str, policy: Policy, dt: float, form: StateForm, robot: Robot
 ) -> Law:
     """Convert a state feedback about the point of a model."""
-    lin = policy.model
-    assert lin is not None
-    frame, reference = policy.axes
-    state = StateMap(robot, reference=reference, frame=frame)
-    tables = {
-        "reference": lin.placement[None],
-        "x0": form.x0[None],
-        "u0": lin.u0[None],
-        "K": form.gains,
-    }
-    return _law_of_states(
-        title, policy, state, tables, form.grid, robot, dt=dt, lin=lin
+    return _law_about_point(
+        title, policy, robot, x0=form.x0, gains=form.gains, axes=form.grid, dt=dt
     )
 
 
 def _memory_law(title: str, policy: Policy, terms: Sample, robot: Robot) -> Law:
     """Convert a state feedback with a memory, such as integrals, about the point of a model."""
+    return _law_about_point(
+        title,
+        policy,
+        robot,
+        x0=terms.y0,
+        gains=-terms.D[None],
+        dt=policy.sample_time,
+        terms=terms,
+    )
+
+
+def _law_about_point(
+    title: str,
+    policy: Policy,
+    robot: Robot,
+    *,
+    x0: Array,
+    gains: Array,
+    dt: float,
+    axes: Mapping[str, Array] = {},
+    terms: Sample | None = None,
+) -> Law:
+    """Return the law of a policy about the point of its model, with one gain for each grid point.
+
+    `terms` are those of a law with a memory.
+    """
     lin = policy.model
     assert lin is not None
     frame, reference = policy.axes
     state = StateMap(robot, reference=reference, frame=frame)
     tables = {
         "reference": lin.placement[None],
-        "x0": terms.y0[None],
+        "x0": x0[None],
         "u0": lin.u0[None],
-        "K": -terms.D[None],
+        "K": gains,
     }
-    dt = policy.sample_time
     return _law_of_states(
-        title, policy, state, tables, {}, robot, dt=dt, lin=lin, terms=terms
+        title, policy, state, tables, axes, robot, dt=dt, lin=lin, terms=terms
     )
 
 

@@ -359,7 +359,7 @@ def _field(
     """Generate the LLVM code that reads the field `name` of a struct from its words.
 
     A number is one word. An array is a word with its address, and one word with the length of each
-    axis. The words of a struct within the struct begin at the field's place.
+    axis. A field that is itself a struct takes all words of this struct, from its place on.
     """
     field_kind = _numba_type(kind.struct.kinds[name])
     first = kind.struct.places[name]

@@ -454,6 +454,53 @@ def test_a_force_on_a_spring_displaces_the_spring_and_no_motor(dt):
             fflin.lqg(gain, estimator, zero_error=names)
 
 
+@pytest.mark.parametrize("delay", [0.0, 0.3])
+def test_under_limits_the_filter_predicts_with_the_applied_inputs(delay):
+    """A z + B dy + E (applied - commanded) is the prediction of the filter."""
+    lin = fflin.linearize(body()).discretize(SAMPLE, delay=delay)
+    estimator = estimator_of(lin)
+    law = fflin.OutputFeedback(lin, fflin.lqg(fflin.lqr(lin), estimator))
+    compensator = law.compensator
+    rng = np.random.default_rng(3)
+    z = rng.normal(size=len(compensator.A))
+    dy = rng.normal(size=len(estimator.C))
+    applied = 0.1 * rng.normal(size=3)
+    S = np.eye(len(estimator.A))[
+        rows_of(estimator.state_names, compensator.state_names)
+    ]
+    xh = S.T @ z
+    innovation = dy - estimator.C @ xh - estimator.D @ applied
+    expected = S @ (estimator.A @ xh + estimator.B @ applied + estimator.L @ innovation)
+    commanded = compensator.C @ z
+    next_z = compensator.A @ z + compensator.B @ dy
+    next_z += law.windup @ (applied - commanded)
+    assert np.abs(next_z - expected).max() < 1e-12 * np.abs(expected).max()
+    assert np.abs(law.windup).max() > 0.01 * np.abs(estimator.B).max()
+
+
+@pytest.mark.parametrize("delay", [0.1, 0.25, 0.6])
+def test_a_constant_torque_leaves_no_error_with_delayed_inputs(delay):
+    """The torque itself is not delayed."""
+    lin = fflin.linearize(body())
+    late = lin.discretize(SAMPLE, delay=delay)
+    estimator = estimator_of(late, disturbance_noise={"tau_b": 1e-10}, bias_noise=None)
+    law = fflin.OutputFeedback(late, fflin.lqg(fflin.lqr(late), estimator))
+    loop, _ = law.closed_loop()
+    pushed = np.zeros(len(loop))
+    pushed[:12] = lin.discretize(SAMPLE).B[:, 0] * 2e-5
+    x = np.zeros(len(loop))
+    attitudes = []
+    for _ in range(2000):
+        x = loop @ x + pushed
+        attitudes.append(np.abs(x[:3]).max())
+    assert attitudes[-1] < 1e-5 * max(attitudes)
+    assert max(attitudes) > 1e-6
+    estimate = x[len(late.A) :][
+        law.compensator.state_names.index("disturbance.tau_b.x")
+    ]
+    assert estimate == pytest.approx(2e-5, rel=1e-5)
+
+
 def test_integral_action_and_an_estimated_disturbance_are_refused():
     words = r"integral\.q_b\.x.*disturbance\.tau_b\.x.*two integrators for one channel"
     with pytest.raises(fflin.InputError, match=words):
