@@ -1,9 +1,11 @@
 """Policies that compute the inputs: state feedback about a point, and allocation."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Self, TypeAlias
+from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
 
 import numpy as np
 import pinocchio as pin
@@ -50,6 +52,9 @@ from fflin.linear.model import LinearModel, gain_map
 from fflin.linear.trajectory import Trajectory
 from fflin.robot.fields import input_limits, limits_of
 from fflin.robot.robot import Robot
+
+if TYPE_CHECKING:
+    from typing import Self
 
 # Function of t, q and v that returns the reference inputs u*, and the error e relative to the
 # reference.
