@@ -27,6 +27,7 @@ from fflin.control.gain import Gain
 from fflin.control.gain import Margins as GainMargins
 from fflin.control.optimal.channel_limits import (
     Crossing,
+    Grid,
     channel_limits,
     log_gain,
     loop_gain,
@@ -519,10 +520,18 @@ class ClosedLoop:
                 delay=self.longest_delay,
             )
         system = as_continuous(*loop, self.dt)
-        grid = self._grid()
+        count = len(self.channels)
+        frequencies = self._grid()
+        responses = np.array([np.diagonal(system.at(w)) for w in frequencies])
+        responses = responses.reshape(len(frequencies), count)
         channels = tuple(
-            self._channel(index, system.channel(index), delays, grid)
-            for index in range(len(self.channels))
+            self._channel(
+                index,
+                system.channel(index),
+                delays,
+                Grid(frequencies, responses[:, index]),
+            )
+            for index in range(count)
         )
         peak = largest_structured_gain(system)
         disk = min(1.0 / peak.bound, 2.0)
@@ -579,7 +588,7 @@ class ClosedLoop:
         return 2.0 * math.atan(w) / self.dt
 
     def _channel(
-        self, index: int, loop: Loop, delays: Array, grid: Array
+        self, index: int, loop: Loop, delays: Array, grid: Grid
     ) -> ChannelMargins:
         """Return the margins of one channel."""
         peak, w_disk = largest_gain(*loop)

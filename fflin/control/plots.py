@@ -40,7 +40,7 @@ from fflin.base.validation import (
 )
 from fflin.control.gain import Gain, asymmetry
 from fflin.control.margins import ClosedLoop, Margins, closed_loop
-from fflin.control.optimal.channel_limits import channel_limits
+from fflin.control.optimal.channel_limits import NO_GRID, channel_limits
 from fflin.control.optimal.disk import as_continuous
 from fflin.control.policy import Policy
 from fflin.linear.check import Check
@@ -563,7 +563,7 @@ def input_loops(gain: Gain) -> tuple[Array, Values, list[LoopMargins]]:
     loop = asymmetry(gain)
     loops = []
     for i in range(len(K)):
-        limits = channel_limits(loop.channel(i), np.zeros(0))
+        limits = channel_limits(loop.channel(i), NO_GRID)
         phases = [crossing.phase for crossing in limits.crossings]
         loops.append(LoopMargins(min(phases, default=math.inf), limits.gain))
     return grid, values, loops

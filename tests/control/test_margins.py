@@ -17,6 +17,7 @@ from fflin.control.optimal.disk import (
 )
 from fflin.control.optimal.largest_gain import ACCURACY, _largest_among, largest_gain
 from fflin.control.plots import input_loops
+from tests.support.marks import exhaustive
 from tests.support.weights import unit_weights
 
 
@@ -208,7 +209,17 @@ def test_the_fixed_scaling_bears_full_perturbations_exactly_up_to_its_bound(case
         assert gain.margins.disk > disk * (1.0 - 2.0 * ACCURACY)
 
 
-@pytest.mark.parametrize("case", DISKS)
+@pytest.mark.parametrize(
+    "case",
+    [
+        "sampled upright",
+        *(
+            pytest.param(case, marks=exhaustive)
+            for case in DISKS
+            if case != "sampled upright"
+        ),
+    ],
+)
 def test_the_disk_margin_has_the_best_scaling_of_every_frequency(case):
     lin = DISKS[case]()
     rng = np.random.default_rng(1)
@@ -264,7 +275,9 @@ def test_the_disk_margin_does_not_depend_on_the_units_of_the_inputs():
 
 
 @pytest.mark.parametrize("name", ["cubesat", "ets_vii", "planar_detumble"])
-@pytest.mark.parametrize("dt", [0.0, 0.01, 0.1, 1.0])
+@pytest.mark.parametrize(
+    "dt", [0.0, *(pytest.param(h, marks=exhaustive) for h in (0.01, 0.1, 1.0))]
+)
 def test_the_margin_that_the_weights_guarantee_is_a_lower_bound(name, dt):
     lin = fflin.linearize(fflin.load(name))
     model = lin.discretize(dt) if dt else lin

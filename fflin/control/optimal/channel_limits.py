@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fflin.base.validation import Array
+from fflin.base.validation import Array, Values
 from fflin.control.optimal.disk import Loop
 
 # Eigenvalues whose real part is at most the fraction _NEAR_AXIS of their magnitude may be
@@ -56,11 +56,21 @@ class ChannelLimits(NamedTuple):
     crossings: tuple[Crossing, ...]
 
 
-def channel_limits(loop: Loop, grid: Array) -> ChannelLimits:
+class Grid(NamedTuple):
+    """Frequencies (k,) [rad/s] and the responses (k,) of one channel there."""
+
+    frequencies: Array
+    responses: Values
+
+
+NO_GRID = Grid(np.zeros(0), np.zeros(0, complex))
+
+
+def channel_limits(loop: Loop, grid: Grid) -> ChannelLimits:
     """Return the limits of a stable continuous loop with one channel.
 
-    Crossings between the frequencies of `grid` (k,) are found even if other poles are so fast that
-    they hide the crossings from the eigenvalues. It may be empty.
+    Crossings between the frequencies of `grid` are found even if other poles are so fast that they
+    hide the crossings from the eigenvalues. It may be empty.
     """
     low, high = (0.0, math.nan), (math.inf, math.nan)
     for frequency in [0.0, *_axis_zeros(loop, -1.0, grid), math.inf]:
@@ -93,12 +103,12 @@ def log_gain(loop: Loop, frequency: float) -> float:
     return math.log(abs(loop_gain(loop, frequency)))
 
 
-def _axis_zeros(loop: Loop, sign: float, grid: Array) -> list[float]:
+def _axis_zeros(loop: Loop, sign: float, grid: Grid) -> list[float]:
     """Return the frequencies > 0 at which M(jw) + sign M(-jw) is zero, for one channel.
 
     With the sign 1, the real part of M is zero there, and the open-loop gain has the magnitude 1.
     With the sign -1, M and the open-loop gain are real. The frequencies are the zeros on the
-    imaginary axis of a system of twice the size. Changes of sign along `grid` (k,) are also found.
+    imaginary axis of a system of twice the size. Changes of sign along `grid` are also found.
     """
     from scipy.linalg import eigvals
 
@@ -132,16 +142,17 @@ def _part(response: complex, sign: float) -> float:
     return float(response.imag)
 
 
-def _changes(loop: Loop, sign: float, grid: Array) -> list[float]:
+def _changes(loop: Loop, sign: float, grid: Grid) -> list[float]:
     """Return the frequencies between those of a grid at which M(jw) + sign M(-jw) changes sign."""
     from scipy.optimize import brentq
 
     def value(frequency: float) -> float:
         return _part(loop.at(frequency)[0, 0], sign)
 
-    signs = np.signbit([value(frequency) for frequency in grid.tolist()])
+    signs = np.signbit([_part(response, sign) for response in grid.responses])
     at = np.flatnonzero(signs[1:] != signs[:-1])
-    return [float(brentq(value, *grid[k : k + 2], rtol=1e-13)) for k in at]
+    intervals = [grid.frequencies[k : k + 2] for k in at]
+    return [float(brentq(value, *interval, rtol=1e-13)) for interval in intervals]
 
 
 def _crossing(loop: Loop, sign: float, w: float) -> float:
