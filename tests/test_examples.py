@@ -13,7 +13,7 @@ from tests.support.marks import exhaustive
 FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
 
 
-# Examples that fly many runs or search long.
+# Examples that fly many runs, search long or draw large figures.
 LONG = {
     "plot_funnel",
     "Funnel",
@@ -23,7 +23,8 @@ LONG = {
     "validity",
     "Validity",
 }
-LONG |= {"plot_campaign", "monte_carlo"}
+LONG |= {"plot_campaign", "monte_carlo", "plot_loops", "plot_matrices", "plot_motion"}
+LONG |= {"Pointing", "PointingError", "CampaignPointing"}
 COMPILED = {"CLaw"}  # examples that call a C compiler
 NAMES = [
     *(name for name in fflin.__all__ if name not in LONG | COMPILED),

@@ -23,6 +23,7 @@ from fflin.base.writing import (
 )
 from fflin.robot.catalog import bundled_directory
 from tests.support.commands import run
+from tests.support.marks import exhaustive
 from tests.support.messages import says
 from tests.support.patience import finished
 
@@ -83,7 +84,9 @@ def test_a_pipe_is_never_written_to(name, urdf, tmp_path, capsys, monkeypatch):
     assert stat.S_ISFIFO(target.stat().st_mode) and len(list(tmp_path.iterdir())) == 2
 
 
-@pytest.mark.parametrize("name", WRITERS)
+@pytest.mark.parametrize(
+    "name", [*(name for name in WRITERS if name != "s.png"), *exhaustive("s.png")]
+)
 def test_a_link_is_followed_and_modes_are_kept(
     name, urdf, tmp_path, capsys, monkeypatch
 ):

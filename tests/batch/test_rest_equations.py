@@ -61,7 +61,7 @@ def test_kernel_agrees_on_random_trees_of_every_joint_type(n):
     assert agreement(robot, spread_configurations(robot, 11)) < 1e-14
 
 
-@pytest.mark.sample
+@pytest.mark.exhaustive
 def test_kernel_counts_the_rotors_of_joints_and_base(robots):
     model = robots["servicer_7dof"].model.copy()
     model.armature = np.linspace(0.1, 2.0, model.nv)

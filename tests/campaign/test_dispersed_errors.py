@@ -155,6 +155,7 @@ def turned_by_noise(engine, size=0.05, **more):
     )
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("engine", ENGINES)
 def test_sensor_errors_act_on_the_policy_that_an_allocation_realises(engine):
     if engine == "compiled":
@@ -178,6 +179,7 @@ def test_sensor_errors_act_on_the_policy_that_an_allocation_realises(engine):
     assert np.array_equal(replayed.q[-1], ends[1].q[1]) and len(replayed.target)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("engine", ENGINES)
 def test_noise_is_white_and_each_run_has_its_own(engine):
     if engine == "compiled":

@@ -23,6 +23,7 @@ from tests.support.patience import finished
 from tests.support.robots import BUNDLED
 
 
+@pytest.mark.exhaustive
 def test_robots_lists_all_with_n_mass_and_origin():
     code, out, err = run("robots")
     assert code == 0 and not err
@@ -779,6 +780,7 @@ def test_linearize_shows_no_rounding_in_f0_and_calls_no_frozen_model_unstable():
     assert "unstable" not in falling and "f0:" in falling
 
 
+@pytest.mark.exhaustive
 def test_equilibria_in_orbit_are_taken_as_panels_sag(tmp_path):
     soft = ["servicer_7dof", "--passive", "panel_*", "--stiffness", "panel_*=40"]
     soft += ["--orbit", "400e3"]

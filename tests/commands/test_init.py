@@ -231,6 +231,7 @@ def sat(tmp_path):
     return tmp_path
 
 
+@pytest.mark.exhaustive
 def test_a_robot_file_stands_wherever_a_robot_does(sat):
     for arguments in (
         *(("info", "sat.toml"), ("linearize", "sat.toml"), ("check", "sat.toml")),
@@ -282,6 +283,7 @@ def test_passive_on_the_command_line(sat):
     assert "'hinge_*'" in refused(*robot[:2], "--passive", "hinge_*", cwd=sat)
 
 
+@pytest.mark.exhaustive
 def test_simulate_begins_and_weighs_as_the_file_says(sat):
     def simulated(*options):
         code, _, err = run(

@@ -85,6 +85,7 @@ def goal_of(motion):
     return state.to_pinocchio(motion.target)[0]
 
 
+@pytest.mark.exhaustive
 def test_simulate_goes_from_start_to_target(sat):
     robot = fflin.load(sat / "sat.toml")
     motion = simulated(sat)
@@ -97,6 +98,7 @@ def test_simulate_goes_from_start_to_target(sat):
     np.testing.assert_allclose(state.to_pinocchio(motion.target)[0], goal, atol=1e-12)
 
 
+@pytest.mark.exhaustive
 def test_target_options_override_the_file(sat):
     options = ("--target-rpy", 0, 0, 35, "--target-position", 1, 2, 3.5)
     motion = simulated(sat, *options, "--target-joint", "joint_4=-0.7")

@@ -215,6 +215,7 @@ def root_frames():
     ]
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(
     "name", ["cubesat", "ets_vii", "planar_detumble", "solo12", "panda"]
 )

@@ -273,6 +273,7 @@ def test_weights_of_the_robot_name_the_integrated_signals(arm):
             robot.replace(weights=wrong)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("dt", [0.0, 0.1])
 def test_margins_and_control_have_the_loop_with_integrals(arm, dt):
     _, lin = arm
@@ -513,6 +514,7 @@ def test_reports_and_notes_know_the_integrals(arm, satellite):
         gain.to("drake")
 
 
+@pytest.mark.exhaustive
 def test_the_worst_loops_of_a_law_with_integrals_are_those_of_its_gain(arm):
     """The integrals are states of the gain's model, or of the law: one loop."""
     robot, lin = arm

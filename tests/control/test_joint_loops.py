@@ -161,6 +161,7 @@ def loops_of(robot, start, target, limits=None):
     return Loops(base, t, path, np.arange(n), target, every, bounds, np.ones(n))
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("degrees", [-20.0, 5.0])
 def test_loops_of_a_turn_and_a_slide_reach_an_attitude_within_limits(polar, degrees):
     start = fflin.configuration(polar, {"slide": 0.6})

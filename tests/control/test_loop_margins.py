@@ -452,7 +452,7 @@ def test_no_part_of_a_sample_below_the_delay_margin_makes_a_loop_unstable(seed):
             assert np.abs(np.linalg.eigvals(F)).max() < 1.0
 
 
-@pytest.mark.parametrize("delay", [pytest.param(1e-6, marks=exhaustive), 1e-3])
+@pytest.mark.parametrize("delay", [*exhaustive(1e-6), 1e-3])
 def test_a_short_delay_changes_the_margins_of_a_continuous_loop_a_little(delay):
     lock = fflin.load("canadarm2").joint_names[2:]
     lin = fflin.linearize(fflin.load("canadarm2", lock=lock))

@@ -61,6 +61,7 @@ def test_a_sampled_loop_has_the_response_of_the_held_plant(satellite):
     assert w[-1] == pytest.approx(np.pi / h)
 
 
+@pytest.mark.exhaustive
 def test_the_figure_shows_the_curves_and_the_margins(satellite, tmp_path):
     lin, law = satellite
     path = tmp_path / "loops.png"

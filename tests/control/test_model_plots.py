@@ -14,6 +14,7 @@ from tests.support.robots import mostly
 pytest.importorskip("matplotlib")
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(
     ("name", "inputs"),
     [

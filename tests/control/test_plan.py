@@ -289,6 +289,7 @@ def test_an_infeasible_plan_gives_up_and_names_the_limit(
     assert len(iterations) <= 24  # with and without the points between knots
 
 
+@pytest.mark.exhaustive
 def test_the_values_nearest_to_their_limits_are_printed(one_joint):
     robot, goal = one_joint
     limits = {"qdot_m": 0.2, "tau_b": [-30.0, 20.0], "tau_m": 25.0}

@@ -106,6 +106,7 @@ def test_orthogonal_wheels_have_the_textbooks_closed_form():
     }
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("layout", mostly(LAYOUTS, "pyramid", "skew"))
 def test_the_motion_matches_the_rigid_body_under_the_textbooks_law(layout):
     """With the wheels' inertia taken out of it and their momentum carried along; H is kept."""
@@ -275,6 +276,7 @@ def test_a_wheel_that_is_at_its_limit_is_reported_and_quickens_nothing(spin):
     )
 
 
+@pytest.mark.exhaustive
 def test_spinning_wheels_are_held_about_their_speed():
     """A bias: the momentum stays where it is, the attitude returns, and with it the speeds."""
     robot = wheeled(AXES[:3])

@@ -120,6 +120,7 @@ def test_limits_are_reached_and_told(kind, tmp_path):
     assert "1" in statuses
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(
     ("kind", "change"),
     [
@@ -197,6 +198,7 @@ FLIGHTS = {
 }
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("kind", FLIGHTS)
 def test_a_simulation_with_the_code_is_the_simulation_without(kind, tmp_path):
     if kind in ("hybrid", "local", "world"):  # sampled
@@ -286,6 +288,7 @@ def test_the_code_is_not_flown_with_another_robot(tmp_path):
         fflin.CLaw(tmp_path, compiler="no_such_compiler")
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(
     ("ending", "dt"),
     [
@@ -367,6 +370,7 @@ def test_the_code_is_not_flown_with_other_continuous_joints(tmp_path):
         code.bind(turning)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("ending", ["c", "h", "json"])
 def test_files_of_another_law_or_edited_ones_are_refused(ending, tmp_path):
     """A pair of which one file is of another law, though both are valid."""

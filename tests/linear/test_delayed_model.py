@@ -291,6 +291,7 @@ def test_the_optimal_gain_predicts_the_state():
         assert of_late.K[:, at] == pytest.approx(expected, abs=1e-9)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("delay", [0.0, *DELAYS])
 def test_the_loop_is_that_of_the_margins(delay):
     """Poles and disk margin equal those of the continuous plant with exact delays."""

@@ -257,6 +257,7 @@ def test_an_explicit_delay_replaces_that_of_the_model():
     assert not np.allclose(default.x, other.x)
 
 
+@pytest.mark.exhaustive
 def test_the_default_step_is_accurate_for_the_delayed_loop():
     """A flexible mode shortens the step, as without a delay."""
     arm = fflin.load("planar_detumble", stiffness=1e5)

@@ -128,6 +128,7 @@ def test_a_sampled_loop_with_delay_equals_a_recursion_over_many_seeds(satellite)
     assert budget.dt == h and budget.delay == delay
 
 
+@pytest.mark.exhaustive
 def test_sinusoids_act_between_the_samples(satellite):
     _, lin, gain = satellite
     h, delay, parts = 0.2, 0.15, 400
@@ -216,6 +217,7 @@ def test_noise_of_a_campaign_has_the_predicted_deviation(satellite):
     assert (low < ratio).all() and (ratio < high).all()
 
 
+@pytest.mark.exhaustive
 def test_the_report_and_the_refusals(satellite):
     _, lin, gain = satellite
     budget = fflin.error_budget(

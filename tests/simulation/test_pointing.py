@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import fflin
-from tests.support.marks import exhaustive
 
 
 @pytest.fixture(scope="module")
@@ -161,7 +160,7 @@ def test_statistics_are_over_time_and_not_over_rows(flown):
     assert fine.absolute.p95[2] == pytest.approx(0.1 * 38.0, rel=5e-3)
 
 
-@exhaustive
+@pytest.mark.exhaustive
 def test_long_windows_of_many_rows_need_little_memory(flown):
     t = np.linspace(0.0, 4000.0, 200_001)
     motion = turned(flown, np.radians(np.sin(t)), t)

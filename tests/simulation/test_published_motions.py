@@ -89,6 +89,7 @@ def test_spin_up_of_one_wheel():
     assert x[g.qdot_m] == pytest.approx([expected], rel=1e-10)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("kind", ["joint", *exhaustive("stored")])
 def test_total_momentum_is_conserved_along_a_motion(kind):
     """An arm swings on a base with wheels at speed; H in the world stays, the wheels' in it."""

@@ -140,6 +140,7 @@ def springy(request):
     return uncertain, gain, np.array(figures)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
 def test_no_rebuilt_corner_or_draw_is_worse_than_the_result(monkeypatch, springy):
     monkeypatch.setattr(worst, "_safe", lambda loops: np.inf)
@@ -419,6 +420,7 @@ def uncertain_arm():
     return model, lin, fflin.lqr(lin, 1.0, 1.0)
 
 
+@pytest.mark.exhaustive
 def test_a_state_feedback_has_the_worst_loops_of_its_gain(uncertain_arm):
     model, lin, gain = uncertain_arm
     worst = model.worst(gain.K, samples=5)
@@ -429,6 +431,7 @@ def test_a_state_feedback_has_the_worst_loops_of_its_gain(uncertain_arm):
     assert model.worst(static, samples=5) == worst
 
 
+@pytest.mark.exhaustive
 def test_the_worst_loop_of_a_controller_with_states_is_that_of_its_closed_loop(
     uncertain_arm,
 ):

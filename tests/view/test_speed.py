@@ -76,6 +76,7 @@ def test_coarse_meshes_are_few_triangles_near_the_fine_ones(panda):
     assert after < 0.4 * before
 
 
+@pytest.mark.exhaustive
 def test_translucent_robots_share_their_meshes(panda):
     robot, motion, _ = panda
     from fflin.view.page import Drawing

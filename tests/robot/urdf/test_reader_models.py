@@ -115,6 +115,7 @@ def test_deep_chain_in_a_thread_of_small_stack():
     assert (result.stdout.strip(), result.stderr) == ("1000.0", "")
 
 
+@pytest.mark.exhaustive
 def test_every_named_robot_loads_or_says_why():
     reasons = {}
     for name in fflin.list_robots():
