@@ -28,6 +28,7 @@ from fflin.robot.joints import ROOT, Carried, find_frame
 from fflin.robot.robot_data import RobotData
 
 _LOCAL = pin.ReferenceFrame.LOCAL
+_BASE = slice(0, 6)  # columns of the base
 
 
 class Pair(NamedTuple):
@@ -38,6 +39,11 @@ class Pair(NamedTuple):
     selected: Array  # S (k, 6)
     first: Carried  # frame 1, on the joint of `to`, or on the universe
     second: Carried  # frame 2
+
+    @property
+    def is_loop(self) -> bool:
+        """Whether both frames are on the robot, so that a motion of the base moves them alike."""
+        return self.first.joint >= ROOT
 
 
 class _Slopes(NamedTuple):
@@ -120,6 +126,8 @@ class Constraints:
             second = _of_frame(pair.second, self._joint_jacobian(pair.second))
             first = _of_frame(pair.first, self._joint_jacobian(pair.first))
             jacobian[pair.rows] = pair.selected @ (X @ second - first)
+            if pair.is_loop:
+                jacobian[pair.rows, _BASE] = 0.0
         return jacobian
 
     def bias(self, q: Array, v: Array) -> Array:
@@ -160,6 +168,9 @@ class Constraints:
             rate_by_v += twist.action @ first.jacobian
             rate_by_v -= turning @ X @ second.jacobian
             derivatives.by_v[rows] = S @ rate_by_v
+            if pair.is_loop:
+                for array in derivatives:
+                    array[rows, _BASE] = 0.0
         return derivatives
 
     def wrenches(self, q: Array, forces: Array) -> pin.StdVec_Force:
