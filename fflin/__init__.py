@@ -14,7 +14,9 @@ _PUBLIC = {
         "robot.robot": "Robot",
         "robot.orbit": "CircularOrbit",
         "robot.equipment.appendages": "FlexibleAppendage Slosh",
+        "robot.constraints": "Weld Hinge Spherical",
         "dynamics.points": "configuration velocity effort",
+        "dynamics.closure": "closed",
         "dynamics.impact": "capture Capture jam Impact",
     },
     "Inputs": {
@@ -23,7 +25,8 @@ _PUBLIC = {
     },
     "Outputs": {
         "robot.outputs": "FullState JointPositions JointVelocities BasePose FramePose "
-        "FrameVelocity RelativePose Gyroscope Accelerometer CenterOfMass Momentum",
+        "FrameVelocity RelativePose Gyroscope Accelerometer CenterOfMass Momentum "
+        "ConstraintForce",
     },
     "Linear models": {
         "linear.linearization": "linearize Linearizer",
@@ -106,7 +109,7 @@ _PUBLIC = {
     "Errors": {
         "base.errors": "FflinError InputError UnknownNameError FileError MissingPackageError "
         "ModelError UrdfError ChartError EquilibriumError SingularInertiaError "
-        "StabilizabilityError DetectabilityError SweepError FflinWarning",
+        "ConstraintError StabilizabilityError DetectabilityError SweepError FflinWarning",
     },
 }
 

@@ -10,9 +10,13 @@ from fflin.robot.robot import Robot as Robot
 from fflin.robot.orbit import CircularOrbit as CircularOrbit
 from fflin.robot.equipment.appendages import FlexibleAppendage as FlexibleAppendage
 from fflin.robot.equipment.appendages import Slosh as Slosh
+from fflin.robot.constraints import Weld as Weld
+from fflin.robot.constraints import Hinge as Hinge
+from fflin.robot.constraints import Spherical as Spherical
 from fflin.dynamics.points import configuration as configuration
 from fflin.dynamics.points import velocity as velocity
 from fflin.dynamics.points import effort as effort
+from fflin.dynamics.closure import closed as closed
 from fflin.dynamics.impact import capture as capture
 from fflin.dynamics.impact import Capture as Capture
 from fflin.dynamics.impact import jam as jam
@@ -38,6 +42,7 @@ from fflin.robot.outputs import Gyroscope as Gyroscope
 from fflin.robot.outputs import Accelerometer as Accelerometer
 from fflin.robot.outputs import CenterOfMass as CenterOfMass
 from fflin.robot.outputs import Momentum as Momentum
+from fflin.robot.outputs import ConstraintForce as ConstraintForce
 
 # Linear models
 from fflin.linear.linearization import linearize as linearize
@@ -176,6 +181,7 @@ from fflin.base.errors import UrdfError as UrdfError
 from fflin.base.errors import ChartError as ChartError
 from fflin.base.errors import EquilibriumError as EquilibriumError
 from fflin.base.errors import SingularInertiaError as SingularInertiaError
+from fflin.base.errors import ConstraintError as ConstraintError
 from fflin.base.errors import StabilizabilityError as StabilizabilityError
 from fflin.base.errors import DetectabilityError as DetectabilityError
 from fflin.base.errors import SweepError as SweepError

@@ -10,6 +10,8 @@ import pinocchio as pin
 from fflin.base.errors import FflinWarning, SingularInertiaError, listed
 from fflin.base.rotation import skew
 from fflin.base.validation import Array
+from fflin.dynamics.closure import Closure
+from fflin.dynamics.contact import Contact, ContactSolver
 from fflin.dynamics.coordinates import ANGULAR, LINEAR, PIN_ANGULAR
 from fflin.dynamics.orbital import GravityGradient
 from fflin.dynamics.state import Actuation, StateMap
@@ -208,8 +210,16 @@ class AccelerationDerivatives(NamedTuple):
 
     @property
     def by_turn(self) -> Array:
-        """D_theta (.., 6 + n, 3) of (14.5), for rotations of the base; zero without an orbit."""
+        """D_theta (.., 6 + n, 3) of (14.5), for rotations of the base.
+
+        It is zero without an orbit, unless a constraint anchors the robot in inertial space.
+        """
         return self.slopes[..., :3]
+
+    @property
+    def by_position(self) -> Array:
+        """D_p (.., 6 + n, 3), for displacements of the base; zero unless the robot is anchored."""
+        return self.slopes[..., 3:6]
 
     @property
     def by_q_m(self) -> Array:
@@ -218,19 +228,32 @@ class AccelerationDerivatives(NamedTuple):
 
     @property
     def by_nu(self) -> Array:
-        """D_nu (.., 6 + n, 6 + n) of (3.3); its columns for v_b are zero."""
+        """D_nu (.., 6 + n, 6 + n) of (3.3).
+
+        Its columns for v_b are zero, unless a constraint anchors the robot in inertial space.
+        """
         return self.slopes[..., self.c.shape[-1] :]
 
 
 class Accelerations:
     """Solution c of the equations of motion ``M c + b = B_u u`` (3.1), with its derivatives.
 
-    Springs and dampers add their forces to the right side.
+    Springs and dampers add their forces to the right side. If the robot has constraints, their
+    `closure` must be given. The accelerations and derivatives are then constrained.
     """
 
-    def __init__(self, state: StateMap, actuation: Actuation, data: pin.Data) -> None:
+    def __init__(
+        self,
+        state: StateMap,
+        actuation: Actuation,
+        data: pin.Data,
+        closure: Closure | None = None,
+    ) -> None:
         robot = state.robot
         self._state, self._actuation, self._data = state, actuation, data
+        self._contacts = ContactSolver(closure) if closure is not None else None
+        # Constraint forces at the last point of `rates`; None for a robot without constraints.
+        self.contact: Contact | None = None
         self._model = robot.model
         self._nv = 6 + robot.n
         self.inertia = Inertia(state, data)
@@ -293,13 +316,15 @@ class Accelerations:
             bias = bias - turning
         if tide:
             bias = bias - pull
-        force = u
-        if not actuation.default:
-            force = columns.dot(u)
+        force = u if actuation.default else columns.dot(u)
         force = force - state.forces(bias)
         if self._resists:
             force[6:] += self._springs.force(state.joint_positions(q), nu[6:])
         c = inverse.dot(force)
+        if self._contacts is not None:
+            self.contact = self._contacts.contact(q, v, nu, c, inverse)
+            c = self.contact.c
+            wrenches = self.contact.added_to(wrenches)
 
         # Derivatives of M c + b - B_u u minus the forces of springs and dampers (3.3), (7.1). The
         # wrenches of inputs are constant in the frames of their links. So the derivatives of RNEA
@@ -312,20 +337,28 @@ class Accelerations:
             by_q, by_v = by_q - turning_by_q, by_v - turning_by_v
         if tide:
             by_q = by_q - pull_by_q
-        state.project_transposed(by_q, self._by_q_m)
-        state.project_transposed(by_v, self._by_nu)
-        self._by_linear[:] = 0.0
-        if self._resists:
-            self._of_stiffness += self._springs.stiffness
-            self._of_damping += self._springs.damping
+        self._write_force_slopes(by_q, by_v)
         if tide:
             by_spin = self._by_nu[ANGULAR].T.dot(skew(tide.spin))
             self._by_turn[:] = (by_spin - state.forces(pull_by_turn)).T
         np.negative(inverse, self._minus_inverse).dot(self._force_slopes, slopes)
         if not actuation.default:
             inverse.dot(columns, by_u)
+        if self._contacts is not None and self.contact is not None:
+            self._contacts.differentiate(
+                self.contact, q, v, nu, -self._minus_inverse, slopes, by_u
+            )
         gravity = tide.fall if tide else state.gravity(q)
         return AccelerationDerivatives(c, slopes, by_u, gravity)
+
+    def _write_force_slopes(self, by_q: Array, by_v: Array) -> None:
+        """Write the derivatives (nv, nv) of RNEA, with springs and dampers, in state order."""
+        self._state.project_transposed(by_q, self._by_q_m)
+        self._state.project_transposed(by_v, self._by_nu)
+        self._by_linear[:] = 0.0
+        if self._resists:
+            self._of_stiffness += self._springs.stiffness
+            self._of_damping += self._springs.damping
 
     def _gyroscopic(
         self, q: Array, v: Array, wrenches: pin.StdVec_Force | None

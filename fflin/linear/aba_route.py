@@ -45,9 +45,13 @@ def _dynamics(
     # Pinocchio differentiates about the world's origin, and loses accuracy if the base is distant.
     # So place the base at the world's origin. This is allowed, because A and B do not depend on the
     # position of the base, even in orbit.
+    # A robot that is anchored in inertial space stays where it is.
+    anchored = state.robot.anchored
+    relative = not (state.field or anchored)
     q, slow = q.copy(), v.copy()
-    q[:3] = 0.0
-    if not state.field:
+    if not anchored:
+        q[:3] = 0.0
+    if relative:
         # Without an orbit, the dynamics do not depend on the linear velocity of the base, except
         # for the rotation of the base axes, which adds -omega x v to the rate of this velocity.
         slow[PIN_LINEAR] = 0.0
@@ -61,7 +65,7 @@ def _dynamics(
         others = np.r_[ANGULAR, 6 : len(inertia)]
         by_q[:, others] -= change @ by_q[:, others]
         by_v[:, others] -= change @ by_v[:, others]
-    if not state.field:
+    if relative:
         linear, angular = v[PIN_LINEAR], v[PIN_ANGULAR]
         rates[LINEAR] -= np.cross(angular, linear)
         by_v[:, LINEAR] = 0.0
@@ -123,7 +127,9 @@ class Route:
         # _NUDGE, and with M^-1 of CRBA in place of ABA's M^-1.
         dynamics = _dynamics(self.aba, self.q, self.v, self._u)
         inertia = _in_base(state, self.q, self.M)
-        others = [_dynamics(self.aba, self.q, self.v, self._u, inertia)]
+        others = []
+        if not robot.constraints:
+            others.append(_dynamics(self.aba, self.q, self.v, self._u, inertia))
         rng = np.random.default_rng(0)
         others += [_dynamics(self.aba, *self._nudged(rng)) for _ in range(_SAMPLES)]
         self.at = self._own.jacobians(self.q, self.nu, self._u, dynamics.rates)
@@ -155,7 +161,14 @@ class Route:
         A, B = self._assembled(dynamics)
         more = [self._assembled(other) for other in others]
         lower = B[nv:]
-        mobility = np.sqrt(np.einsum("ik,ij,jk->k", lower, self.M, lower))
+        free = lower
+        if self.state.robot.constraints:
+            # An input without effect on the constrained robot has an effect on the free one.
+            data = self.state.robot.create_data()
+            forces = self.aba.actuation.columns(data, self.q)
+            chart = self.state.chart(self.q)
+            free = inverse @ self.state.to_frame(chart, forces)
+        mobility = np.sqrt(np.einsum("ik,ij,jk->k", free, self.M, free))
         self.input_mobility = np.where(mobility > 0.0, mobility, 1.0)
 
         sums_A, sums_B = self._sums(dynamics)

@@ -253,6 +253,9 @@ class LinearModel(ModelHeader, StateSpace):
         model with delayed inputs, see `discretize`.
     delay : ndarray (nu,)
         Delay of each input [s].
+    dependent : tuple of str
+        States of the robot that the model does not contain, because the constraints determine them
+        from the states of the model.
 
     Examples
     --------
@@ -286,6 +289,7 @@ class LinearModel(ModelHeader, StateSpace):
     _robot: Robot | None = None  # robot of the model; None for a model from a file
     mean_motion: float = 0.0
     added: tuple[str, ...] = ()
+    dependent: tuple[str, ...] = ()
     _delays: tuple[float, ...] = ()  # empty if no input is delayed
 
     def __init__(
@@ -357,6 +361,11 @@ class LinearModel(ModelHeader, StateSpace):
         if source is None:
             return self.f0 / self.dt
         return np.append(source.f0, np.zeros(len(self.added)))
+
+    @property
+    def rank(self) -> int:
+        """Rank of the constraints: the number of velocities that they remove; 0 without any."""
+        return len(self.dependent) // 2
 
     @property
     def delay(self) -> Array:

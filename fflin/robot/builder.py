@@ -33,6 +33,7 @@ from fflin.robot.fields import FIELDS, checked_inputs, checked_names
 from fflin.robot.inputs import named_inputs
 from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.mass_properties import as_inertia, dynamic_parameters, pieces_of
+from fflin.robot.outputs import ConstraintForce
 from fflin.robot.robot_data import RobotData, link_mass
 from fflin.robot.rotors import require_free_rotors
 
@@ -122,7 +123,31 @@ def _require_consistent(robot: RobotData) -> None:
             )
     for name in robot.used_frames:
         find_frame(robot.model, name)
+    _require_two_bodies(robot)
+    titles = [item.title for item in robot.constraints]
+    for output in robot.outputs:
+        if isinstance(output, ConstraintForce):
+            require_known("constraint", [output.name], titles)
     require_free_rotors(robot)
+
+
+def _require_two_bodies(robot: RobotData) -> None:
+    """Raise an error if a constraint holds a body to itself, or to inertial space in orbit."""
+    for item in robot.constraints:
+        if item.to is None:
+            if robot.orbit:
+                raise InputError(
+                    f"constraint '{item.title}' holds a frame in inertial space, but "
+                    f"'{robot.name}' is in orbit; remove the orbit, or give the constraint a "
+                    "second frame with to="
+                )
+            continue
+        carriers = {find_frame(robot.model, name).joint for name in item.frames}
+        if len(carriers) == 1:
+            raise InputError(
+                f"constraint '{item.title}' connects two frames of the same body; remove it, or "
+                "give frames of two bodies"
+            )
 
 
 def equipped(
