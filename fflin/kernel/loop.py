@@ -9,9 +9,11 @@ from collections import namedtuple
 
 import numpy as np
 
+from fflin.kernel import constraints as held
 from fflin.kernel import forward
 from fflin.kernel import vectors as vec
 from fflin.kernel.allocation import allocate, write_difference
+from fflin.kernel.constraints import CONSTRAINTS
 from fflin.kernel.forward import MECHANICS, MOMENTUM_REFERENCE, POINT
 from fflin.kernel.policies import (
     LAW,
@@ -261,6 +263,14 @@ ARGUMENTS = Struct(
 ARGUMENTS_OF_ONE = ARGUMENTS.with_one_lane()
 
 
+class ConstrainedArguments(namedtuple("ConstrainedArguments", "usual constraints")):
+    """Arguments of `advance_constrained`: the arguments of `advance`, and the constraints."""
+
+
+CONSTRAINED = Struct(ConstrainedArguments, usual=ARGUMENTS, constraints=CONSTRAINTS)
+CONSTRAINED_OF_ONE = CONSTRAINED.with_one_lane()
+
+
 def _combine(shares, row, rates, out):
     """Write the sum of the rows of `rates`, with the weights in a row of `shares`.
 
@@ -321,7 +331,7 @@ def _ask(work, robot, law, channel, point, t, step, stage):
 
 def advance(words, clock, last, every, rows, work):
     """Advance eight runs; `words` are the 64-bit words of `ARGUMENTS`, see `_advance`."""
-    _advance(ARGUMENTS(words), clock, last, every, rows, work)
+    _advance(ARGUMENTS(words), None, clock, last, every, rows, work)
 
 
 def advance_one(words, clock, last, every, rows, work):
@@ -329,20 +339,42 @@ def advance_one(words, clock, last, every, rows, work):
 
     A single run would be slower in eight equal lanes.
     """
-    _advance(ARGUMENTS_OF_ONE(words), clock, last, every, rows, work)
+    _advance(ARGUMENTS_OF_ONE(words), None, clock, last, every, rows, work)
 
 
-def _advance(arguments, clock, last, every, rows, work):
+# Only robots with constraints use the next two functions, so the other robots do not wait until
+# these functions are compiled.
+
+
+def advance_constrained(words, clock, last, every, rows, work):
+    """Advance eight runs; `words` are the words of `CONSTRAINED`, see `_advance`."""
+    arguments = CONSTRAINED(words)
+    _advance(
+        arguments.usual, arguments.constraints, clock, last, every, rows, work
+    )
+
+
+def advance_one_constrained(words, clock, last, every, rows, work):
+    """Advance one run; `words` are the words of `CONSTRAINED_OF_ONE`, see `_advance`."""
+    arguments = CONSTRAINED_OF_ONE(words)
+    _advance(
+        arguments.usual, arguments.constraints, clock, last, every, rows, work
+    )
+
+
+def _advance(arguments, constraints, clock, last, every, rows, work):
     """Advance all runs to the step `last`, or until one of the runs meets a stop condition.
 
-    The function updates the point,
-    the momentum reference, the state of the policy and the state of the channel. clock (1,) is the
-    number of finished steps. Before step 0, the initial momentum and centre of mass are written
-    into the momentum reference.
+    The function updates the point, the momentum reference, the state of the policy and the state of
+    the channel. clock (1,) is the number of finished steps. Before step 0, the initial momentum and
+    centre of mass are written into the momentum reference.
+
+    `constraints` is None for a robot without constraints. The code for constraints is then not
+    compiled.
 
     If `every` is not 0, the function writes a row into `rows` at every step that is a multiple of
-    `every`. A row consists of q, nu, u, the reference momentum (6,) and the reference centre of
-    mass (3,). `work` has `WorkOffsets.size` entries.
+    `every`. A row consists of q, nu, u, the reference momentum (6,), the reference centre of mass
+    (3,), and the forces of the constraints. `work` has `WorkOffsets.size` entries.
     """
     robot = arguments.robot
     method = arguments.method
@@ -382,6 +414,17 @@ def _advance(arguments, clock, last, every, rows, work):
             forward.accelerate(
                 work, robot, point, t, method.rates, (1 + stage) * len(point.nu)
             )
+            if constraints is not None:
+                forces = constraints.multipliers
+                if stage == 0:
+                    forces = constraints.forces
+                to = (1 + stage) * len(point.nu)
+                held.constrain(
+                    work, robot, constraints, point, method.rates, to, forces
+                )
+                if stage == 0 and every > 0 and step % every == 0:
+                    vec.copy(forces, 0, rows, at, len(forces))
+                    at += len(forces)
             if arguments.pushed:
                 weight, moment = method.weights[stage], method.moments[stage]
                 forward.add_wrench(work, robot, kept, point, weight, moment)
@@ -390,11 +433,16 @@ def _advance(arguments, clock, last, every, rows, work):
                 _combine(method.speed, stage, law.filter.rates, law.filter.z)
             forward.configure(work, robot, point.q)
         forward.end_step(kept, h)
+        if constraints is not None:
+            held.close(work, robot, constraints, point)
         if arguments.project:
             forward.impose(work, robot, kept, point, (step + 1) * h)
         clock[0] = step + 1
         if not goes_on(arguments.stop, robot.origin, point.q, point.nu):
             break
+        if constraints is not None:
+            if not held.independent(constraints):
+                break
 
 
 class RunStatistics(
@@ -481,13 +529,14 @@ def take(words, rows, first, count):
     at = stats.at
     sizes = stats.sizes
     kept = 0
-    width = len(at.q) + len(at.nu)
     inputs = len(stats.largest_u)
+    width = len(at.q) + len(at.nu)
+    stride = len(rows) // max(count, 1)
     e = stats.path.e
     while kept < len(stats.steps) and stats.steps[kept] < first:
         kept += 1
     for row in range(count):
-        step, begin = first + row, row * (width + inputs + 9)
+        step, begin = first + row, row * stride
         vec.copy(rows, begin, at.q, 0, len(at.q))
         vec.copy(rows, begin + len(at.q), at.nu, 0, len(at.nu))
         _compare(stats, step)
