@@ -15,7 +15,7 @@ Z from another factor of M.
 
 If all bodies that a constraint loads belong to one robot, the constraint exerts no wrench on the
 robot: the first six columns of J are exactly zero. Both frames are loaded at the same point, the
-origin of the second frame, so that action and reaction are collinear even if the frames do not
+origin of the first frame, so that action and reaction are collinear even if the frames do not
 coincide exactly.
 """
 
@@ -23,7 +23,7 @@ from collections import namedtuple
 
 from fflin.kernel import bodies
 from fflin.kernel import vectors as vec
-from fflin.kernel.bodies import BIAS, VELOCITY, at_parent, joint_axis
+from fflin.kernel.bodies import BIAS, VELOCITY, at_parent, joint_axis, motion_cross
 from fflin.kernel.tree import INDICES, LANED, MOTION, PLACE, REALS, Struct
 from fflin.kernel.vectors import Entries, below, called, chosen, load, root, store
 
@@ -36,7 +36,7 @@ _CORRECTIONS = 2
 LEAST_FRACTION = 1e-10
 
 # Offsets of the entries that `locate` writes for each pair of frames: the axes of the first frame,
-# the vectors from the joints of both bodies to the origin of the second frame, the rotation vector
+# the vectors from the joints of both bodies to the origin of the first frame, the rotation vector
 # of the second frame relative to the first for small rotations, and its position. The rotation
 # vector and the position are in axes of the first frame, all other vectors are in base axes.
 AXES, FIRST_LEVER, SECOND_LEVER, ROTATION, POSITION = 0, 9, 12, 15, 18
@@ -189,8 +189,8 @@ def locate(work, robot, constraints, q):
         apart = vec.minus(position, start)
         for axis in range(3):
             vec.put3(location, to + AXES + 3 * axis, axes[axis])
-        vec.put3(location, to + FIRST_LEVER, vec.plus(origin, apart))
-        vec.put3(location, to + SECOND_LEVER, lever)
+        vec.put3(location, to + FIRST_LEVER, origin)
+        vec.put3(location, to + SECOND_LEVER, vec.minus(lever, apart))
         # If the axes coincide, the rate of this vector is the relative angular velocity. The
         # entries x and y are zero if the z axes coincide, whatever the rotation about z is.
         (x, y, z), (a, b, c) = axes, others
@@ -307,25 +307,22 @@ def correct(work, tree, constraints, forces):
         store(change, k, value)
 
 
-def _point_motion(work, tree, body, lever):
-    """Return the motion of a point for c = 0; the lever is from the body's joint to the point.
+def _twist(work, tree, body, offset, lever):
+    """Return a motion vector of a body at the point at the end of a lever from its joint.
 
-    The motion is the angular acceleration of the body, the acceleration of the point, the angular
-    velocity of the body, and the velocity of the point for v_b = 0.
+    `offset` is `VELOCITY` or `BIAS`.
     """
-    at = tree.offsets.motion + body * MOTION
-    w, v = vec.get6(work, at + VELOCITY)
-    alpha, a = vec.get6(work, at + BIAS)
-    v = vec.plus(v, vec.cross(w, lever))
-    a = vec.plus(vec.plus(a, vec.cross(alpha, lever)), vec.cross(w, v))
-    return alpha, a, w, v
+    w, v = vec.get6(work, tree.offsets.motion + body * MOTION + offset)
+    return w, vec.plus(v, vec.cross(w, lever))
 
 
 @called
 def write_accelerations(work, robot, constraints, point):
     """Write the accelerations of all rows, for the accelerations c of the free robot.
 
-    `forward.accelerate` must have written c and the motion of the bodies.
+    They are the rows of A_2 - A_1 - V_1 x V_2, with the twists V of both frames at the origin of
+    the first frame, and their spatial accelerations A. `forward.accelerate` must have written c and
+    the motion of the bodies.
     """
     tree = robot.tree
     location = constraints.location
@@ -335,19 +332,19 @@ def write_accelerations(work, robot, constraints, point):
         axis, angular = _direction(constraints, row)
         lever = vec.get3(location, pair * LOCATION + SECOND_LEVER)
         second = constraints.second[pair]
-        alpha, a, w, v = _point_motion(work, tree, second, lever)
-        if constraints.first[pair] >= 0:
+        twist = _twist(work, tree, second, VELOCITY, lever)
+        alpha, a = _twist(work, tree, second, BIAS, lever)
+        first = constraints.first[pair]
+        if first >= 0:
             lever = vec.get3(location, pair * LOCATION + FIRST_LEVER)
-            first = constraints.first[pair]
-            alpha_1, a_1, w_1, v_1 = _point_motion(work, tree, first, lever)
-            # The axes of the row rotate with the first body, and the point of the first body moves
-            # along with the second frame.
-            alpha = vec.minus(vec.minus(alpha, alpha_1), vec.cross(w_1, w))
-            coriolis = vec.times(vec.cross(w_1, vec.minus(v, v_1)), 2.0)
-            a = vec.minus(vec.minus(a, a_1), coriolis)
+            change = motion_cross(_twist(work, tree, first, VELOCITY, lever), twist)
+            change = vec.plus6(change, _twist(work, tree, first, BIAS, lever))
+            alpha, a = vec.minus6((alpha, a), change)
         else:
-            # The accelerations c lack gravity.
-            a = vec.plus(a, vec.across(vec.axes_of(point.q), vec.get3(robot.gravity, 0)))
+            # The accelerations c lack gravity, and the twist lacks the velocity v_b.
+            gravity = vec.across(vec.axes_of(point.q), vec.get3(robot.gravity, 0))
+            transport = vec.cross(twist[0], vec.get3(point.nu, 3))
+            a = vec.plus(a, vec.minus(gravity, transport))
         value = vec.dot(axis, a)
         if angular:
             value = vec.dot(axis, alpha)
