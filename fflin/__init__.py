@@ -14,6 +14,7 @@ _PUBLIC = {
         "robot.robot": "Robot",
         "robot.orbit": "CircularOrbit",
         "robot.equipment.appendages": "FlexibleAppendage Slosh",
+        "robot.constraints": "Weld Hinge Spherical",
         "dynamics.points": "configuration velocity effort",
         "dynamics.impact": "capture Capture jam Impact",
     },

@@ -10,6 +10,9 @@ from fflin.robot.robot import Robot as Robot
 from fflin.robot.orbit import CircularOrbit as CircularOrbit
 from fflin.robot.equipment.appendages import FlexibleAppendage as FlexibleAppendage
 from fflin.robot.equipment.appendages import Slosh as Slosh
+from fflin.robot.constraints import Weld as Weld
+from fflin.robot.constraints import Hinge as Hinge
+from fflin.robot.constraints import Spherical as Spherical
 from fflin.dynamics.points import configuration as configuration
 from fflin.dynamics.points import velocity as velocity
 from fflin.dynamics.points import effort as effort

@@ -122,7 +122,27 @@ def _require_consistent(robot: RobotData) -> None:
             )
     for name in robot.used_frames:
         find_frame(robot.model, name)
+    _require_two_bodies(robot)
     require_free_rotors(robot)
+
+
+def _require_two_bodies(robot: RobotData) -> None:
+    """Raise an error if a constraint holds a body to itself, or to inertial space in orbit."""
+    for item in robot.constraints:
+        if item.to is None:
+            if robot.orbit:
+                raise InputError(
+                    f"constraint '{item.title}' holds a frame in inertial space, but "
+                    f"'{robot.name}' is in orbit; remove the orbit, or give the constraint a "
+                    "second frame with to="
+                )
+            continue
+        carriers = {find_frame(robot.model, name).joint for name in item.frames}
+        if len(carriers) == 1:
+            raise InputError(
+                f"constraint '{item.title}' connects two frames of the same body; remove it, or "
+                "give frames of two bodies"
+            )
 
 
 def equipped(

@@ -27,6 +27,7 @@ from fflin.base.validation import (
     number,
     numbers,
 )
+from fflin.robot.constraints import checked_constraints
 from fflin.robot.disturbance import checked_disturbance
 from fflin.robot.inputs import (
     KINDS,
@@ -359,6 +360,7 @@ def _parts(what: str, value: object, known: Sequence[str]) -> dict[str, object]:
 # `robot.builder` checks them itself.
 FIELDS: dict[str, Callable[[object, RobotData], Any] | None] = {
     **dict.fromkeys(("passive", "wheel_joints", "inputs", "appendages")),
+    "constraints": lambda value, _: checked_constraints(value),
     "outputs": _outputs,
     **{name: partial(_of_joints, name) for name in ("stiffness", "damping", "rest")},
     "gravity": lambda value, _: three_numbers("gravity", value),

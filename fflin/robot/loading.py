@@ -27,6 +27,7 @@ from fflin.base.toml_file import TomlFile, flat
 from fflin.base.validation import by_name, instance, is_rotation, printable, rotated
 from fflin.base.writing import read_file, remember
 from fflin.robot.catalog import RobotFile, find_inputs, find_mesh, find_robot, folders
+from fflin.robot.constraints import FROM_FILE, Constraint
 from fflin.robot.equipment.appendages import Appendage, FlexibleAppendage, Slosh
 from fflin.robot.fields import FIELDS
 from fflin.robot.inputs import KINDS, Input
@@ -46,7 +47,11 @@ _SKEWED = 1e-12
 
 # Fields that are arrays of tables in a robot file: {field: names of the arrays}. For example, the
 # tables [[input]] give the field `inputs`.
-_TABLES = {"inputs": ("input",), "appendages": ("flexible", "slosh")}
+_TABLES = {
+    "inputs": ("input",),
+    "appendages": ("flexible", "slosh"),
+    "constraints": ("constraint",),
+}
 
 # Keys of a robot file; the guide explains them. A file without the key `urdf` contains only inputs.
 KEYS = (
@@ -88,8 +93,9 @@ def load(
         Arguments of a xacro file, as {name: value}: the values of its ``<xacro:arg>``. They take
         precedence over the table ``[xacro]`` of the robot file.
     **fields
-        Fields of the robot: inputs, outputs, appendages, stiffness, damping, rest, gravity, orbit,
-        disturbance, limits, passive, weights, point, target and start; see `Robot.replace`. Fields
+        Fields of the robot: inputs, outputs, appendages, constraints, stiffness, damping, rest,
+        gravity, orbit, disturbance, limits, passive, weights, point, target and start; see
+        `Robot.replace`. Fields
         given here take precedence over the robot file. Locks, limits, springs and dampers are
         merged with the robot file: an entry given here replaces only the entry with the same name.
 
@@ -478,6 +484,8 @@ def _read_robot_file(file: RobotFile) -> tuple[TomlFile, RobotFile, dict[str, ob
         document, "slosh", partial(_maker, Slosh, of_tank)
     ):
         values["appendages"] = appendages
+    if constraints := _built(document, "constraint", _constraint_type):
+        values["constraints"] = constraints
     # The robot is named after the TOML file, not after the URDF.
     urdf_file = urdf_file._replace(name=file.name, package_dirs=dirs)
     keys = ("lock", "xacro", *FIELDS)
@@ -509,15 +517,25 @@ def _read_inputs(document: TomlFile) -> tuple[Input, ...]:
     return inputs
 
 
-def _input_type(values: dict[str, object]) -> type[Input]:
-    """Remove the key `type` from the values of an input, and return the class of this type."""
+def _type_of(values: dict[str, object], known: Mapping[str, T]) -> T:
+    """Remove the key `type` from the values of a table, and return what `known` has for it."""
     if "type" not in values:
         raise InputError(
-            f"the key 'type' is missing; set 'type' to one of {', '.join(_TYPES)}"
+            f"the key 'type' is missing; set 'type' to one of {', '.join(known)}"
         )
     kind = str(values.pop("type"))
-    require_known("valid 'type'", [kind], _TYPES)
-    return _TYPES[kind]
+    require_known("valid 'type'", [kind], known)
+    return known[kind]
+
+
+def _constraint_type(values: dict[str, object]) -> Callable[..., Constraint]:
+    """Remove the key `type` from the values of a constraint, and return its constructor."""
+    return _type_of(values, FROM_FILE)
+
+
+def _input_type(values: dict[str, object]) -> type[Input]:
+    """Remove the key `type` from the values of an input, and return the class of this type."""
+    return _type_of(values, _TYPES)
 
 
 def _maker(

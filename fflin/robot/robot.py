@@ -107,6 +107,8 @@ class Robot(RobotData):
         Grasped payload robots, each in a pair with the prefix of its names.
     appendages : tuple of FlexibleAppendage and Slosh
         Flexible appendages and slosh. Their modes are among the joints.
+    constraints : tuple of Weld, Hinge and Spherical
+        Constraints between frames of the robot, or to inertial space, see `replace`.
 
     Examples
     --------
@@ -133,6 +135,10 @@ class Robot(RobotData):
         appendages : sequence of FlexibleAppendage and Slosh
             Flexible appendages and slosh of the robot, which replace all previous ones. Their
             modes become joints without motors.
+        constraints : sequence of Weld, Hinge and Spherical
+            Constraints between frames of the robot, or to inertial space, which replace all
+            previous ones. A constraint without a placement holds its frames in the pose that they
+            have at the first configuration at which it is used.
         outputs : sequence of Output
             Measured outputs of the robot, in the order of y.
         stiffness : mapping or float

@@ -13,6 +13,7 @@ import pinocchio as pin
 
 from fflin.base.errors import InputError, unknown
 from fflin.base.validation import Array
+from fflin.robot.constraints import Constraint
 from fflin.robot.disturbance import DisturbanceTerms
 from fflin.robot.equipment.appendages import Appendage
 from fflin.robot.equipment.assembly import stored_momentum
@@ -94,6 +95,7 @@ class RobotData(Coordinates):
     file_joints: tuple[str, ...] = ()
     attached: tuple[tuple[str, Self], ...] = ()
     appendages: tuple[Appendage, ...] = ()
+    constraints: tuple[Constraint, ...] = ()
     # The robot without the joints of wheels and modes; None if no joint is a wheel or mode. Its
     # fields such as `inputs` and `stiffness` may be outdated.
     _unequipped: Self | None = None
@@ -108,9 +110,11 @@ class RobotData(Coordinates):
 
     @property
     def used_frames(self) -> tuple[str, ...]:
-        """Names of the frames at which inputs and outputs are mounted."""
-        of_inputs = [name for item in self.inputs for name in item.frames]
-        return (*of_inputs, *(name for item in self.outputs for name in item.frames))
+        """Names of the frames of inputs, outputs and constraints."""
+        names = [name for item in self.inputs for name in item.frames]
+        names += [name for item in self.outputs for name in item.frames]
+        names += [name for item in self.constraints for name in item.frames]
+        return tuple(names)
 
     @cached_property
     def named_inputs(self) -> tuple[tuple[Input, tuple[str, ...]], ...]:

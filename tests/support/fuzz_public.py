@@ -289,6 +289,14 @@ def light(folder):
             **{"frame": "base", "mass": 1.0, "position": vector, "frequency": 0.2},
             **{"length": None, "axis": (0, 0, 1), "damping": 0.01, "name": "tank"},
         },
+        **{
+            name: {"frame": "base", "to": None, "placement": None, "name": "held"}
+            for name in ("Weld", "Spherical")
+        },
+        "Hinge": {
+            **{"frame": "base", "to": None, "axis": (0, 0, 1)},
+            **{"placement": None, "name": "held"},
+        },
         "StateFeedback": {"lin": lin, "K": gain.K},
         "StateMap": {"robot": robot, "reference": None, "frame": "hybrid"},
         "Thruster": {

@@ -1,0 +1,182 @@
+r"""Constraints of a robot: residual, Jacobian, and the accelerations that they require.
+
+Constraint k holds frame 2, the constraint's `frame`, relative to frame 1. Frame 1 is fixed to the
+frame `to`, or to inertial space, at the constraint's placement, so that frames 1 and 2 coincide if
+a weld is closed. With the twists :math:`V_1` and :math:`V_2` of the two frames in their own axes,
+and the transformation X of twists from frame 2 to frame 1, the relative twist is
+
+.. math:: V = X V_2 - V_1.
+
+Each constraint sets some rows S of V to zero, in the axes of frame 1: :math:`S V = J \nu = 0`.
+Differentiated, this is :math:`J \dot\nu + \gamma = 0`. Twists have the linear part first, as in
+Pinocchio, and so have the tangent coordinates of q and :math:`\nu`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+import pinocchio as pin
+
+from fflin.base.errors import InputError
+from fflin.base.validation import Array
+from fflin.robot.constraints import Constraint, Hinge
+from fflin.robot.joints import ROOT, Carried, find_frame
+from fflin.robot.robot_data import RobotData
+
+_LOCAL = pin.ReferenceFrame.LOCAL
+
+
+class Pair(NamedTuple):
+    """The two frames of a constraint: the joints that carry them, and placements on these."""
+
+    constraint: Constraint
+    rows: slice  # rows of the constraint among all rows
+    selected: Array  # S (k, 6)
+    first: Carried  # frame 1, on the joint of `to`, or on the universe
+    second: Carried  # frame 2
+
+
+class Constraints:
+    """Constraints of one robot at any configuration, in Pinocchio's tangent coordinates.
+
+    Attributes
+    ----------
+    items : tuple of Constraint
+    count : int
+        Number of rows of all constraints.
+    """
+
+    def __init__(self, robot: RobotData) -> None:
+        self.items = robot.constraints
+        self.count = sum(len(item.rows) for item in self.items)
+        self._robot = robot
+        self._model = robot.model
+        self._data = robot.model.createData()
+        self._pairs: tuple[Pair, ...] = ()
+
+    def settle(self, q: Array) -> None:
+        """Store, in constraints without a placement, the pose of their frames at q (nq,)."""
+        if self._pairs:
+            return
+        pin.forwardKinematics(self._model, self._data, q)
+        for item in self.items:
+            if item.placement is not None:
+                continue
+            to = self._carrier(item.to)
+            frame = self._carrier(item.frame)
+            item.store(self._pose(to).actInv(self._pose(frame)))
+
+    @property
+    def pairs(self) -> tuple[Pair, ...]:
+        """The frames of all constraints; raise `InputError` if a placement is not yet stored."""
+        if not self._pairs:
+            self._pairs = tuple(self._made())
+        return self._pairs
+
+    def residual(self, q: Array) -> Array:
+        """Return phi (rows,) at q (nq,): the distances [m] and angles [rad] left to close.
+
+        On the manifold phi is zero, and its derivative in tangent coordinates is J.
+        """
+        pin.forwardKinematics(self._model, self._data, q)
+        residual = np.zeros(self.count)
+        for pair in self.pairs:
+            apart = self._apart(pair)
+            rotation = pin.log3(apart.rotation)
+            if isinstance(pair.constraint, Hinge):
+                rotation = _tilt(np.array(pair.constraint.axis), apart.rotation)
+            twist = np.concatenate((apart.translation, rotation))
+            residual[pair.rows] = pair.selected @ twist
+        return residual
+
+    def jacobian(self, q: Array) -> Array:
+        """Return J (rows, nv) at q (nq,)."""
+        pin.computeJointJacobians(self._model, self._data, q)
+        pin.updateGlobalPlacements(self._model, self._data)
+        jacobian = np.zeros((self.count, self._model.nv))
+        for pair in self.pairs:
+            X = self._apart(pair).action
+            second = _of_frame(pair.second, self._joint_jacobian(pair.second))
+            first = _of_frame(pair.first, self._joint_jacobian(pair.first))
+            jacobian[pair.rows] = pair.selected @ (X @ second - first)
+        return jacobian
+
+    def bias(self, q: Array, v: Array) -> Array:
+        """Return gamma (rows,) at q (nq,) and v (nv,), so that J dv/dt + gamma = 0."""
+        pin.forwardKinematics(self._model, self._data, q, v, np.zeros_like(v))
+        bias = np.zeros(self.count)
+        for pair in self.pairs:
+            X = self._apart(pair)
+            first, second = self._twist(pair.first), self._twist(pair.second)
+            rates = X.act(self._acceleration(pair.second))
+            rates -= self._acceleration(pair.first)
+            # dX/dt V_2 = V x X V_2 with the relative twist V = X V_2 - V_1.
+            rates -= first.cross(X.act(second))
+            bias[pair.rows] = pair.selected @ rates.vector
+        return bias
+
+    def _made(self) -> Iterator[Pair]:
+        at = 0
+        for item in self.items:
+            if item.placement is None:
+                raise InputError(
+                    f"constraint '{item.title}' has no placement yet; give placement=, or the "
+                    "configuration at which it is closed"
+                )
+            to = self._carrier(item.to)
+            first = Carried(to.joint, to.placement * item.placement)
+            rows = slice(at, at + len(item.rows))
+            yield Pair(item, rows, item.rows, first, self._carrier(item.frame))
+            at = rows.stop
+
+    def _carrier(self, frame: str | None) -> Carried:
+        if frame is None:
+            return Carried(ROOT - 1, pin.SE3.Identity())
+        return find_frame(self._model, frame)
+
+    def _pose(self, frame: Carried) -> pin.SE3:
+        return self._data.oMi[frame.joint] * frame.placement
+
+    def _apart(self, pair: Pair) -> pin.SE3:
+        """Return the pose of frame 2 in frame 1."""
+        return self._pose(pair.first).actInv(self._pose(pair.second))
+
+    def _twist(self, frame: Carried) -> pin.Motion:
+        return frame.placement.actInv(self._data.v[frame.joint])
+
+    def _acceleration(self, frame: Carried) -> pin.Motion:
+        return frame.placement.actInv(self._data.a[frame.joint])
+
+    def _joint_jacobian(self, frame: Carried) -> Array:
+        if frame.joint < ROOT:
+            return np.zeros((6, self._model.nv))
+        jacobian: Array = pin.getJointJacobian(
+            self._model, self._data, frame.joint, _LOCAL
+        )
+        return jacobian
+
+
+def _of_frame(frame: Carried, columns: Array) -> Array:
+    """Return twists of a frame in its own axes from twists (6, k) of the joint that carries it."""
+    twists: Array = frame.placement.actionInverse @ columns
+    return twists
+
+
+def _tilt(axis: Array, rotation: Array) -> Array:
+    """Return the rotation vector (3,) that tilts an axis to the axis rotated by a matrix R."""
+    tilted = rotation @ axis
+    across = np.cross(axis, tilted)
+    sine = float(np.linalg.norm(across))
+    cosine = float(axis @ tilted)
+    if sine < 1e-12 and cosine > 0.0:
+        return across
+    angle = np.arctan2(sine, cosine)
+    if sine < 1e-12:
+        # The axes are opposite: any rotation by 180 deg across the axis closes the hinge.
+        across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+        sine = float(np.linalg.norm(across))
+    vector: Array = angle * across / sine
+    return vector
