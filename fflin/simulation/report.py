@@ -508,6 +508,8 @@ def motion_report(motion: Motion) -> str:
         parts.append(_largest_modes(motion))
     if kinds or motion.u.any():
         parts.append(_largest_inputs(motion))
+    if motion.constraint_names:
+        parts.append(_largest_forces(motion))
     limit_messages = [
         *(f"limit exceeded: {violation}" for violation in motion.passed),
         *map(str, motion.saturated),
@@ -541,6 +543,25 @@ def motion_report(motion: Motion) -> str:
             f"largest difference from the linear model: {size} in {motion.state_names[most]}"
         )
     return "\n".join(parts)
+
+
+def _largest_forces(motion: Motion) -> str:
+    """Return a table of the largest force and moment of each constraint."""
+    rows = [["constraint", "largest force [N]", "largest moment [N m]"]]
+    columns = dict(
+        zip(motion.constraint_names, motion.constraint_forces.T, strict=True)
+    )
+    # A name is the title of the constraint, "F" or "tau", and the axis.
+    titles = dict.fromkeys(name.rsplit(".", 2)[0] for name in columns)
+    for title in titles:
+        row = [title]
+        for kind in ("F", "tau"):
+            parts = [columns.get(f"{title}.{kind}.{axis}") for axis in "xyz"]
+            known = [part for part in parts if part is not None]
+            size = np.linalg.norm(known, axis=0).max() if known else None
+            row.append("" if size is None else f"{size:.4g}")
+        rows.append(row)
+    return f"{grid(rows, 'l')}\n"
 
 
 def _heading(motion: Motion, kinds: list[ErrorSize]) -> list[str]:

@@ -30,6 +30,8 @@ from fflin.robot.joints import ROOT
 from fflin.simulation.plan import Plan
 from fflin.simulation.plant import LARGEST_TURN
 
+# Start of the message if the rows of the constraints become dependent.
+SINGULAR = "singular constraints"
 STOPS = ("", "diverged", "left the chart", "stopped")
 
 _LOOK = 16  # steps between checks of the clock
@@ -225,6 +227,7 @@ class Recording(NamedTuple):
     steps: int  # number of steps that were begun
     stopped: str  # reason if the run ended early, or an empty text
     engine: str  # name of the engine
+    forces: Array | None = None  # (N, r) of constraints, or None without constraints
 
 
 def _follower(plan: Plan) -> Callable[[int], None] | None:
@@ -251,6 +254,13 @@ class _Rows:
         self._callback = plan.options.callback
         self._ends = np.cumsum([len(plan.q), len(plan.v), len(plan.initial), 6])
         self._rows = np.empty((plan.times.rows, self._ends[-1] + 3))
+        self._constrained = plan.plant.constrained
+        self._forces = list[Array]()
+
+    def add_forces(self) -> None:
+        """Record the present forces of the constraints in the latest row."""
+        if self._constrained is not None and len(self._forces) < len(self.times):
+            self._forces.append(self._constrained.forces)
 
     def add(self, t: float, q: Array, v: Array, u: Array) -> None:
         """Record a row, and call the callback of the run."""
@@ -265,6 +275,11 @@ class _Rows:
         """Return the rows of a run that ended after `steps` for the reason `stopped`."""
         parts = np.split(self._rows[: len(self.times)], self._ends, axis=1)
         q, v, u, momentum, center = parts
+        forces = None
+        if self._constrained is not None:
+            # No step begins at the last row, so this row repeats the forces before it.
+            rows = self._forces + self._forces[-1:]
+            forces = np.array(rows[: len(q)])
         return Recording(
             t=np.array(self.times),
             q=q,
@@ -275,6 +290,7 @@ class _Rows:
             steps=steps,
             stopped=stopped,
             engine="python",
+            forces=forces,
         )
 
 
@@ -288,6 +304,9 @@ def go(plan: Plan, hint: str = "") -> Recording:
     applied = None if law is None else plan.applied_by(law)
     ask = partial(applied, 0) if applied and not times.sample else None
     take, stage = plan.method(plant.robot.model, dt).step, plant.stage
+    constrained = plant.constrained
+    if constrained is not None:
+        stage = plant.constrained_stage
     follow = _follower(plan)
     pushed = not plant.isolated(driven=law is not None)
     rows = _Rows(plan, kept)
@@ -303,6 +322,8 @@ def go(plan: Plan, hint: str = "") -> Recording:
         a, push = stage(t, q, v, inputs)
         if pushed:
             kept.wrenches[stages][:] = kept.wrench(q, push)
+        if constrained is not None and not stages:
+            rows.add_forces()
         stages += 1
         if follow:
             follow(stages)
@@ -322,6 +343,8 @@ def go(plan: Plan, hint: str = "") -> Recording:
             if pushed:
                 kept.advance()
             t = (step + 1) * dt
+            if constrained is not None:
+                q, v = constrained.close(q, v)
             if plan.project:
                 kept.impose(t, q, v)
             if stopped := ending(t, q, v):
@@ -361,8 +384,12 @@ def ending_of(plan: Plan, stop: StopConditions) -> Callable[[float, Array, Array
     any_attitude = stop._replace(sign=[0.0])
     origin = [0.0, 0.0, 0.0, *plan.plant.state.origin_quaternion.tolist()]
 
-    def ending(t: float, q: Array, v: Array) -> str:
+    constrained = plan.plant.constrained
+
+    def ending(t: float, q: Array, v: Array, *, independent: bool = True) -> str:
         place, rates = q.tolist(), v.tolist()
+        if not (independent and (constrained is None or constrained.independent())):
+            return f"{SINGULAR} at t = {t:g} s: a row of the constraints depends on the others"
         if goes_on(stop, origin, place, rates):
             for event in plan.events:
                 value = event(t, q.copy(), v.copy())
