@@ -188,7 +188,8 @@ class Constrained:
         """Return the smallest change c (6 + n,) with J c = -error, in the metric of M at q."""
         M = self._state.project(pin.crba(self._model, self._data, q))
         factor, _ = dpotrf(M, 1)
-        basis = dtrtrs(factor, J.T, 1)[0].T.ravel().tolist()
+        # One column at a time, because OpenBLAS would wait for threads if there were several.
+        basis = np.concatenate([dtrtrs(factor, row, 1)[0] for row in J]).tolist()
         r, size = J.shape
         triangle, change, forces = [0.0] * (r * r), [0.0] * size, [0.0] * r
         kernel.orthonormalise(basis, triangle, self.least)
