@@ -16,6 +16,7 @@ _PUBLIC = {
         "robot.equipment.appendages": "FlexibleAppendage Slosh",
         "robot.constraints": "Weld Hinge Spherical",
         "dynamics.points": "configuration velocity effort",
+        "dynamics.closure": "closed",
         "dynamics.impact": "capture Capture jam Impact",
     },
     "Inputs": {
@@ -107,7 +108,7 @@ _PUBLIC = {
     "Errors": {
         "base.errors": "FflinError InputError UnknownNameError FileError MissingPackageError "
         "ModelError UrdfError ChartError EquilibriumError SingularInertiaError "
-        "StabilizabilityError DetectabilityError SweepError FflinWarning",
+        "ConstraintError StabilizabilityError DetectabilityError SweepError FflinWarning",
     },
 }
 

@@ -16,6 +16,7 @@ from fflin.robot.constraints import Spherical as Spherical
 from fflin.dynamics.points import configuration as configuration
 from fflin.dynamics.points import velocity as velocity
 from fflin.dynamics.points import effort as effort
+from fflin.dynamics.closure import closed as closed
 from fflin.dynamics.impact import capture as capture
 from fflin.dynamics.impact import Capture as Capture
 from fflin.dynamics.impact import jam as jam
@@ -179,6 +180,7 @@ from fflin.base.errors import UrdfError as UrdfError
 from fflin.base.errors import ChartError as ChartError
 from fflin.base.errors import EquilibriumError as EquilibriumError
 from fflin.base.errors import SingularInertiaError as SingularInertiaError
+from fflin.base.errors import ConstraintError as ConstraintError
 from fflin.base.errors import StabilizabilityError as StabilizabilityError
 from fflin.base.errors import DetectabilityError as DetectabilityError
 from fflin.base.errors import SweepError as SweepError

@@ -157,6 +157,21 @@ class EquilibriumError(FflinError, ValueError):
     """
 
 
+class ConstraintError(FflinError, ValueError):
+    """Error for a configuration or velocity that the constraints of a robot do not permit.
+
+    Examples
+    --------
+    >>> import pinocchio as pin
+    >>> held = fflin.Weld("base", placement=pin.SE3.Identity())
+    >>> robot = fflin.load("cubesat", constraints=[held])
+    >>> fflin.linearize(robot, fflin.configuration(robot, rpy=(5, 0, 0)))
+    Traceback (most recent call last):
+        ...
+    fflin.base.errors.ConstraintError: q is off constraint 'base' by 0.0873 rad; close it ...
+    """
+
+
 class StabilizabilityError(FflinError, ValueError):
     """Error for modes that neither decay by themselves nor can be controlled by the inputs.
 

@@ -21,12 +21,14 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError
+from fflin.base.rotation import skew
 from fflin.base.validation import Array
 from fflin.robot.constraints import Constraint, Hinge
 from fflin.robot.joints import ROOT, Carried, find_frame
 from fflin.robot.robot_data import RobotData
 
 _LOCAL = pin.ReferenceFrame.LOCAL
+_BASE = slice(0, 6)  # columns of the base
 
 
 class Pair(NamedTuple):
@@ -37,6 +39,28 @@ class Pair(NamedTuple):
     selected: Array  # S (k, 6)
     first: Carried  # frame 1, on the joint of `to`, or on the universe
     second: Carried  # frame 2
+
+    @property
+    def is_loop(self) -> bool:
+        """Whether both frames are on the robot, so that a motion of the base moves them alike."""
+        return self.first.joint >= ROOT
+
+
+class _Slopes(NamedTuple):
+    """Derivatives (6, nv) of the twist V and the acceleration of a frame, in its own axes."""
+
+    twist_by_q: Array
+    jacobian: Array
+    rate_by_q: Array
+    rate_by_v: Array
+
+
+class RowDerivatives(NamedTuple):
+    """Derivatives (rows, nv) of the rows of the constraints, in Pinocchio's order."""
+
+    twist_by_q: Array  # of J v with respect to q, at constant v
+    by_q: Array  # of J dv/dt + gamma with respect to q, at constant v and dv/dt
+    by_v: Array  # of J dv/dt + gamma with respect to v
 
 
 class Constraints:
@@ -102,6 +126,8 @@ class Constraints:
             second = _of_frame(pair.second, self._joint_jacobian(pair.second))
             first = _of_frame(pair.first, self._joint_jacobian(pair.first))
             jacobian[pair.rows] = pair.selected @ (X @ second - first)
+            if pair.is_loop:
+                jacobian[pair.rows, _BASE] = 0.0
         return jacobian
 
     def bias(self, q: Array, v: Array) -> Array:
@@ -117,6 +143,66 @@ class Constraints:
             rates -= first.cross(X.act(second))
             bias[pair.rows] = pair.selected @ rates.vector
         return bias
+
+    def derivatives(self, q: Array, v: Array, a: Array) -> RowDerivatives:
+        """Return the derivatives of the rows at q (nq,), v (nv,) and the acceleration a (nv,)."""
+        pin.computeForwardKinematicsDerivatives(self._model, self._data, q, v, a)
+        derivatives = RowDerivatives(*np.zeros((3, self.count, self._model.nv)))
+        for pair in self.pairs:
+            pose = self._apart(pair)
+            X = pose.action
+            first, second = self._slopes(pair.first), self._slopes(pair.second)
+            relative = X @ second.jacobian - first.jacobian
+            twist = pose.act(self._twist(pair.second))
+            rate = pose.act(self._acceleration(pair.second))
+            turning = self._twist(pair.first).action
+            # d(X V_2) = X dV_2 - (X V_2) x (relative xi), and the same for accelerations.
+            twist_by_q = X @ second.twist_by_q - twist.action @ relative
+            rate_by_q = X @ second.rate_by_q - rate.action @ relative
+            S, rows = pair.selected, pair.rows
+            derivatives.twist_by_q[rows] = S @ (twist_by_q - first.twist_by_q)
+            rate_by_q -= first.rate_by_q
+            rate_by_q += twist.action @ first.twist_by_q - turning @ twist_by_q
+            derivatives.by_q[rows] = S @ rate_by_q
+            rate_by_v = X @ second.rate_by_v - first.rate_by_v
+            rate_by_v += twist.action @ first.jacobian
+            rate_by_v -= turning @ X @ second.jacobian
+            derivatives.by_v[rows] = S @ rate_by_v
+            if pair.is_loop:
+                for array in derivatives:
+                    array[rows, _BASE] = 0.0
+        return derivatives
+
+    def wrenches(self, q: Array, forces: Array) -> pin.StdVec_Force:
+        """Return the wrenches on all joints, in their frames, of constraint forces (rows,)."""
+        pin.forwardKinematics(self._model, self._data, q)
+        wrenches = pin.StdVec_Force(self._model.njoints, pin.Force.Zero())
+        for pair in self.pairs:
+            wrench = pin.Force(pair.selected.T @ forces[pair.rows])
+            first, second = pair.first, pair.second
+            wrenches[first.joint] -= first.placement.act(wrench)
+            turned = self._apart(pair).actInv(wrench)
+            wrenches[second.joint] += second.placement.act(turned)
+        return wrenches
+
+    def force_by_q(self, q: Array, forces: Array) -> Array:
+        """Return the derivative (nv, nv) of J^T times the forces (rows,), due to rotations alone.
+
+        The wrench on frame 2 is constant in the axes of frame 1, so it turns relative to frame 2.
+        The derivative at wrenches that are constant in the frames of their joints is not included.
+        """
+        pin.computeJointJacobians(self._model, self._data, q)
+        total = np.zeros((self._model.nv, self._model.nv))
+        for pair in self.pairs:
+            X = self._apart(pair).action
+            second = _of_frame(pair.second, self._joint_jacobian(pair.second))
+            first = _of_frame(pair.first, self._joint_jacobian(pair.first))
+            force, torque = np.split(pair.selected.T @ forces[pair.rows], 2)
+            turned = np.zeros((6, 6))
+            turned[:3, 3:] = turned[3:, :3] = skew(force)
+            turned[3:, 3:] = skew(torque)
+            total += second.T @ X.T @ turned @ (X @ second - first)
+        return total
 
     def _made(self) -> Iterator[Pair]:
         at = 0
@@ -149,6 +235,18 @@ class Constraints:
 
     def _acceleration(self, frame: Carried) -> pin.Motion:
         return frame.placement.actInv(self._data.a[frame.joint])
+
+    def _slopes(self, frame: Carried) -> _Slopes:
+        """Return derivatives of the twist and acceleration of a frame, in its own axes."""
+        if frame.joint < ROOT:
+            return _Slopes(*np.zeros((4, 6, self._model.nv)))
+        twist_by_q, rate_by_q, rate_by_v, jacobian = (
+            pin.getJointAccelerationDerivatives(
+                self._model, self._data, frame.joint, _LOCAL
+            )
+        )
+        columns = twist_by_q, jacobian, rate_by_q, rate_by_v
+        return _Slopes(*(_of_frame(frame, x) for x in columns))
 
     def _joint_jacobian(self, frame: Carried) -> Array:
         if frame.joint < ROOT:

@@ -10,6 +10,8 @@ import pinocchio as pin
 from fflin.base.errors import FflinWarning, SingularInertiaError, listed
 from fflin.base.rotation import skew
 from fflin.base.validation import Array
+from fflin.dynamics.closure import Closure
+from fflin.dynamics.contact import Contact, ContactSolver
 from fflin.dynamics.coordinates import ANGULAR, LINEAR, PIN_ANGULAR
 from fflin.dynamics.orbital import GravityGradient
 from fflin.dynamics.state import Actuation, StateMap
@@ -205,11 +207,21 @@ class AccelerationDerivatives(NamedTuple):
     slopes: Array
     by_u: Array  # D_u (.., 6 + n, nu) of (3.3), for u in base axes
     gravity: Array  # (.., 3) [m/s^2] in base axes; `GravityGradient.fall` in orbit
+    # constraint forces of a robot with constraints, for which c and its derivatives are constrained
+    contact: Contact | None = None
 
     @property
     def by_turn(self) -> Array:
-        """D_theta (.., 6 + n, 3) of (14.5), for rotations of the base; zero without an orbit."""
+        """D_theta (.., 6 + n, 3) of (14.5), for rotations of the base.
+
+        It is zero without an orbit, unless a constraint anchors the robot in inertial space.
+        """
         return self.slopes[..., :3]
+
+    @property
+    def by_position(self) -> Array:
+        """D_p (.., 6 + n, 3), for displacements of the base; zero unless the robot is anchored."""
+        return self.slopes[..., 3:6]
 
     @property
     def by_q_m(self) -> Array:
@@ -218,7 +230,10 @@ class AccelerationDerivatives(NamedTuple):
 
     @property
     def by_nu(self) -> Array:
-        """D_nu (.., 6 + n, 6 + n) of (3.3); its columns for v_b are zero."""
+        """D_nu (.., 6 + n, 6 + n) of (3.3).
+
+        Its columns for v_b are zero, unless a constraint anchors the robot in inertial space.
+        """
         return self.slopes[..., self.c.shape[-1] :]
 
 
@@ -228,9 +243,16 @@ class Accelerations:
     Springs and dampers add their forces to the right side.
     """
 
-    def __init__(self, state: StateMap, actuation: Actuation, data: pin.Data) -> None:
+    def __init__(
+        self,
+        state: StateMap,
+        actuation: Actuation,
+        data: pin.Data,
+        closure: Closure | None = None,
+    ) -> None:
         robot = state.robot
         self._state, self._actuation, self._data = state, actuation, data
+        self._contacts = ContactSolver(closure) if closure is not None else None
         self._model = robot.model
         self._nv = 6 + robot.n
         self.inertia = Inertia(state, data)
@@ -300,6 +322,14 @@ class Accelerations:
         if self._resists:
             force[6:] += self._springs.force(state.joint_positions(q), nu[6:])
         c = inverse.dot(force)
+        contact = None
+        if self._contacts is not None:
+            contact = self._contacts.contact(q, v, nu, c, inverse)
+            c = contact.c
+            loads = pin.StdVec_Force(contact.wrenches)
+            for joint, wrench in enumerate(wrenches or ()):
+                loads[joint] += wrench
+            wrenches = loads
 
         # Derivatives of M c + b - B_u u minus the forces of springs and dampers (3.3), (7.1). The
         # wrenches of inputs are constant in the frames of their links. So the derivatives of RNEA
@@ -324,8 +354,12 @@ class Accelerations:
         np.negative(inverse, self._minus_inverse).dot(self._force_slopes, slopes)
         if not actuation.default:
             inverse.dot(columns, by_u)
+        if self._contacts is not None and contact is not None:
+            self._contacts.differentiate(
+                contact, q, v, nu, -self._minus_inverse, slopes, by_u
+            )
         gravity = tide.fall if tide else state.gravity(q)
-        return AccelerationDerivatives(c, slopes, by_u, gravity)
+        return AccelerationDerivatives(c, slopes, by_u, gravity, contact)
 
     def _gyroscopic(
         self, q: Array, v: Array, wrenches: pin.StdVec_Force | None

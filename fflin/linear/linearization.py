@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from threading import Lock
 from typing import Any
@@ -12,12 +13,15 @@ import pinocchio as pin
 from fflin.base import __version__
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, frozen, truth, vector
+from fflin.dynamics.closure import Closure
 from fflin.dynamics.coordinates import Chart, Frame, ReferenceChart, refuse_orbit
 from fflin.dynamics.outputs import Sensing
 from fflin.dynamics.rnea import AccelerationDerivatives, Accelerations
 from fflin.dynamics.state import Actuation, StateMap
 from fflin.linear.aba_route import inertia_matrix
 from fflin.linear.check import certify
+from fflin.linear.constrained import Reducer, reduced_fields
+from fflin.linear.files import given
 from fflin.linear.model import LinearModel
 from fflin.linear.state_equations import assemble, drift, output_equations
 from fflin.robot.fields import magnitudes_of
@@ -93,7 +97,12 @@ class Prepared:
             or np.any(robot.springs)
         )
         # In this case, all matrices of a model at rest except B are known in advance.
-        self.free = self.sensing is None and not moving and not has_other_forces
+        self.free = (
+            self.sensing is None
+            and not moving
+            and not has_other_forces
+            and not robot.constraints
+        )
         nx = state.nx
         nv = state.nx // 2
         nu = len(self.actuation.names)
@@ -170,6 +179,8 @@ def ignorable_states(robot: Robot, lin: LinearModel) -> tuple[str, ...]:
     groups.append("r_b")
     if robot.orbit:
         groups = []
+    if robot.anchored:
+        groups = []
     base = [f"{group}.{axis}" for group in groups for axis in "xyz"]
     return (*base, *(f"q_m.{name}" for name in robot.rotors))
 
@@ -220,6 +231,11 @@ class Linearizer:
         :math:`q_b = \mathrm{vec}(q^{*-1} q)` and :math:`r_b = R^{*T} (p - p^*)`; a star denotes the
         reference. Use a moving reference for trajectories, and for relative equilibria such as a
         steady spin.
+    independent : sequence of str, optional
+        Names or patterns of the coordinates of the models of a robot with constraints, such as
+        joint names, "q_b" or "r_b.x". By default, the coordinates are chosen at the first point, by
+        a factorisation with pivoting in units of equal kinetic energy. All models of a
+        `Linearizer` have the same coordinates.
 
     Raises
     ------
@@ -262,14 +278,27 @@ class Linearizer:
         frame: Frame | None = None,
         reference: pin.SE3 | None = None,
         moving: bool = False,
+        independent: Sequence[str] | None = None,
     ) -> None:
         self.prepared = ready = Prepared(
             robot, frame=frame, reference=reference, moving=moving
         )
         self.robot = robot
+        self._closure: Closure | None = None
+        self._reducer: Reducer | None = None
+        if robot.constraints:
+            self._closure = Closure(ready.map)
+            self._reducer = Reducer(self._closure, independent, moving=moving)
+        elif independent is not None:
+            raise InputError(
+                f"independent is given, but '{robot.name}' has no constraints, so that all "
+                "coordinates are independent; leave out independent"
+            )
         self._data = robot.create_data()
         self._lock = Lock()  # protects the work space
-        self._accelerations = Accelerations(ready.map, ready.actuation, self._data)
+        self._accelerations = Accelerations(
+            ready.map, ready.actuation, self._data, self._closure
+        )
         nv = ready.map.nx // 2
         nx = ready.map.nx
         self._shape_B = (nx, len(ready.actuation.names))
@@ -309,6 +338,9 @@ class Linearizer:
                 B.setflags(write=False)
                 q.setflags(write=False)
                 return LinearModel(self._fields, B=B, q=q)
+            if self._closure is not None:
+                q = self._closure.configuration(q)
+                v = self._closure.velocity(q, v)
             # Suppress NumPy's overflow warnings, because `_require_finite` reports an overflow.
             with np.errstate(over="ignore", invalid="ignore"):
                 return self._anywhere(q, v, u)
@@ -363,7 +395,16 @@ class Linearizer:
         made = {"A": A, "B": B, "q": q, "v": v, "u0": u, self._rate: rate} | seen
         for array in made.values():
             array.setflags(write=False)
-        return LinearModel(self._fields | made)
+        if self._reducer is None or rates.contact is None:
+            return LinearModel(self._fields | made)
+        whole = LinearModel(self._fields | made)
+        space = rates.contact.space
+        reduction = self._reducer.reduction(chart, q, v, nu, space)
+        fields = reduced_fields(state, reduction, whole)
+        return LinearModel(
+            {**self._fields, "_computed": {}, **made, **fields}
+            | {"_inertia": partial(given, frozen(reduction.M))}
+        )
 
     def along(self, q: Array, v: Array, u: Array) -> dict[str, Array]:
         """Return A, B, C, D and y (N, ..) about N valid points, with the inputs u in base axes.
@@ -425,6 +466,7 @@ def linearize(
     frame: Frame | None = None,
     reference: pin.SE3 | None = None,
     moving: bool = False,
+    independent: Sequence[str] | None = None,
 ) -> LinearModel:
     """Linearise a robot about an operating point, by default at rest with neutral joints.
 
@@ -447,6 +489,9 @@ def linearize(
     moving : bool
         Whether to return the error dynamics about a reference that moves through the
         operating point; see `Linearizer`.
+    independent : sequence of str, optional
+        Coordinates of the model of a robot with constraints, such as joint names; see
+        `Linearizer`.
 
     Returns
     -------
@@ -458,6 +503,9 @@ def linearize(
     ------
     InputError
         If an argument has a wrong size or value.
+    ConstraintError
+        If the constraints of the robot are not closed at q, v violates them, or the rank of the
+        constraints changes near q.
     ChartError
         If the base is rotated by 180 deg from the reference.
     SingularInertiaError
@@ -474,4 +522,7 @@ def linearize(
     >>> lin.is_equilibrium(1e-9)
     True
     """
-    return Linearizer(robot, frame=frame, reference=reference, moving=moving)(q, v, u)
+    linearizer = Linearizer(
+        robot, frame=frame, reference=reference, moving=moving, independent=independent
+    )
+    return linearizer(q, v, u)

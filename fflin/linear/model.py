@@ -253,6 +253,11 @@ class LinearModel(ModelHeader, StateSpace):
         model with delayed inputs, see `discretize`.
     delay : ndarray (nu,)
         Delay of each input [s].
+    rank : int
+        Number of velocities that the constraints of the robot remove; 0 without constraints.
+    dependent : tuple of str
+        States of the robot that the model does not contain, because the constraints determine them
+        from the states of the model.
 
     Examples
     --------
@@ -286,6 +291,8 @@ class LinearModel(ModelHeader, StateSpace):
     _robot: Robot | None = None  # robot of the model; None for a model from a file
     mean_motion: float = 0.0
     added: tuple[str, ...] = ()
+    rank: int = 0
+    dependent: tuple[str, ...] = ()
     _delays: tuple[float, ...] = ()  # empty if no input is delayed
 
     def __init__(

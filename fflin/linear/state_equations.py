@@ -36,6 +36,7 @@ def assemble(
     state = actuation.state
     g = state.groups
     nv = state.nx // 2
+    anchored = state.robot.anchored
     lower = rates.slopes
     omega_in_reference, v_in_reference = state.axes
     w, v = nu[..., ANGULAR], nu[..., LINEAR]
@@ -44,7 +45,7 @@ def assemble(
     # (4.8)
     f0 = np.concatenate((chart.rate(w), position_rate, nu[..., 6:], rates.c), -1)
 
-    D_theta = _rotation_derivative(actuation, chart, u, rates, W)
+    D_theta = _rotation_derivative(actuation, chart, u, rates, W, v)
     lower[..., g.q_b] = chart.over_q_b(D_theta)
 
     # Write the rows of attitude and position. If the base is at the reference, do not write the
@@ -68,10 +69,14 @@ def assemble(
     # Rotate the rows of the accelerations from base axes to the axes of the frame.
     if not chart.at_reference:
         chart.turn_rows(state.in_reference, lower)  # (4.6)
-        # The columns of the base's linear velocity need no rotation: before (4.5) below, these
-        # columns are zero.
         if omega_in_reference:
             chart.turn_rows((ANGULAR,), rates.by_nu.mT)
+        if anchored:
+            # Otherwise, the columns of the base's position and linear velocity are zero before
+            # (4.5) below.
+            chart.turn_rows((LINEAR,), lower.mT)
+            if v_in_reference:
+                chart.turn_rows((LINEAR,), rates.by_nu.mT)
         chart.turn_rows(state.in_reference, rates.by_u)  # (4.7)
         chart.turn_rows(actuation.held, rates.by_u.mT)
     if state.falls:
@@ -101,6 +106,7 @@ def _rotation_derivative(
     u: Array,
     rates: AccelerationDerivatives,
     W: Array,
+    v: Array,
 ) -> Array:
     """Return D_theta (.., 6 + n, 3): the derivative of the accelerations by base rotations (4.4).
 
@@ -110,9 +116,13 @@ def _rotation_derivative(
     c = rates.c
     omega_in_reference, v_in_reference = state.axes
     D_theta = rates.by_turn  # zero without an orbit
+    anchored = state.robot.anchored
     if omega_in_reference:
-        # In orbit, omega is in base axes. So here `rates.by_turn` is zero, and is replaced.
-        D_theta = product(rates.by_nu[..., ANGULAR], W)
+        # In orbit, omega is in base axes. So here `rates.by_turn` is zero unless it is anchored.
+        turned = product(rates.by_nu[..., ANGULAR], W)
+        D_theta = D_theta + turned if anchored else turned
+    if v_in_reference and anchored:
+        D_theta = D_theta + product(rates.by_nu[..., LINEAR], skew(v))
     if np.count_nonzero(u):
         # A wrench that is fixed in reference axes turns relative to the base.
         for columns in actuation.held:
@@ -137,9 +147,10 @@ def drift(state: StateMap, f0: Array, gravity: Array) -> Array:
     """Return the state derivative (.., nx) of a moving reference (section 5).
 
     f0 is the state derivative of the robot. Under gravity, the result is f0 without the rotation
-    about the vertical, because a rotation about the vertical does not affect the dynamics.
+    about the vertical, because a rotation about the vertical does not affect the dynamics of a
+    robot that is not anchored.
     """
-    if not state.falls:
+    if not state.falls or state.robot.anchored:
         return f0
     weight = (gravity * gravity).sum(axis=-1, keepdims=True)
     if not np.count_nonzero(weight):
@@ -172,6 +183,7 @@ def output_equations(
     g = state.groups
     by_q, by_nu = state.columns(sensed.by_q), state.columns(sensed.by_v)
     turn = by_q[:, ANGULAR].copy()
+    by_position = by_q[:, LINEAR].copy()
     by_q_m = by_q[:, 6:]
     D: Array = np.zeros((len(by_q), len(u)))
     if sensing.needs_acceleration:
@@ -182,6 +194,9 @@ def output_equations(
         by_nu += by_rate.dot(rate_by_nu)
         by_q_m = by_q_m + by_rate.dot(rates.by_q_m)
         turn += by_rate[:, LINEAR].dot(skew(rates.gravity))
+        if state.robot.anchored:
+            turn += by_rate.dot(rates.by_turn)
+            by_position += by_rate.dot(rates.by_position)
         by_u = by_rate.dot(rates.by_u)
         for columns in actuation.held:
             turn += by_u[:, columns].dot(skew(u[columns]))
@@ -193,7 +208,7 @@ def output_equations(
 
     C = np.zeros((len(by_q), state.nx))
     C[:, g.q_b] = chart.over_q_b(turn)  # (8.2)
-    C[:, g.r_b] = by_q[:, LINEAR].dot(chart.R.T)
+    C[:, g.r_b] = by_position.dot(chart.R.T)
     C[:, g.q_m] = by_q_m  # (8.3)
     C[:, -len(nu) :] = state.to_frame(chart, by_nu.T).T
     for row, index in sensing.states:

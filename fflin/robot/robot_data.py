@@ -156,6 +156,11 @@ class RobotData(Coordinates):
         return Springs(*rows)
 
     @cached_property
+    def anchored(self) -> bool:
+        """Whether a constraint holds a frame of the robot in inertial space."""
+        return any(item.to is None for item in self.constraints)
+
+    @cached_property
     def mass(self) -> float:
         """Total mass [kg]."""
         return float(pin.computeTotalMass(self.model))

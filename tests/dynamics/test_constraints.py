@@ -76,6 +76,52 @@ def test_the_bias_is_the_rate_of_the_relative_twist(kind, to):
     np.testing.assert_allclose(expected, rate, atol=1e-7)
 
 
+def along(robot, q, f):
+    """Derivative of f(q) with respect to Pinocchio's tangent coordinates of q."""
+    return np.array(
+        [
+            difference(lambda t, e=e: f(pin.integrate(robot.model, q, t * e)))
+            for e in np.eye(robot.nv)
+        ]
+    ).T
+
+
+@pytest.mark.parametrize(("kind", "to"), CASES)
+def test_the_derivatives_of_the_rows_are_differences(kind, to):
+    rng = np.random.default_rng(7)
+    robot, constraints, q = constrained_tree(rng, kind, to)
+    q = pin.integrate(robot.model, q, 0.1 * rng.normal(size=robot.nv))
+    v, a = rng.normal(size=(2, robot.nv))
+
+    def rows(q, v):
+        return constraints.jacobian(q) @ a + constraints.bias(q, v)
+
+    slopes = constraints.derivatives(q, v, a)
+    by_q = along(robot, q, lambda q: rows(q, v))
+    np.testing.assert_allclose(slopes.by_q, by_q, atol=1e-7)
+    twist_by_q = along(robot, q, lambda q: constraints.jacobian(q) @ v)
+    np.testing.assert_allclose(slopes.twist_by_q, twist_by_q, atol=1e-7)
+    by_v = [difference(lambda t, e=e: rows(q, v + t * e)) for e in np.eye(robot.nv)]
+    np.testing.assert_allclose(slopes.by_v, np.array(by_v).T, atol=1e-9)
+
+
+@pytest.mark.parametrize(("kind", "to"), CASES)
+def test_the_wrenches_and_their_derivative_are_those_of_the_jacobian(kind, to):
+    """The generalised force J^T lam varies as RNEA with fixed wrenches, and with their turning."""
+    rng = np.random.default_rng(11)
+    robot, constraints, q = constrained_tree(rng, kind, to)
+    q = pin.integrate(robot.model, q, 0.1 * rng.normal(size=robot.nv))
+    forces = rng.normal(size=constraints.count)
+    wrenches = constraints.wrenches(q, forces)
+    data, still = robot.create_data(), np.zeros(robot.nv)
+    force = -pin.rnea(robot.model, data, q, still, still, wrenches)
+    np.testing.assert_allclose(constraints.jacobian(q).T @ forces, force, atol=1e-12)
+    held = -pin.computeRNEADerivatives(robot.model, data, q, still, still, wrenches)[0]
+    expected = along(robot, q, lambda q: constraints.jacobian(q).T @ forces)
+    slopes = held + constraints.force_by_q(q, forces)
+    np.testing.assert_allclose(slopes, expected, atol=1e-7)
+
+
 def test_a_missing_placement_is_stored_at_the_first_configuration():
     robot = fflin.load("planar_detumble", constraints=[fflin.Weld("hand")])
     constraints = Constraints(robot)

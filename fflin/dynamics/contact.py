@@ -1,0 +1,120 @@
+"""Constrained accelerations and constraint forces, with their derivatives, in base axes.
+
+The accelerations a of the state's velocities satisfy M a + h = S u + J^T lam and J a + gamma = 0.
+The free accelerations and their derivatives, with lam = 0, come from `fflin.dynamics.rnea`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from fflin.base.rotation import skew
+from fflin.base.validation import Array
+from fflin.dynamics.closure import Closure, TangentSpace
+from fflin.dynamics.coordinates import ANGULAR, LINEAR
+
+
+@dataclass
+class Contact:
+    """Constraint forces at one point, and what their derivatives need.
+
+    Attributes
+    ----------
+    space : TangentSpace
+    c : ndarray (6 + n,)
+        Constrained accelerations, in the convention of `AccelerationDerivatives.c`.
+    forces : ndarray (rows,)
+        Constraint forces lam. If rows are redundant, lam is the smallest of the possible forces.
+    wrenches : pin.StdVec_Force
+        Wrenches of the constraint forces on all joints, in their frames.
+    forces_by_x : ndarray (rows, 12 + 2 n)
+        Derivatives of lam with respect to displacements of the state in base axes.
+    forces_by_u : ndarray (rows, nu)
+        Derivatives of lam with respect to u in base axes.
+    """
+
+    space: TangentSpace
+    c: Array
+    forces: Array
+    wrenches: pin.StdVec_Force
+    forces_by_x: Array
+    forces_by_u: Array
+
+
+class ContactSolver:
+    """Solution of the constrained equations of motion at points of one robot."""
+
+    def __init__(self, closure: Closure) -> None:
+        self._closure = closure
+        self._state = closure.state
+        self._inverse_by_rows = np.zeros((0, 0))
+        self._delassus = np.zeros((0, 0))
+
+    def contact(
+        self, q: Array, v: Array, nu: Array, c: Array, inverse: Array
+    ) -> Contact:
+        """Return the contact at a point from the free accelerations c and M^-1."""
+        constraints = self._closure.constraints
+        space = self._closure.tangent(q)
+        rows = space.rows
+        self._inverse_by_rows = inverse @ rows.T
+        self._delassus = rows @ self._inverse_by_rows
+        a = self._rate(q, nu, c)
+        gamma = space.selected @ constraints.bias(q, v)
+        reduced = -np.linalg.solve(self._delassus, rows @ a + gamma)
+        forces = space.selected.T @ reduced
+        none = np.zeros((0, 0))
+        return Contact(
+            space=space,
+            c=c + self._inverse_by_rows @ reduced,
+            forces=forces,
+            wrenches=constraints.wrenches(q, forces),
+            forces_by_x=none,
+            forces_by_u=none,
+        )
+
+    def differentiate(
+        self,
+        contact: Contact,
+        q: Array,
+        v: Array,
+        nu: Array,
+        inverse: Array,
+        slopes: Array,
+        by_u: Array,
+    ) -> None:
+        """Constrain the derivatives `slopes` (6 + n, 12 + 2 n) and `by_u` (6 + n, nu) in place.
+
+        On entry, they are the derivatives of the free accelerations, at wrenches of the constraint
+        forces that are constant in the frames of their joints.
+        """
+        state, constraints = self._state, self._closure.constraints
+        nv = len(contact.c)
+        space = contact.space
+        turning = constraints.force_by_q(q, contact.forces)
+        slopes[:, :nv] += inverse @ state.project(turning)
+        rate_slopes = slopes.copy()
+        theta, w, v_b = slice(0, 3), slice(nv, nv + 3), slice(nv + 3, nv + 6)
+        rate_slopes[LINEAR, theta] += skew(state.gravity(q))
+        rate_slopes[LINEAR, w] += skew(nu[LINEAR])
+        rate_slopes[LINEAR, v_b] -= skew(nu[ANGULAR])
+        rates = state.spread(self._rate(q, nu, contact.c))
+        of_rows = constraints.derivatives(q, v, rates)
+        explicit = np.hstack((state.columns(of_rows.by_q), state.columns(of_rows.by_v)))
+        residual = space.rows @ rate_slopes + space.selected @ explicit
+        by_x = -np.linalg.solve(self._delassus, residual)
+        by_input = -np.linalg.solve(self._delassus, space.rows @ by_u)
+        slopes += self._inverse_by_rows @ by_x
+        by_u += self._inverse_by_rows @ by_input
+        contact.forces_by_x = space.selected.T @ by_x
+        contact.forces_by_u = space.selected.T @ by_input
+
+    def _rate(self, q: Array, nu: Array, c: Array) -> Array:
+        """Return dnu/dt (3.2) from the accelerations c without gravity."""
+        rate = c.copy()
+        rate[LINEAR] += self._state.gravity(q)
+        rate[LINEAR] -= np.cross(nu[ANGULAR], nu[LINEAR])
+        return rate

@@ -1,0 +1,197 @@
+"""Linear models of robots with constraints, in the coordinates of the motions that remain.
+
+With a basis G of the velocities that the constraints permit, the tangent of the state manifold in
+base axes is xi = G z1, dnu = G z2 + Y z1. Z maps these displacements to the coordinates of chart
+and frame, where P picks d independent coordinates, the same for positions and rates.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from scipy.linalg import qr
+
+from fflin.base.errors import ConstraintError, InputError, listed
+from fflin.base.names import matching
+from fflin.base.rotation import skew
+from fflin.base.validation import Array, frozen
+from fflin.dynamics.closure import Closure, TangentSpace
+from fflin.dynamics.coordinates import ANGULAR, LINEAR, Chart
+from fflin.dynamics.state import StateMap
+from fflin.linear.model import LinearModel
+
+# Coordinates are independent if the smallest singular value of their rows of the basis, in units of
+# equal kinetic energy, is at least _INDEPENDENT.
+_INDEPENDENT = 1e-5
+
+# Each coordinate counts a little less than the one before it, so that rounding errors do not decide
+# between two coordinates of equal weight.
+_LESS = 1e-6
+
+
+@dataclass(frozen=True)
+class Reduction:
+    """Map between all states and the independent states at a point.
+
+    Attributes
+    ----------
+    kept : ndarray (2 d,) of int
+        Indices of the independent states: positions, then rates.
+    T : ndarray (12 + 2 n, 2 d)
+        Map T_c from deviations of the independent states to deviations of all states.
+    M : ndarray (d, d)
+        Inertia of the independent coordinates.
+    rank : int
+        Rank r of the constraints.
+    """
+
+    kept: Array
+    T: Array
+    M: Array
+    rank: int
+
+
+class Reducer:
+    """Choice of independent coordinates of one robot, and reduction of its models to them.
+
+    The choice is made at the first point, or given, and is the same at all points.
+    """
+
+    def __init__(
+        self, closure: Closure, independent: Sequence[str] | None, *, moving: bool
+    ) -> None:
+        self.closure = closure
+        self.given = None if independent is None else tuple(independent)
+        self._state = closure.state
+        self._moving = moving
+        self._picked: Array | None = None
+
+    def reduction(
+        self, chart: Chart, q: Array, v: Array, nu: Array, space: TangentSpace
+    ) -> Reduction:
+        """Return the reduction at a point; `nu` is v in state order."""
+        state = self._state
+        M = state.project(
+            pin.crba(state.robot.model, state.robot.create_data(), q).T
+        )
+        G = space.basis
+        G = G @ np.linalg.inv(np.linalg.cholesky(G.T @ M @ G)).T
+        by_position, by_rate, mixed = self._coordinates(chart, nu)
+        Y = np.zeros_like(G)
+        if v.any():
+            Y = -self._turning(space, q, v) @ G
+        positions, rates = by_position @ G, by_rate @ G
+        in_frame = by_rate @ M @ by_rate.T
+        size = np.sqrt(in_frame.diagonal())
+        picked = self._independent(size, positions, rates)
+        first = np.linalg.inv(positions[picked])
+        second = np.linalg.inv(rates[picked])
+        lower = mixed @ G + by_rate @ Y
+        lower = (lower - rates @ second @ lower[picked]) @ first
+        nv, d = len(M), len(picked)
+        T = np.zeros((2 * nv, 2 * d))
+        T[:nv, :d], T[nv:, :d] = positions @ first, lower
+        T[nv:, d:] = rates @ second
+        T[np.concatenate((picked, picked + nv))] = np.eye(2 * d)
+        kept = np.concatenate((picked, picked + nv))
+        return Reduction(kept, T, second.T @ second, space.rank)
+
+    def _coordinates(self, chart: Chart, nu: Array) -> tuple[Array, Array, Array]:
+        """Return the blocks of Z: of positions, of rates, and of rates by positions."""
+        state = self._state
+        nv = len(nu)
+        by_position, by_rate = np.eye(nv), np.eye(nv)
+        mixed = np.zeros((nv, nv))
+        if self._moving:
+            by_position[ANGULAR, ANGULAR] *= 0.5
+            return by_position, by_rate, mixed
+        by_position[ANGULAR, ANGULAR] = chart.N
+        by_position[LINEAR, LINEAR] = chart.R
+        for part in state.in_reference:
+            by_rate[part, part] = chart.R
+            mixed[part, ANGULAR] = -chart.R @ skew(nu[part])
+        return by_position, by_rate, mixed
+
+    def _turning(self, space: TangentSpace, q: Array, v: Array) -> Array:
+        """Return J^+ K_q: minus the change of nu on the manifold per displacement of q."""
+        derivatives = self.closure.constraints.derivatives(q, v, np.zeros_like(v))
+        by_q = self._state.columns(derivatives.twist_by_q)
+        solved: Array = np.linalg.pinv(space.rows) @ space.selected @ by_q
+        return solved
+
+    def _independent(self, size: Array, positions: Array, rates: Array) -> Array:
+        """Return the indices (d,) of the independent coordinates.
+
+        `positions` and `rates` (6 + n, d) are the motions of unit kinetic energy, and `size` is
+        the square root of the inertia of each coordinate.
+        """
+        count = positions.shape[1]
+        weighted = size[:, None] * rates
+        if self._picked is None and self.given is None:
+            order = 1.0 - _LESS * np.arange(len(size))
+            pivots = qr((order[:, None] * weighted).T, mode="r", pivoting=True)[1]
+            self._picked = np.sort(pivots[:count])
+        elif self._picked is None:
+            self._picked = self._named(count)
+        picked = self._picked
+        if len(picked) != count:
+            raise ConstraintError(
+                f"{count} coordinates are independent at this point, but {len(picked)} were chosen "
+                "at the first point; linearise the points separately"
+            )
+        least = 1.0
+        if count:
+            parts = (weighted[picked], size[picked, None] * positions[picked])
+            least = min(float(np.linalg.svd(x)[1][-1]) for x in parts)
+        if least < _INDEPENDENT:
+            names = listed(self._state.names[i] for i in picked)
+            raise ConstraintError(
+                f"the coordinates {names} do not determine the motion at this point; give other "
+                "coordinates with independent="
+            )
+        return picked
+
+    def _named(self, count: int) -> Array:
+        """Return the indices of the coordinates that the user named."""
+        state = self._state
+        names = state.names[: state.nx // 2]
+        picked: list[int] = []
+        for key in self.given or ():
+            picked += matching("coordinate", key, names)
+        if len(set(picked)) != count:
+            raise InputError(
+                f"independent names {len(set(picked))} coordinates, expected {count}: the "
+                f"constraints leave {count} of {len(names)} free"
+            )
+        return np.array(sorted(set(picked)), dtype=np.intp)
+
+
+def reduced_fields(
+    state: StateMap, reduction: Reduction, whole: LinearModel
+) -> dict[str, Any]:
+    """Return the fields of a model in the independent states from the model in all states."""
+    kept, T = reduction.kept, reduction.T
+    names = [state.names[i] for i in kept]
+    chosen = set(names)
+    arrays = {
+        "A": whole.A[kept] @ T,
+        "B": whole.B[kept],
+        "C": whole.C @ T,
+        "f0": whole.f0[kept],
+        "x0": whole.x0[kept],
+        "y0": whole.y0,
+        "placement": whole.placement,
+    }
+    if whole.drift is not None:
+        arrays["drift"] = whole.drift[kept]
+    return {
+        **{key: frozen(array) for key, array in arrays.items()},
+        "state_names": tuple(names),
+        "state_units": tuple(state.units[i] for i in kept),
+        "rank": reduction.rank,
+        "dependent": tuple(name for name in state.names if name not in chosen),
+    }
