@@ -21,11 +21,12 @@ coincide exactly.
 
 from collections import namedtuple
 
+from fflin.base.validation import Array
 from fflin.kernel import bodies
 from fflin.kernel import vectors as vec
 from fflin.kernel.bodies import BIAS, VELOCITY, at_parent, joint_axis, motion_cross
 from fflin.kernel.tree import INDICES, LANED, MOTION, PLACE, REALS, Struct
-from fflin.kernel.vectors import Entries, below, called, chosen, load, root, store
+from fflin.kernel.vectors import below, called, chosen, compiled_as, load, root, store
 
 # Corrections of the position, and of the velocity, at the end of each step. The factors of the
 # first correction serve for all, so a position error e of the step becomes an error of order e^3.
@@ -80,16 +81,39 @@ _OF_CONSTRAINTS = {
 CONSTRAINTS = Struct(Constraints, LANED, _OF_CONSTRAINTS)
 
 
-def orthonormalise(basis: Entries, triangle: Entries, least: Entries) -> None:
+def _product_by_loop(left, first, right, second, count):
+    """Compute `_product` in compiled code."""
+    total = load(left, first) * load(right, second)
+    for index in range(1, count):
+        total = total + load(left, first + index) * load(right, second + index)
+    return total
+
+
+@compiled_as(_product_by_loop)
+def _product(left, first, right, second, count):
+    """Return the scalar product of `count` entries of two arrays."""
+    return left[first : first + count].dot(right[second : second + count])
+
+
+def _add_by_loop(target, to, factor, source, first, count):
+    """Compute `_add` in compiled code."""
+    for index in range(count):
+        vec.add(target, to + index, factor * load(source, first + index))
+
+
+@compiled_as(_add_by_loop)
+def _add(target, to, factor, source, first, count):
+    """Add `count` entries of an array, times a factor, to entries of another array."""
+    target[to : to + count] += factor * source[first : first + count]
+
+
+def orthonormalise(basis: Array, triangle: Array, least: Array, rows: int) -> None:
     """Replace the columns of Z in `basis` by the columns of Q, and write R to `triangle`.
 
-    The columns are stored one after the other. The modified Gram-Schmidt method keeps the accuracy
-    of the solutions. `least` (1,) is reduced to the smallest squared orthogonal fraction.
+    The columns are stored one after the other; their number is `rows`. The modified Gram-Schmidt
+    method keeps the accuracy of the solutions. `least` (1,) is reduced to the smallest squared
+    orthogonal fraction.
     """
-    # The number of rows r follows from the r^2 entries of the triangle.
-    rows = 0
-    while rows * rows < len(triangle):
-        rows += 1
     size = len(basis) // rows
     for i in range(rows):
         at = i * size
@@ -97,8 +121,7 @@ def orthonormalise(basis: Entries, triangle: Entries, least: Entries) -> None:
         for j in range(i):
             part = _product(basis, j * size, basis, at, size)
             store(triangle, j * rows + i, part)
-            for index in range(size):
-                vec.add(basis, at + index, -(part * load(basis, j * size + index)))
+            _add(basis, at, -part, basis, j * size, size)
         square = _product(basis, at, basis, at, size)
         fraction = square / before
         store(least, 0, chosen(fraction, load(least, 0), fraction, load(least, 0)))
@@ -110,7 +133,7 @@ def orthonormalise(basis: Entries, triangle: Entries, least: Entries) -> None:
 
 
 def respond(
-    basis: Entries, triangle: Entries, error: Entries, change: Entries, forces: Entries
+    basis: Array, triangle: Array, error: Array, change: Array, forces: Array
 ) -> None:
     """Write the smallest y with Z^T y = -error to `change`, and its multipliers to `forces`.
 
@@ -125,21 +148,12 @@ def respond(
             total = total - load(triangle, j * rows + i) * load(forces, j)
         total = total / load(triangle, i * rows + i)
         store(forces, i, total)
-        for index in range(size):
-            vec.add(change, index, total * load(basis, i * size + index))
+        _add(change, 0, total, basis, i * size, size)
     for i in range(rows - 1, -1, -1):
         total = load(forces, i)
         for j in range(i + 1, rows):
             total = total - load(triangle, i * rows + j) * load(forces, j)
         store(forces, i, total / load(triangle, i * rows + i))
-
-
-def _product(left, first, right, second, count):
-    """Return the scalar product of `count` entries of two arrays."""
-    total = load(left, first) * load(right, second)
-    for index in range(1, count):
-        total = total + load(left, first + index) * load(right, second + index)
-    return total
 
 
 def _frame(work, tree, body, poses, index):
@@ -193,7 +207,8 @@ def locate(work, robot, constraints, q):
         vec.put3(location, to + SECOND_LEVER, vec.minus(lever, apart))
         # If the axes coincide, the rate of this vector is the relative angular velocity. The
         # entries x and y are zero if the z axes coincide, whatever the rotation about z is.
-        (x, y, z), (a, b, c) = axes, others
+        x, y, _ = axes
+        a, b, c = others
         angle = 0.5 * (vec.dot(y, a) - vec.dot(x, b))
         rotation = -vec.dot(y, c), vec.dot(x, c), angle
         vec.put3(location, to + ROTATION, rotation)
@@ -224,7 +239,7 @@ def _direction(constraints, row):
 
 
 def _unit_wrench(axis, lever, angular):
-    """Return the wrench about a joint of a unit moment, or of a unit force at the end of a lever."""
+    """Return the wrench about a joint of a unit moment, or of a unit force at a lever's end."""
     if angular:
         return axis, vec.minus(axis, axis)
     return vec.cross(lever, axis), axis
@@ -277,8 +292,14 @@ def factorise(work, tree, constraints):
     for row in range(len(constraints.error)):
         bodies.solve_inwards(work, tree, basis, row * size)
         for k in range(size):
-            store(basis, row * size + k, load(basis, row * size + k) * _scale(work, tree, k))
-    orthonormalise(basis, constraints.triangle, constraints.least)
+            store(
+                basis,
+                row * size + k,
+                load(basis, row * size + k) * _scale(work, tree, k),
+            )
+    orthonormalise(
+        basis, constraints.triangle, constraints.least, len(constraints.error)
+    )
 
 
 def _scale(work, tree, k):
@@ -294,9 +315,7 @@ def correct(work, tree, constraints, forces):
     receives its multipliers. `factorise` must be called before.
     """
     change = constraints.change
-    respond(
-        constraints.basis, constraints.triangle, constraints.error, change, forces
-    )
+    respond(constraints.basis, constraints.triangle, constraints.error, change, forces)
     # L^-1 D^(-1/2) y
     for k in range(len(tree.row)):
         row = tree.row[k]

@@ -349,17 +349,13 @@ def advance_one(words, clock, last, every, rows, work):
 def advance_constrained(words, clock, last, every, rows, work):
     """Advance eight runs; `words` are the words of `CONSTRAINED`, see `_advance`."""
     arguments = CONSTRAINED(words)
-    _advance(
-        arguments.usual, arguments.constraints, clock, last, every, rows, work
-    )
+    _advance(arguments.usual, arguments.constraints, clock, last, every, rows, work)
 
 
 def advance_one_constrained(words, clock, last, every, rows, work):
     """Advance one run; `words` are the words of `CONSTRAINED_OF_ONE`, see `_advance`."""
     arguments = CONSTRAINED_OF_ONE(words)
-    _advance(
-        arguments.usual, arguments.constraints, clock, last, every, rows, work
-    )
+    _advance(arguments.usual, arguments.constraints, clock, last, every, rows, work)
 
 
 def _advance(arguments, constraints, clock, last, every, rows, work):
@@ -389,6 +385,7 @@ def _advance(arguments, constraints, clock, last, every, rows, work):
     if clock[0] == 0:
         forward.start_at(work, robot, kept, point)
     for step in range(clock[0], last):
+        recorded = every > 0 and step % every == 0
         vec.copy(point.q, 0, method.first, 0, len(point.q))
         vec.copy(point.nu, 0, method.rates, 0, len(point.nu))
         for stage in range(len(method.origin)):
@@ -403,26 +400,14 @@ def _advance(arguments, constraints, clock, last, every, rows, work):
             forward.turn_held(robot, point)
             if stage == 0:
                 vec.copy(point.u, 0, method.u, 0, len(point.u))
-                if every > 0 and step % every == 0:
-                    for values in (point.q, point.nu, point.u):
-                        vec.copy(values, 0, rows, at, len(values))
-                        at += len(values)
-                    momentum, center = forward.kept_at(kept, step * h)
-                    vec.put6(rows, at, momentum)
-                    vec.put3(rows, at + 6, center)
-                    at += 9
+                if recorded:
+                    at = _record(kept, point, step * h, rows, at)
             forward.accelerate(
                 work, robot, point, t, method.rates, (1 + stage) * len(point.nu)
             )
             if constraints is not None:
-                forces = constraints.multipliers
-                if stage == 0:
-                    forces = constraints.forces
-                to = (1 + stage) * len(point.nu)
-                held.constrain(
-                    work, robot, constraints, point, method.rates, to, forces
-                )
-                if stage == 0 and every > 0 and step % every == 0:
+                forces = _constrain(work, robot, constraints, method, point, stage)
+                if recorded and stage == 0:
                     vec.copy(forces, 0, rows, at, len(forces))
                     at += len(forces)
             if arguments.pushed:
@@ -438,11 +423,37 @@ def _advance(arguments, constraints, clock, last, every, rows, work):
         if arguments.project:
             forward.impose(work, robot, kept, point, (step + 1) * h)
         clock[0] = step + 1
-        if not goes_on(arguments.stop, robot.origin, point.q, point.nu):
+        if not _continues(arguments, constraints):
             break
-        if constraints is not None:
-            if not held.independent(constraints):
-                break
+
+
+def _record(kept, point, t, rows, at):
+    """Write q, nu, u, momentum and centre of mass into `rows`; return the index after them."""
+    for values in (point.q, point.nu, point.u):
+        vec.copy(values, 0, rows, at, len(values))
+        at += len(values)
+    momentum, center = forward.kept_at(kept, t)
+    vec.put6(rows, at, momentum)
+    vec.put3(rows, at + 6, center)
+    return at + 9
+
+
+def _constrain(work, robot, constraints, method, point, stage):
+    """Correct the accelerations of a stage, and return the forces of the constraints."""
+    # The forces of the first stage are kept until the next step.
+    forces = constraints.forces if stage == 0 else constraints.multipliers
+    first = (1 + stage) * len(point.nu)
+    held.constrain(work, robot, constraints, point, method.rates, first, forces)
+    return forces
+
+
+def _continues(arguments, constraints):
+    """Return whether no run meets a stop condition at the end of a step."""
+    robot, point = arguments.robot, arguments.point
+    good = goes_on(arguments.stop, robot.origin, point.q, point.nu)
+    if constraints is not None:
+        good = good and held.independent(constraints)
+    return good
 
 
 class RunStatistics(

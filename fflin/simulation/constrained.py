@@ -15,21 +15,15 @@ import pinocchio as pin
 from scipy.linalg import qr
 from scipy.linalg.lapack import dpotrf, dtrtrs
 
-from fflin.base.errors import InputError, listed
+from fflin.base.errors import ConstraintError, listed
 from fflin.base.validation import Array, Indices
-from fflin.dynamics.constraints import Constraints, Pair
+from fflin.dynamics.closure import Closure
+from fflin.dynamics.constraints import Pair
 from fflin.dynamics.state import StateMap
 from fflin.kernel import constraints as kernel
 from fflin.kernel.tree import Tree
 from fflin.robot.constraints import Hinge
 from fflin.robot.joints import ROOT, Carried
-
-# The initial configuration is closed if its residual [m|rad] is at most _NEAR. Its velocity is
-# corrected if the rates of the rows are at most _NEAR [m/s|rad/s].
-_NEAR = 1e-6
-
-# Newton corrections of the initial configuration, and the residual at which they end.
-_CORRECTIONS, _CLOSED = 8, 1e-14
 
 # A row of J whose entries are below this value [m|1] is zero.
 _ZERO = 1e-9
@@ -60,7 +54,7 @@ class Constrained:
         Names and units of the forces and moments of all constraints.
     outside : bool
         Whether a frame of the world holds the robot, so that its momentum is not constant.
-    least : list of float
+    least : ndarray (1,)
         Squared orthogonal fraction of the rows, see `kernel.constraints`; the smallest so far.
     forces : ndarray (r,)
         Forces of the independent rows at the latest evaluation of the accelerations.
@@ -71,26 +65,22 @@ class Constrained:
         self._state = state
         self._model = robot.model
         self._data = robot.create_data()
-        self.constraints = Constraints(robot)
+        self._closure = Closure(state)
+        self.constraints = self._closure.constraints
         self.constraints.settle(q)
-        self.outside = any(item.to is None for item in self.constraints.items)
+        self.outside = robot.anchored
         self.kept = self._independent(q)
         self.names, self.units = zip(*self._components(), strict=True)
-        self.least = [1.0]
-        self.forces = np.zeros(len(self.kept))
+        self.least = np.ones(1)
+        self.forces: Array = np.zeros(len(self.kept))
 
     def start(self, q: Array, v: Array) -> tuple[Array, Array]:
-        """Return the initial q and v on the constraints; raise `InputError` if they are far off."""
-        residual = self.constraints.residual(q)
-        self._require_near("configuration", "m or rad", residual)
-        rates = self.constraints.jacobian(q) @ v
-        self._require_near("velocity", "m/s or rad/s", rates)
-        for _ in range(_CORRECTIONS):
-            if np.abs(residual).max() <= _CLOSED:
-                break
-            q = self._nearer(q)
-            residual = self.constraints.residual(q)
-        return q, self._slowed(q, v)
+        """Return the initial q and v on the constraints.
+
+        Raise `ConstraintError` if the given q (nq,) or v (nv,) is far from them.
+        """
+        q = self._closure.configuration(q)
+        return q, self._closure.velocity(q, v)
 
     def accelerate(self, q: Array, v: Array, rate: Array) -> tuple[Array, Array]:
         """Return dv/dt (nv,) for the accelerations `rate` (nv,) of the robot without constraints.
@@ -113,7 +103,7 @@ class Constrained:
 
     def independent(self) -> bool:
         """Return whether the rows were independent at all evaluations so far."""
-        return self.least[0] > kernel.LEAST_FRACTION
+        return bool(self.least[0] > kernel.LEAST_FRACTION)
 
     def wrenches(self, q: Array, forces: Array) -> Array:
         """Return the forces and moments (N, k) of all constraints from forces (N, r) of the rows.
@@ -158,7 +148,9 @@ class Constrained:
             if isinstance(pair.constraint, Hinge):
                 # The tilt of the axis has the components x and y in axes whose z is the axis.
                 x, y = pair.selected[3:, 3:]
-                pairs.append(_frames(tree, pair, np.column_stack((x, y, np.cross(x, y)))))
+                pairs.append(
+                    _frames(tree, pair, np.column_stack((x, y, np.cross(x, y))))
+                )
                 rows += [(first + 1, 0), (first + 1, 1)]
             elif len(pair.selected) == 6:
                 rows += [(first, 0), (first, 1), (first, 2)]
@@ -189,12 +181,12 @@ class Constrained:
         M = self._state.project(pin.crba(self._model, self._data, q))
         factor, _ = dpotrf(M, 1)
         # One column at a time, because OpenBLAS would wait for threads if there were several.
-        basis = np.concatenate([dtrtrs(factor, row, 1)[0] for row in J]).tolist()
+        basis = np.concatenate([dtrtrs(factor, row, 1)[0] for row in J])
         r, size = J.shape
-        triangle, change, forces = [0.0] * (r * r), [0.0] * size, [0.0] * r
-        kernel.orthonormalise(basis, triangle, self.least)
-        kernel.respond(basis, triangle, error.tolist(), change, forces)
-        return Correction(dtrtrs(factor, np.array(change), 1, 1)[0], np.array(forces))
+        triangle, change, forces = np.zeros(r * r), np.zeros(size), np.zeros(r)
+        kernel.orthonormalise(basis, triangle, self.least, r)
+        kernel.respond(basis, triangle, error, change, forces)
+        return Correction(dtrtrs(factor, change, 1, 1)[0], forces)
 
     def _nearer(self, q: Array) -> Array:
         """Return q after one Newton correction of the residual."""
@@ -213,7 +205,7 @@ class Constrained:
         return slowed
 
     def _independent(self, q: Array) -> Indices:
-        """Return the indices of independent rows at q; raise `InputError` if the rank is open."""
+        """Return the indices of independent rows at q; raise `ConstraintError` if the rank is open."""
         J = self._state.columns(self.constraints.jacobian(q))
         rows = np.flatnonzero(np.abs(J).max(axis=1) > _ZERO)
         M = self._state.project(pin.crba(self._model, self._data, q))
@@ -224,14 +216,14 @@ class Constrained:
         fractions = np.abs(R.diagonal())
         rank = int((fractions > _REDUNDANT).sum())
         if rank and fractions[rank - 1] < _INDEPENDENT:
-            raise InputError(
+            raise ConstraintError(
                 f"the constraints of '{self._state.robot.name}' are nearly singular at the initial "
                 f"configuration: a row differs from the others by {fractions[rank - 1]:.1e}, "
                 f"expected more than {_INDEPENDENT:g}, or less than {_REDUNDANT:g} for a redundant "
                 "row; start from another configuration"
             )
         if not rank:
-            raise InputError(
+            raise ConstraintError(
                 f"the constraints of '{self._state.robot.name}' restrict no motion at the initial "
                 "configuration; remove them"
             )
@@ -253,17 +245,6 @@ class Constrained:
             if len(pair.selected) > 3:
                 for axis in "xyz":
                     yield f"{pair.constraint.title}.tau.{axis}", "N m"
-
-    def _require_near(self, what: str, unit: str, errors: Array) -> None:
-        """Raise `InputError` if a row of the initial configuration or velocity is far from 0."""
-        for pair in self.constraints.pairs:
-            error = float(np.abs(errors[pair.rows]).max())
-            if not error <= _NEAR:
-                raise InputError(
-                    f"the initial {what} violates constraint '{pair.constraint.title}' by "
-                    f"{error:.3g} {unit}, expected at most {_NEAR:g}; fflin.closed returns the "
-                    "nearest configuration that satisfies it"
-                )
 
 
 class Frames(NamedTuple):

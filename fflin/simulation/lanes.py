@@ -41,6 +41,7 @@ from fflin.simulation.run import (
     Recording,
     ending_of,
     go,
+    singular_at,
     stop_conditions,
     stop_of,
 )
@@ -251,9 +252,7 @@ class LaneLoop:
             self.parts, self._words, self._fresh = laid_out(parts, arguments)
         else:
             both = loop.ConstrainedArguments(parts, constraints_of(plan))
-            constrained = (
-                loop.CONSTRAINED_OF_ONE if lanes == 1 else loop.CONSTRAINED
-            )
+            constrained = loop.CONSTRAINED_OF_ONE if lanes == 1 else loop.CONSTRAINED
             both, self._words, self._fresh = laid_out(both, constrained)
             self.parts, self.constraints = both
         self._work = self._space(self.parts.robot.tree.offsets.size)
@@ -335,12 +334,10 @@ class LaneLoop:
                 bar(done, steps)
                 v = self._state.spread(point.nu.T)
                 for lane in going.nonzero()[0]:
-                    messages[lane] = self._ending(
-                        done * times.dt,
-                        point.q[:, lane],
-                        v[lane],
-                        independent=self._is_independent(lane),
-                    )
+                    t = done * times.dt
+                    messages[lane] = self._ending(t, point.q[:, lane], v[lane])
+                    if not messages[lane] and not self._is_independent(int(lane)):
+                        messages[lane] = singular_at(t)
                 stop = np.array([float(stop_of(message)) for message in messages])
                 if done % statistics.span == 0:
                     over = statistics.over(point.q.T, v)[:count] & (stop == 0.0)

@@ -30,8 +30,6 @@ from fflin.robot.joints import ROOT
 from fflin.simulation.plan import Plan
 from fflin.simulation.plant import LARGEST_TURN
 
-# Start of the message if the rows of the constraints become dependent.
-SINGULAR = "singular constraints"
 STOPS = ("", "diverged", "left the chart", "stopped")
 
 _LOOK = 16  # steps between checks of the clock
@@ -386,10 +384,10 @@ def ending_of(plan: Plan, stop: StopConditions) -> Callable[[float, Array, Array
 
     constrained = plan.plant.constrained
 
-    def ending(t: float, q: Array, v: Array, *, independent: bool = True) -> str:
+    def ending(t: float, q: Array, v: Array) -> str:
         place, rates = q.tolist(), v.tolist()
-        if not (independent and (constrained is None or constrained.independent())):
-            return f"{SINGULAR} at t = {t:g} s: a row of the constraints depends on the others"
+        if constrained is not None and not constrained.independent():
+            return singular_at(t)
         if goes_on(stop, origin, place, rates):
             for event in plan.events:
                 value = event(t, q.copy(), v.copy())
@@ -416,6 +414,14 @@ def ending_of(plan: Plan, stop: StopConditions) -> Callable[[float, Array, Array
         return f"diverged at t = {t:g} s in steps of {dt:g} s{shown}; {advice}"
 
     return ending
+
+
+def singular_at(t: float) -> str:
+    """Return the message for constraints that become singular at time t [s]."""
+    return (
+        f"stopped at t = {t:g} s: the constraints are singular, because one of them follows from "
+        "the others at this configuration; their forces are not determinate there"
+    )
 
 
 def stop_of(message: str) -> int:
