@@ -308,14 +308,20 @@ def _scale(work, tree, k):
 
 
 @called
-def correct(work, tree, constraints, forces):
+def correct(work, tree, constraints):
     """Write the smallest change that sets `constraints.error` to zero, in the metric of M.
 
-    The change is for accelerations, for velocities, or for a small displacement. `forces` (r,)
-    receives its multipliers. `factorise` must be called before.
+    The change is for accelerations, for velocities, or for a small displacement. `factorise` must
+    be called before.
     """
     change = constraints.change
-    respond(constraints.basis, constraints.triangle, constraints.error, change, forces)
+    respond(
+        constraints.basis,
+        constraints.triangle,
+        constraints.error,
+        change,
+        constraints.multipliers,
+    )
     # L^-1 D^(-1/2) y
     for k in range(len(tree.row)):
         row = tree.row[k]
@@ -374,10 +380,10 @@ def write_accelerations(work, robot, constraints, point):
 
 
 @called
-def constrain(work, robot, constraints, point, rates, to, forces):
+def constrain(work, robot, constraints, point, rates, to):
     """Correct the accelerations that `forward.accelerate` has written into `rates`.
 
-    `forces` (r,) receives the forces of the constraints. Forces from the world are added to
+    The multipliers are the forces of the constraints. Forces from the world are added to
     `point.wrench`.
     """
     tree = robot.tree
@@ -386,11 +392,11 @@ def constrain(work, robot, constraints, point, rates, to, forces):
     write_jacobian(work, robot, constraints)
     write_accelerations(work, robot, constraints, point)
     factorise(work, tree, constraints)
-    correct(work, tree, constraints, forces)
+    correct(work, tree, constraints)
     for index in range(size):
         vec.add(rates, to + index, load(constraints.change, index))
     for row in range(len(constraints.error)):
-        force = load(forces, row)
+        force = load(constraints.multipliers, row)
         for index in range(6):
             value = load(constraints.jacobian, row * size + index)
             vec.add(point.wrench, index, force * value)
@@ -415,7 +421,7 @@ def close(work, robot, constraints, point):
     factorise(work, tree, constraints)
     for _ in range(_CORRECTIONS):
         write_positions(constraints)
-        correct(work, tree, constraints, constraints.multipliers)
+        correct(work, tree, constraints)
         vec.displace(tree, point.q, constraints.change, constraints.at)
         vec.copy(constraints.at, 0, point.q, 0, len(point.q))
         bodies.outwards(work, tree, point.q)
@@ -423,7 +429,7 @@ def close(work, robot, constraints, point):
     write_jacobian(work, robot, constraints)
     for _ in range(_CORRECTIONS):
         write_velocities(constraints, point.nu)
-        correct(work, tree, constraints, constraints.multipliers)
+        correct(work, tree, constraints)
         for index in range(size):
             vec.add(point.nu, index, load(constraints.change, index))
     bodies.inwards(work, tree)

@@ -391,25 +391,20 @@ def _advance(arguments, constraints, clock, last, every, rows, work):
         for stage in range(len(method.origin)):
             t = step * h + method.nodes[stage]
             if law.kind != NOTHING and (channel.sample == 0 or stage == 0):
-                if is_asked(channel, step):
-                    _ask(work, robot, law, channel, point, t, step, stage)
-                transmit(channel, step, point.nu, point.u)
+                _command(work, arguments, t, step, stage)
             forward.apply_faults(
                 robot.faults, robot.triads, step * h, h, point.u, point.pushing
             )
             forward.turn_held(robot, point)
-            if stage == 0:
-                vec.copy(point.u, 0, method.u, 0, len(point.u))
-                if recorded:
-                    at = _record(kept, point, step * h, rows, at)
             forward.accelerate(
                 work, robot, point, t, method.rates, (1 + stage) * len(point.nu)
             )
             if constraints is not None:
-                forces = _constrain(work, robot, constraints, method, point, stage)
-                if recorded and stage == 0:
-                    vec.copy(forces, 0, rows, at, len(forces))
-                    at += len(forces)
+                _constrain(work, robot, constraints, method, point, stage)
+            if stage == 0:
+                vec.copy(point.u, 0, method.u, 0, len(point.u))
+                if recorded:
+                    at = _record(kept, point, constraints, step * h, rows, at)
             if arguments.pushed:
                 weight, moment = method.weights[stage], method.moments[stage]
                 forward.add_wrench(work, robot, kept, point, weight, moment)
@@ -427,24 +422,36 @@ def _advance(arguments, constraints, clock, last, every, rows, work):
             break
 
 
-def _record(kept, point, t, rows, at):
-    """Write q, nu, u, momentum and centre of mass into `rows`; return the index after them."""
+def _record(kept, point, constraints, t, rows, at):
+    """Write a row into `rows`, and return the index after it."""
     for values in (point.q, point.nu, point.u):
         vec.copy(values, 0, rows, at, len(values))
         at += len(values)
     momentum, center = forward.kept_at(kept, t)
     vec.put6(rows, at, momentum)
     vec.put3(rows, at + 6, center)
-    return at + 9
+    at += 9
+    if constraints is not None:
+        vec.copy(constraints.forces, 0, rows, at, len(constraints.forces))
+        at += len(constraints.forces)
+    return at
+
+
+def _command(work, arguments, t, step, stage):
+    """Write the inputs that the actuator channel lets through at a stage to `point.u`."""
+    channel, point = arguments.channel, arguments.point
+    if is_asked(channel, step):
+        _ask(work, arguments.robot, arguments.law, channel, point, t, step, stage)
+    transmit(channel, step, point.nu, point.u)
 
 
 def _constrain(work, robot, constraints, method, point, stage):
-    """Correct the accelerations of a stage, and return the forces of the constraints."""
-    # The forces of the first stage are kept until the next step.
-    forces = constraints.forces if stage == 0 else constraints.multipliers
+    """Correct the accelerations of a stage; keep the forces of the first stage."""
     first = (1 + stage) * len(point.nu)
-    held.constrain(work, robot, constraints, point, method.rates, first, forces)
-    return forces
+    held.constrain(work, robot, constraints, point, method.rates, first)
+    if stage == 0:
+        forces = constraints.multipliers
+        vec.copy(forces, 0, constraints.forces, 0, len(forces))
 
 
 def _continues(arguments, constraints):

@@ -205,7 +205,7 @@ class Constrained:
         return slowed
 
     def _independent(self, q: Array) -> Indices:
-        """Return the indices of independent rows at q; raise `ConstraintError` if the rank is open."""
+        """Return the indices of independent rows at q; raise an error if the rank is open."""
         J = self._state.columns(self.constraints.jacobian(q))
         rows = np.flatnonzero(np.abs(J).max(axis=1) > _ZERO)
         M = self._state.project(pin.crba(self._model, self._data, q))

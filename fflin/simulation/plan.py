@@ -54,7 +54,6 @@ from fflin.dynamics.state import StateMap, selection
 from fflin.linear.model import Delay, LinearModel
 from fflin.robot.fields import chosen_limits, input_keys_of
 from fflin.robot.robot import Robot
-from fflin.simulation.constrained import Constrained
 from fflin.simulation.pace import Pace, Signal, limits_of_step
 from fflin.simulation.plant import LARGEST_TURN, Disturbance, Plant
 
@@ -156,9 +155,7 @@ class Plan:
         self.q, self.v = points.point_of(
             state, options.x0, options.q0, options.v0, default
         )
-        if robot.constraints:
-            plant.constrained = Constrained(state, self.q)
-            self.q, self.v = plant.constrained.start(self.q, self.v)
+        self.q, self.v = plant.constrain(self.q, self.v)
         points.require_slow("the initial velocity", self.v)
         if plant.field:
             plant.field.require_near(self.q)
@@ -212,10 +209,10 @@ class Plan:
             self.near = state.read(*self.reference(0.0)[:2])
         # Whether each step ends with a correction that sets momentum and centre of mass to their
         # predicted values. In orbit, momentum is not conserved, so there is no correction.
-        self.project = truth("project", options.project) and robot.orbit is None
-        # A frame that is held in the world determines where the base is.
-        if plant.constrained is not None and plant.constrained.outside:
-            self.project = False
+        # If a frame is held in the world, the constraint determines where the base is.
+        self.project = truth("project", options.project) and not (
+            robot.orbit or robot.anchored
+        )
         # Indices in v of the wheels with a speed limit.
         self.wheels = [robot.joints[row - 6].idx_v for row in self.limits.wheels.row]
         # States that the policy feeds back, if known.

@@ -58,7 +58,7 @@ class Plant(Aba):
         robot.require_inertia()
         super().__init__(state)
         self.disturbance = disturbance
-        # Constraints of the robot from an initial configuration on, or None; written by the plan.
+        # Constraints of the robot, or None; written by `constrain`.
         self.constrained: Constrained | None = None
         # Disturbances of the robot itself.
         self.on_base = BaseDisturbance(robot, state.field)
@@ -139,6 +139,16 @@ class Plant(Aba):
                 power = power + v.dot(disturbed)
             push = np.append(power, np.zeros(5))
         return rate, push
+
+    def constrain(self, q: Array, v: Array) -> tuple[Array, Array]:
+        """Return an initial q (nq,) and v (nv,) on the constraints of the robot, if it has some.
+
+        From then on, `constrained` is set. Raise `ConstraintError` if q or v is far from them.
+        """
+        if not self.robot.constraints:
+            return q, v
+        self.constrained = Constrained(self.state, q)
+        return self.constrained.start(q, v)
 
     def constrained_stage(
         self, t: float, q: Array, v: Array, u: Array

@@ -508,8 +508,7 @@ def motion_report(motion: Motion) -> str:
         parts.append(_largest_modes(motion))
     if kinds or motion.u.any():
         parts.append(_largest_inputs(motion))
-    if motion.constraint_names:
-        parts.append(_largest_forces(motion))
+    parts += _largest_forces(motion)
     limit_messages = [
         *(f"limit exceeded: {violation}" for violation in motion.passed),
         *map(str, motion.saturated),
@@ -545,8 +544,10 @@ def motion_report(motion: Motion) -> str:
     return "\n".join(parts)
 
 
-def _largest_forces(motion: Motion) -> str:
-    """Return a table of the largest force and moment of each constraint."""
+def _largest_forces(motion: Motion) -> list[str]:
+    """Return a table of the largest force and moment of each constraint, if there are some."""
+    if not motion.constraint_names:
+        return []
     rows = [["constraint", "largest force [N]", "largest moment [N m]"]]
     columns = dict(
         zip(motion.constraint_names, motion.constraint_forces.T, strict=True)
@@ -561,7 +562,7 @@ def _largest_forces(motion: Motion) -> str:
             size = np.linalg.norm(known, axis=0).max() if known else None
             row.append("" if size is None else f"{size:.4g}")
         rows.append(row)
-    return f"{grid(rows, 'l')}\n"
+    return [f"{grid(rows, 'l')}\n"]
 
 
 def _heading(motion: Motion, kinds: list[ErrorSize]) -> list[str]:

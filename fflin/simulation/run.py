@@ -28,7 +28,7 @@ from fflin.dynamics.points import LARGEST_SPEED
 from fflin.kernel.loop import StopConditions, goes_on
 from fflin.robot.joints import ROOT
 from fflin.simulation.plan import Plan
-from fflin.simulation.plant import LARGEST_TURN
+from fflin.simulation.plant import LARGEST_TURN, Plant
 
 STOPS = ("", "diverged", "left the chart", "stopped")
 
@@ -255,10 +255,10 @@ class _Rows:
         self._constrained = plan.plant.constrained
         self._forces = list[Array]()
 
-    def add_forces(self) -> None:
-        """Record the present forces of the constraints in the latest row."""
-        if self._constrained is not None and len(self._forces) < len(self.times):
-            self._forces.append(self._constrained.forces)
+    def add_forces(self, forces: Array) -> None:
+        """Record the forces of the constraints in the latest row, unless it already has some."""
+        if len(self._forces) < len(self.times):
+            self._forces.append(forces)
 
     def add(self, t: float, q: Array, v: Array, u: Array) -> None:
         """Record a row, and call the callback of the run."""
@@ -292,6 +292,32 @@ class _Rows:
         )
 
 
+def _stage_of(plant: Plant, rows: _Rows) -> Callable[..., tuple[Array, Array]]:
+    """Return the function of (t, q, v, u) for the accelerations and the external wrench."""
+    constrained = plant.constrained
+    if constrained is None:
+        return plant.stage
+
+    def stage(t: float, q: Array, v: Array, u: Array) -> tuple[Array, Array]:
+        result = plant.constrained_stage(t, q, v, u)
+        rows.add_forces(constrained.forces)
+        return result
+
+    return stage
+
+
+def _corrected(
+    plan: Plan, kept: Conserved, t: float, q: Array, v: Array
+) -> tuple[Array, Array]:
+    """Return q and v at the end of a step, on the constraints and with the predicted momentum."""
+    constrained = plan.plant.constrained
+    if constrained is not None:
+        q, v = constrained.close(q, v)
+    if plan.project:
+        kept.impose(t, q, v)
+    return q, v
+
+
 # A diverging motion may overflow before it is stopped, so NumPy's warnings are suppressed.
 @np.errstate(over="ignore", invalid="ignore")
 def go(plan: Plan, hint: str = "") -> Recording:
@@ -301,13 +327,11 @@ def go(plan: Plan, hint: str = "") -> Recording:
     kept = Conserved(plan)
     applied = None if law is None else plan.applied_by(law)
     ask = partial(applied, 0) if applied and not times.sample else None
-    take, stage = plan.method(plant.robot.model, dt).step, plant.stage
-    constrained = plant.constrained
-    if constrained is not None:
-        stage = plant.constrained_stage
+    take = plan.method(plant.robot.model, dt).step
     follow = _follower(plan)
     pushed = not plant.isolated(driven=law is not None)
     rows = _Rows(plan, kept)
+    stage = _stage_of(plant, rows)
     t, stages = 0.0, 0
 
     def acceleration(t: float, q: Array, v: Array) -> Array:
@@ -320,8 +344,6 @@ def go(plan: Plan, hint: str = "") -> Recording:
         a, push = stage(t, q, v, inputs)
         if pushed:
             kept.wrenches[stages][:] = kept.wrench(q, push)
-        if constrained is not None and not stages:
-            rows.add_forces()
         stages += 1
         if follow:
             follow(stages)
@@ -341,10 +363,7 @@ def go(plan: Plan, hint: str = "") -> Recording:
             if pushed:
                 kept.advance()
             t = (step + 1) * dt
-            if constrained is not None:
-                q, v = constrained.close(q, v)
-            if plan.project:
-                kept.impose(t, q, v)
+            q, v = _corrected(plan, kept, t, q, v)
             if stopped := ending(t, q, v):
                 break
             if step % _LOOK == 0:
