@@ -25,7 +25,8 @@ _PUBLIC = {
     },
     "Outputs": {
         "robot.outputs": "FullState JointPositions JointVelocities BasePose FramePose "
-        "FrameVelocity RelativePose Gyroscope Accelerometer CenterOfMass Momentum",
+        "FrameVelocity RelativePose Gyroscope Accelerometer CenterOfMass Momentum "
+        "ConstraintForce",
     },
     "Linear models": {
         "linear.linearization": "linearize Linearizer",

@@ -42,6 +42,7 @@ from fflin.robot.outputs import Gyroscope as Gyroscope
 from fflin.robot.outputs import Accelerometer as Accelerometer
 from fflin.robot.outputs import CenterOfMass as CenterOfMass
 from fflin.robot.outputs import Momentum as Momentum
+from fflin.robot.outputs import ConstraintForce as ConstraintForce
 
 # Linear models
 from fflin.linear.linearization import linearize as linearize

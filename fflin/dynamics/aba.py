@@ -5,6 +5,7 @@ import pinocchio as pin
 
 from fflin.base.rotation import skew
 from fflin.base.validation import Array
+from fflin.dynamics.classical import ClassicalConstraints
 from fflin.dynamics.coordinates import PIN_ANGULAR
 from fflin.dynamics.state import Actuation, StateMap
 
@@ -37,6 +38,9 @@ class Aba:
         self.field = state.field
         self._resists = bool(np.any(robot.springs))
         self._none = pin.StdVec_Force(robot.model.njoints, pin.Force.Zero())
+        self._constraints: ClassicalConstraints | None = None
+        if robot.constraints:
+            self._constraints = ClassicalConstraints(state)
 
     def acceleration(
         self, q: Array, v: Array, u: Array, tau: Array | None = None
@@ -60,10 +64,24 @@ class Aba:
             return self.field.relative(v, absolute, rate)
         return rate
 
+    def constraint_forces(self, q: Array, v: Array, u: Array) -> dict[str, Array]:
+        """Return {constraint: wrench (6,)} at a point, see `ClassicalConstraints.forces`."""
+        assert self._constraints is not None
+        forces = self.actuation.fixed @ u + self._passive_force(q, v)
+        absolute = self.field.absolute(q, v) if self.field else v
+        wrenches = self._wrenches(q, absolute, u)
+        free = self._free_acceleration(self._model, q, absolute, forces, wrenches)
+        return self._constraints.forces(q, absolute, free)
+
     def accelerations(self, q: Array, v: Array, u: Array) -> Array:
         """Return dv/dt (N, nv) at N points, computed as in `acceleration`."""
         state = self.state
-        if self.field or state.robot.followers or state.robot.stored_momentum:
+        if (
+            self.field
+            or state.robot.followers
+            or state.robot.stored_momentum
+            or self._constraints
+        ):
             return np.array(
                 [self.acceleration(*point) for point in zip(q, v, u, strict=True)]
             )
@@ -117,9 +135,12 @@ class Aba:
                 q, v, external, tau, state.S
             )
         else:
-            slopes = pin.computeABADerivatives(
-                self._model, self._data, q, v, tau, external
-            )
+            if self._constraints is None:
+                slopes = pin.computeABADerivatives(
+                    self._model, self._data, q, v, tau, external
+                )
+            else:
+                slopes = self._held_derivatives(q, v, tau, external)
             by_q, by_v, by_force = state.velocities(np.array(slopes).mT).mT
             by_q, by_v = state.columns(by_q), state.columns(by_v)
             by_force = state.velocities(by_force)
@@ -175,7 +196,38 @@ class Aba:
         force[..., 6:] -= damping * self.state.velocities(v)[..., 6:]
         return force
 
+    def _held_derivatives(
+        self, q: Array, v: Array, tau: Array, external: pin.StdVec_Force
+    ) -> tuple[Array, Array, Array]:
+        """Return the derivatives of dv/dt with constraints, with respect to q, v and tau.
+
+        Pinocchio's constrained dynamics have no wrenches on links. So the wrenches become
+        generalised forces, whose derivatives with respect to q are added.
+        """
+        assert self._constraints is not None
+        at_rest = np.zeros_like(v)
+        point = (self._weightless, self._data, q, at_rest, at_rest, external)
+        force = -pin.rnea(*point)
+        force_by_q = -pin.computeRNEADerivatives(*point)[0]
+        by_q, by_v, by_force = self._constraints.derivatives(
+            self._model, q, v, tau + force
+        )
+        return by_q + by_force @ force_by_q, by_v, by_force
+
     def _accelerate(
+        self,
+        model: pin.Model,
+        q: Array,
+        v: Array,
+        forces: Array,
+        external: pin.StdVec_Force,
+    ) -> Array:
+        rate = self._free_acceleration(model, q, v, forces, external)
+        if self._constraints is None:
+            return rate
+        return self._constraints.constrained(q, v, rate)
+
+    def _free_acceleration(
         self,
         model: pin.Model,
         q: Array,

@@ -6,15 +6,20 @@ The free accelerations and their derivatives, with lam = 0, come from `fflin.dyn
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
 
+from fflin.base.errors import ConstraintError, listed
 from fflin.base.rotation import skew
 from fflin.base.validation import Array
 from fflin.dynamics.closure import Closure, TangentSpace
 from fflin.dynamics.coordinates import ANGULAR, LINEAR
+
+# A component of lam is determinate if its part along redundant rows is less than this fraction.
+_DETERMINATE = 1e-7
 
 
 @dataclass
@@ -42,6 +47,22 @@ class Contact:
     wrenches: pin.StdVec_Force
     forces_by_x: Array
     forces_by_u: Array
+
+    def require_determinate(self, names: Sequence[str], components: Array) -> None:
+        """Raise an error if components of lam depend on internal stresses of redundant rows.
+
+        `components` (k, rows) selects the components from lam.
+        """
+        scaled = components * self.space.row_scale
+        free = components @ self.space.redundant.T
+        size = np.linalg.norm(scaled, axis=1)
+        lost = np.linalg.norm(free, axis=1) > _DETERMINATE * size
+        if lost.any():
+            shown = listed(name for name, flag in zip(names, lost, strict=True) if flag)
+            raise ConstraintError(
+                f"{shown} is not determinate, because the constraints are redundant, so that it "
+                "depends on internal stresses; leave it out with ConstraintForce(..., components=)"
+            )
 
 
 class ContactSolver:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -15,6 +15,7 @@ from fflin.base.validation import Array
 from fflin.dynamics.coordinates import PIN_ANGULAR, PIN_LINEAR
 from fflin.dynamics.state import StateMap
 from fflin.robot.joints import ROOT, Carried, by_joint, find_frame
+from fflin.robot.robot import Robot
 from fflin.robot.outputs import BasePose, FullState, JointOutput, JointPositions, Output
 
 _LOCAL = pin.ReferenceFrame.LOCAL
@@ -213,6 +214,17 @@ def _accelerometer_derivatives(at: Point, to: Sensed, frame: Carried) -> None:
     to.by_v[:, PIN_ANGULAR] -= of_base.dot(skew(at.v_b))
 
 
+def _force_derivatives(at: Point, to: Sensed) -> None:
+    """Leave zeros, because `state_equations.output_equations` computes constraint forces."""
+
+
+def _force(world: Measuring, _: object) -> Array:
+    raise InputError(
+        "the force of a constraint is an output of linear models only; remove ConstraintForce from "
+        "the outputs"
+    )
+
+
 def _accelerometer(world: Measuring, _: object, frame: Carried) -> Array:
     velocity = world.velocity(frame)
     rate = frame.placement.actInv(world.data.a[frame.joint]).linear
@@ -229,6 +241,7 @@ KINDS: dict[type[kinds.Output], tuple[Derivatives, Value]] = {
     kinds.RelativePose: (_pose_derivatives, _pose),
     kinds.Gyroscope: (_gyroscope_derivatives, _gyroscope),
     kinds.Accelerometer: (_accelerometer_derivatives, _accelerometer),
+    kinds.ConstraintForce: (_force_derivatives, _force),
 }
 
 
@@ -257,6 +270,8 @@ class Sensing:
         # joint elsewhere.
         self._home = pin.SE3ToXYZQUAT(robot.model.jointPlacements[ROOT].inverse())
 
+        # (rows of y, matrix that maps all constraint forces to them) for each ConstraintForce.
+        self.forces: list[tuple[slice, Array]] = []
         # (index in y, index in the state) for each output that is a state.
         self.states: list[tuple[int, int]] = []
         self._kinds: list[tuple[slice, Derivatives, list[Carried]]] = []
@@ -266,6 +281,9 @@ class Sensing:
             if type(output) in KINDS:
                 frames = [find_frame(robot.model, name) for name in output.frames]
                 signals += output.signals
+                if isinstance(output, kinds.ConstraintForce):
+                    rows = slice(at, len(signals))
+                    self.forces.append((rows, _components(robot, output)))
                 self._kinds.append(
                     (slice(at, len(signals)), KINDS[type(output)][0], frames)
                 )
@@ -371,15 +389,25 @@ class Measuring:
             zip(robot.outputs, frames, attitudes, states, strict=True)
         )
 
-    def __call__(self, x: Array, q: Array, v: Array, a: Array) -> Array:
+    def __call__(
+        self,
+        x: Array,
+        q: Array,
+        v: Array,
+        a: Array,
+        forces: Mapping[str, Array] | None = None,
+    ) -> Array:
         """Return y (ny,) at a point, which is given as the state x and also as q and v.
 
-        `a` (nv,) is dv/dt as Pinocchio's ABA returns it.
+        `a` (nv,) is dv/dt as Pinocchio's ABA returns it. `forces` is {constraint: wrench (6,)}.
         """
         pin.forwardKinematics(self.model, self.data, q, v, a)
         values = list[Array]()
         for output, frames, attitudes, states in self._outputs:
-            if type(output) in KINDS:
+            if isinstance(output, kinds.ConstraintForce) and forces is not None:
+                wrench = dict(zip(kinds.FORCES, forces[output.name], strict=True))
+                values.append(np.array([wrench[name] for name in output.chosen]))
+            elif type(output) in KINDS:
                 measure = KINDS[type(output)][1]
                 values.append(measure(self, attitudes, *frames))
             else:
@@ -393,6 +421,18 @@ class Measuring:
     def velocity(self, frame: Carried) -> pin.Motion:
         """Return the twist of a frame, in the axes of this frame."""
         return frame.placement.actInv(self.data.v[frame.joint])
+
+
+def _components(robot: Robot, output: kinds.ConstraintForce) -> Array:
+    """Return the matrix (k, rows) from the forces of all constraints to the components."""
+    blocks = []
+    for item in robot.constraints:
+        selected = item.rows.T
+        if item.title != output.name:
+            selected = np.zeros_like(selected)
+        blocks.append(selected)
+    wrench = np.hstack(blocks)
+    return wrench[[list(kinds.FORCES).index(name) for name in output.chosen]]
 
 
 def state_indices(state: StateMap, output: Output) -> list[int]:

@@ -45,9 +45,13 @@ def _dynamics(
     # Pinocchio differentiates about the world's origin, and loses accuracy if the base is distant.
     # So place the base at the world's origin. This is allowed, because A and B do not depend on the
     # position of the base, even in orbit.
+    # A robot that is anchored in inertial space stays where it is.
+    anchored = state.robot.anchored
+    relative = not (state.field or anchored)
     q, slow = q.copy(), v.copy()
-    q[:3] = 0.0
-    if not state.field:
+    if not anchored:
+        q[:3] = 0.0
+    if relative:
         # Without an orbit, the dynamics do not depend on the linear velocity of the base, except
         # for the rotation of the base axes, which adds -omega x v to the rate of this velocity.
         slow[PIN_LINEAR] = 0.0
@@ -61,7 +65,7 @@ def _dynamics(
         others = np.r_[ANGULAR, 6 : len(inertia)]
         by_q[:, others] -= change @ by_q[:, others]
         by_v[:, others] -= change @ by_v[:, others]
-    if not state.field:
+    if relative:
         linear, angular = v[PIN_LINEAR], v[PIN_ANGULAR]
         rates[LINEAR] -= np.cross(angular, linear)
         by_v[:, LINEAR] = 0.0
@@ -123,7 +127,9 @@ class Route:
         # _NUDGE, and with M^-1 of CRBA in place of ABA's M^-1.
         dynamics = _dynamics(self.aba, self.q, self.v, self._u)
         inertia = _in_base(state, self.q, self.M)
-        others = [_dynamics(self.aba, self.q, self.v, self._u, inertia)]
+        others = []
+        if not robot.constraints:
+            others.append(_dynamics(self.aba, self.q, self.v, self._u, inertia))
         rng = np.random.default_rng(0)
         others += [_dynamics(self.aba, *self._nudged(rng)) for _ in range(_SAMPLES)]
         self.at = self._own.jacobians(self.q, self.nu, self._u, dynamics.rates)

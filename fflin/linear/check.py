@@ -20,6 +20,7 @@ from fflin.linear.aba_route import (
     inverse_inertia,
     scaled_condition,
 )
+from fflin.linear.constrained_check import ConstrainedReferences
 from fflin.linear.fit import require_fit
 from fflin.linear.model import Certificate, LinearModel, refuse_sampled
 from fflin.linear.nonlinear import Nonlinear, jacobians
@@ -228,8 +229,23 @@ def check_all(
 def _comparisons(robot: Robot, lin: LinearModel) -> Iterator[Row]:
     """Yield the row of each comparison of a model with independent computations."""
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
+    if robot.constraints:
+        require_fit(lin, robot, state, sensed=True)
+        _require_independent(robot, lin)
+        yield from ConstrainedReferences(robot, lin).rows(lin)
+        return
     require_fit(lin, robot, state, whole=True, sensed=True)
     yield from References(robot, lin).rows(lin)
+
+
+def _require_independent(robot: Robot, lin: LinearModel) -> None:
+    """Raise `InputError` if a model does not have as many states as the robot's motions."""
+    expected = StateMap(robot).nx - 2 * lin.rank
+    if lin.rank == 0 or len(lin.state_names) != expected:
+        raise InputError(
+            f"the model has {len(lin.state_names)} states and the rank {lin.rank} of constraints, "
+            f"but '{robot.name}' has constraints; make the model with fflin.linearize"
+        )
 
 
 class References:
@@ -401,6 +417,8 @@ def certify(robot: Robot, lin: LinearModel) -> Certificate:
 
     The certificate contains the largest errors of A and of B, compared with ABA derivatives.
     """
+    if robot.constraints:
+        return ConstrainedReferences(robot, lin).certificate(lin)
     route = Route(robot, lin)
     return Certificate(
         condition=scaled_condition(lin.M),

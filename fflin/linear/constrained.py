@@ -45,14 +45,11 @@ class Reduction:
         Map T_c from deviations of the independent states to deviations of all states.
     M : ndarray (d, d)
         Inertia of the independent coordinates.
-    rank : int
-        Rank r of the constraints.
     """
 
     kept: Array
     T: Array
     M: Array
-    rank: int
 
 
 class Reducer:
@@ -75,9 +72,7 @@ class Reducer:
     ) -> Reduction:
         """Return the reduction at a point; `nu` is v in state order."""
         state = self._state
-        M = state.project(
-            pin.crba(state.robot.model, state.robot.create_data(), q).T
-        )
+        M = state.project(pin.crba(state.robot.model, state.robot.create_data(), q).T)
         G = space.basis
         G = G @ np.linalg.inv(np.linalg.cholesky(G.T @ M @ G)).T
         by_position, by_rate, mixed = self._coordinates(chart, nu)
@@ -98,7 +93,7 @@ class Reducer:
         T[nv:, d:] = rates @ second
         T[np.concatenate((picked, picked + nv))] = np.eye(2 * d)
         kept = np.concatenate((picked, picked + nv))
-        return Reduction(kept, T, second.T @ second, space.rank)
+        return Reduction(kept, T, second.T @ second)
 
     def _coordinates(self, chart: Chart, nu: Array) -> tuple[Array, Array, Array]:
         """Return the blocks of Z: of positions, of rates, and of rates by positions."""
@@ -192,6 +187,5 @@ def reduced_fields(
         **{key: frozen(array) for key, array in arrays.items()},
         "state_names": tuple(names),
         "state_units": tuple(state.units[i] for i in kept),
-        "rank": reduction.rank,
         "dependent": tuple(name for name in state.names if name not in chosen),
     }

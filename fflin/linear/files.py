@@ -69,9 +69,9 @@ _ARRAYS: dict[str, tuple[str, ...]] = {
     "delay": ("late",),
 }
 _NAMES = [f"{signal}_{field}" for field in ("names", "units") for signal in _SIGNALS]
-_LISTS = (*_NAMES, "locked", "ignorable", "wheels", "limit_names", "added")
+_LISTS = (*_NAMES, "locked", "ignorable", "wheels", "limit_names", "added", "dependent")
 # Lists and arrays that files of earlier versions lack.
-_OPTIONAL = ("wheels", "added", "delay")
+_OPTIONAL = ("wheels", "added", "dependent", "delay")
 _TEXTS = (
     "frame",
     "robot",

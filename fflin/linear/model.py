@@ -253,8 +253,6 @@ class LinearModel(ModelHeader, StateSpace):
         model with delayed inputs, see `discretize`.
     delay : ndarray (nu,)
         Delay of each input [s].
-    rank : int
-        Number of velocities that the constraints of the robot remove; 0 without constraints.
     dependent : tuple of str
         States of the robot that the model does not contain, because the constraints determine them
         from the states of the model.
@@ -291,7 +289,6 @@ class LinearModel(ModelHeader, StateSpace):
     _robot: Robot | None = None  # robot of the model; None for a model from a file
     mean_motion: float = 0.0
     added: tuple[str, ...] = ()
-    rank: int = 0
     dependent: tuple[str, ...] = ()
     _delays: tuple[float, ...] = ()  # empty if no input is delayed
 
@@ -364,6 +361,11 @@ class LinearModel(ModelHeader, StateSpace):
         if source is None:
             return self.f0 / self.dt
         return np.append(source.f0, np.zeros(len(self.added)))
+
+    @property
+    def rank(self) -> int:
+        """Rank of the constraints: the number of velocities that they remove; 0 without any."""
+        return len(self.dependent) // 2
 
     @property
     def delay(self) -> Array:

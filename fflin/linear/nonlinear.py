@@ -34,11 +34,12 @@ class Nonlinear:
     ) -> None:
         self._aba, self._lin = aba, lin
         self.state = state or aba.state
-        # Without an orbit, ABA receives velocities relative to an observer. The observer moves with
-        # the velocity that the base has at the operating point. Otherwise, rounding errors of the
-        # velocity of a fast base would hide the other velocities.
+        # Unless the robot is in orbit or anchored in inertial space, ABA receives velocities
+        # relative to an observer. The observer moves with the velocity that the base has at the
+        # operating point. Otherwise, rounding errors of the velocity of a fast base would hide the
+        # other velocities.
         self._observer = np.zeros(3)
-        if aba.field is None:
+        if aba.field is None and not aba.state.robot.anchored:
             self._observer = rotation_matrix(lin.q[3:7]) @ lin.v[PIN_LINEAR]
         # Velocity and acceleration of a moving reference; zero for a fixed reference.
         self._v: Array = np.zeros((1, aba.state.robot.nv))

@@ -198,6 +198,17 @@ def output_equations(
             turn += by_rate.dot(rates.by_turn)
             by_position += by_rate.dot(rates.by_position)
         by_u = by_rate.dot(rates.by_u)
+        for rows, components in sensing.forces:
+            assert rates.contact is not None
+            contact = rates.contact
+            contact.require_determinate(sensing.names[rows], components)
+            by_x = components.dot(contact.forces_by_x)
+            sensed.y[rows] = components.dot(contact.forces)
+            turn[rows] = by_x[:, ANGULAR]
+            by_position[rows] = by_x[:, LINEAR]
+            by_q_m[rows] = by_x[:, 6 : len(nu)]
+            by_nu[rows] = by_x[:, len(nu) :]
+            by_u[rows] = components.dot(contact.forces_by_u)
         for columns in actuation.held:
             turn += by_u[:, columns].dot(skew(u[columns]))
         chart.turn_rows(actuation.held, by_u.mT)

@@ -33,6 +33,7 @@ from fflin.robot.fields import FIELDS, checked_inputs, checked_names
 from fflin.robot.inputs import named_inputs
 from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.mass_properties import as_inertia, dynamic_parameters, pieces_of
+from fflin.robot.outputs import ConstraintForce
 from fflin.robot.robot_data import RobotData, link_mass
 from fflin.robot.rotors import require_free_rotors
 
@@ -123,6 +124,10 @@ def _require_consistent(robot: RobotData) -> None:
     for name in robot.used_frames:
         find_frame(robot.model, name)
     _require_two_bodies(robot)
+    titles = [item.title for item in robot.constraints]
+    for output in robot.outputs:
+        if isinstance(output, ConstraintForce):
+            require_known("constraint", [output.name], titles)
     require_free_rotors(robot)
 
 

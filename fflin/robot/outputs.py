@@ -280,10 +280,73 @@ class Accelerometer(FrameOutput):
     FEELS_ACCELERATION = True
 
 
+# Units {component: unit} of the wrench of a constraint.
+FORCES = {
+    f"{vector}.{axis}": unit
+    for vector, unit in (("force", "N"), ("torque", "N m"))
+    for axis in "xyz"
+}
+
+
+@dataclass(frozen=True)
+class ConstraintForce(Output):
+    """Output of the force and torque that a constraint exerts on its `frame`, at its origin.
+
+    The opposite wrench acts on the frame `to`. The axes are fixed to `to`, and are those of `frame`
+    at its `placement`.
+
+    - Force (3,) [N].
+    - Torque (3,) [N m]. The torque of a `Spherical` is zero, and so is the torque of a `Hinge`
+      about its axis.
+
+    If constraints are redundant, some components are not determinate, because they depend on
+    internal stresses. `linearize` refuses these components.
+
+    Parameters
+    ----------
+    name : str
+        Name of the constraint.
+    components : tuple of str, optional
+        Components, such as ``("force.x", "torque.z")``; all six by default.
+
+    Examples
+    --------
+    >>> robot = fflin.load("cubesat", constraints=[fflin.Weld("base", name="clamp")])
+    >>> lin = fflin.linearize(robot.replace(outputs=[fflin.ConstraintForce("clamp")]))
+    >>> lin.output_names[0], bool(lin.D.any())
+    ('clamp.force.x', True)
+    """
+
+    WORD = "force"
+    FEELS_ACCELERATION = True
+
+    name: str
+    components: tuple[str, ...] | None = None
+
+    def __post_init__(self) -> None:
+        if isinstance(self.components, str):
+            raise InputError(
+                f"components is {self.components!r}, expected a tuple of names: write "
+                f"({self.components!r},)"
+            )
+        require_known("component of a constraint force", self.chosen, FORCES)
+
+    @property
+    def chosen(self) -> tuple[str, ...]:
+        """Names of the components, such as force.x."""
+        return tuple(FORCES) if self.components is None else self.components
+
+    @property
+    def signals(self) -> list[tuple[str, str]]:
+        """List with (name, unit) of each component."""
+        return [(f"{self.name}.{item}", FORCES[item]) for item in self.chosen]
+
+
 # The command line lists the outputs in this order.
 KINDS: tuple[type[Output], ...] = (
     *(FullState, BasePose, JointPositions, JointVelocities, CenterOfMass, Momentum),
     *(FramePose, FrameVelocity, RelativePose, Gyroscope, Accelerometer),
+    ConstraintForce,
 )
 
 
@@ -303,6 +366,8 @@ def parse_output(text: str) -> tuple[Output, ...]:
     wanted = (
         [item.name for item in fields(kind)] if issubclass(kind, FrameOutput) else []
     )
+    if kind is ConstraintForce:
+        wanted = ["name"]
     names = rest.split(":", len(wanted) - 1) if colon else []
     if len(names) != len(wanted) or not all(names):
         places = ("NAME", *(name.upper() for name in wanted[1:]))
