@@ -16,7 +16,7 @@ from scipy.linalg import qr
 from scipy.linalg.lapack import dpotrf, dtrtrs
 
 from fflin.base.errors import ConstraintError, listed
-from fflin.base.validation import Array, Indices
+from fflin.base.validation import Array, Indices, Mask
 from fflin.dynamics.closure import Closure
 from fflin.dynamics.constraints import Pair
 from fflin.dynamics.state import StateMap
@@ -24,6 +24,7 @@ from fflin.kernel import constraints as kernel
 from fflin.kernel.tree import Tree
 from fflin.robot.constraints import Hinge
 from fflin.robot.joints import ROOT, Carried
+from fflin.robot.outputs import FORCES
 
 # A row of J whose entries are below this value [m|1] is zero.
 _ZERO = 1e-9
@@ -31,6 +32,13 @@ _ZERO = 1e-9
 # The fraction of a row that is orthogonal to the rows before it, in the metric of M. An independent
 # row has a larger fraction than _INDEPENDENT, a redundant row a smaller one than _REDUNDANT.
 _INDEPENDENT, _REDUNDANT = 1e-4, 1e-7
+
+# Newton's method for drawn configurations: largest number of corrections, residual [m|rad] at which
+# they end, and largest residual that may be left.
+_CORRECTIONS, _CLOSED, _LEFT = 30, 1e-14, 1e-10
+
+# Factor of the columns of J that should remain independent.
+_RELUCTANT = 1e-6
 
 # Part of a unit wrench that must vanish for a determinate component.
 _DETERMINATE = 1e-6
@@ -50,8 +58,8 @@ class Constrained:
     ----------
     kept : ndarray of int (r,)
         Indices of the independent rows among all rows.
-    names, units : tuple of str
-        Names and units of the forces and moments of all constraints.
+    names : tuple of str
+        Names of the forces and torques of all constraints, as in `ConstraintForce`.
     outside : bool
         Whether a frame of the world holds the robot, so that its momentum is not constant.
     least : ndarray (1,)
@@ -70,7 +78,11 @@ class Constrained:
         self.constraints.settle(q)
         self.outside = robot.anchored
         self.kept = self._independent(q)
-        self.names, self.units = zip(*self._components(), strict=True)
+        self.names = tuple(
+            f"{item.title}.{component}"
+            for item in self.constraints.items
+            for component in FORCES
+        )
         self.least = np.ones(1)
         self.forces: Array = np.zeros(len(self.kept))
 
@@ -106,7 +118,7 @@ class Constrained:
         return bool(self.least[0] > kernel.LEAST_FRACTION)
 
     def wrenches(self, q: Array, forces: Array) -> Array:
-        """Return the forces and moments (N, k) of all constraints from forces (N, r) of the rows.
+        """Return the forces and torques (N, k) of all constraints from forces (N, r) of the rows.
 
         Forces that redundant rows leave open are the smallest ones.
         """
@@ -115,11 +127,44 @@ class Constrained:
         if len(self.kept) < self.constraints.count:
             for row, q_i in zip(full, q, strict=True):
                 row[:] = self._determinate(q_i) @ row
-        parts = list[Array]()
-        for pair in self.constraints.pairs:
-            twists = full[:, pair.rows] @ pair.selected
-            parts.append(twists[:, : 6 if len(pair.selected) > 3 else 3])
-        return np.hstack(parts)
+        return np.hstack(
+            [full[:, pair.rows] @ pair.selected for pair in self.constraints.pairs]
+        )
+
+    def dependent(self, q: Array, drawn: Mask) -> Indices:
+        """Return the indices of r coordinates that the constraints determine from the others.
+
+        Coordinates in the mask `drawn` (6 + n,) are chosen only if the others do not suffice.
+        """
+        J = self._state.columns(self.constraints.jacobian(q)[self.kept])
+        M = self._state.project(pin.crba(self._model, self._data, q))
+        columns = J / np.sqrt(M.diagonal())
+        columns /= np.linalg.norm(columns, axis=1)[:, None]
+        columns[:, drawn] *= _RELUCTANT
+        _, order = qr(columns, mode="r", pivoting=True)
+        indices: Indices = np.sort(order[: len(self.kept)])
+        return indices
+
+    def completed(self, q: Array, v: Array, dependent: Indices) -> tuple[Array, Array]:
+        """Return q and v on the constraints, for which only dependent coordinates change.
+
+        Raise `ConstraintError` if Newton's method does not converge.
+        """
+        change = np.zeros(6 + self._state.robot.n)
+        for _ in range(_CORRECTIONS):
+            residual = self.constraints.residual(q)[self.kept]
+            J = self._state.columns(self.constraints.jacobian(q)[self.kept])
+            if not np.abs(residual).max() > _CLOSED:
+                break
+            change[dependent] = -np.linalg.solve(J[:, dependent], residual)
+            q = pin.integrate(self._model, q, self._state.spread(change))
+            self._state.robot.follow(q)
+        distance, text = self._closure.distance(q)
+        if not distance <= _LEFT:
+            raise ConstraintError(f"Newton's method leaves {text}")
+        nu = self._state.velocities(v)
+        nu[dependent] -= np.linalg.solve(J[:, dependent], J @ nu)
+        return q, self._state.spread(nu)
 
     def notes(self, q: Array) -> Iterator[str]:
         """Yield a note if redundant rows leave some of the forces open at q."""
@@ -236,15 +281,6 @@ class Constrained:
         basis = np.linalg.qr(J @ J[self.kept].T)[0]
         projection: Array = basis @ basis.T
         return projection
-
-    def _components(self) -> Iterator[tuple[str, str]]:
-        """Yield the name and the unit of each force and moment of the constraints."""
-        for pair in self.constraints.pairs:
-            for axis in "xyz":
-                yield f"{pair.constraint.title}.F.{axis}", "N"
-            if len(pair.selected) > 3:
-                for axis in "xyz":
-                    yield f"{pair.constraint.title}.tau.{axis}", "N m"
 
 
 class Frames(NamedTuple):

@@ -137,10 +137,10 @@ class Motion(StatesAndInputs, Design):
         Lower and upper limits of the states and inputs in `limit_names`. A missing limit is
         infinite. Limits that the simulation does not enforce are included.
     constraint_names : tuple of str
-        Names of the recorded forces [N] and moments [N m] of constraints, such as "grip.F.x" and
-        "grip.tau.z" for a constraint named "grip".
+        Names of the recorded forces [N] and torques [N m] of constraints, such as "grip.force.x"
+        and "grip.torque.z" for a constraint named "grip"; see `ConstraintForce`.
     constraint_forces : ndarray (N, k)
-        Forces and moments that each constraint exerts on its `frame`, just after each time t, in
+        Forces and torques that each constraint exerts on its `frame`, just after each time t, in
         the axes of its placement. The last row repeats the row before it, as in `u`. Redundant
         constraints leave some of them open; then the smallest ones are recorded, and a note says
         so.

@@ -545,22 +545,20 @@ def motion_report(motion: Motion) -> str:
 
 
 def _largest_forces(motion: Motion) -> list[str]:
-    """Return a table of the largest force and moment of each constraint, if there are some."""
+    """Return a table of the largest force and torque of each constraint, if there are some."""
     if not motion.constraint_names:
         return []
-    rows = [["constraint", "largest force [N]", "largest moment [N m]"]]
+    rows = [["constraint", "largest force [N]", "largest torque [N m]"]]
     columns = dict(
         zip(motion.constraint_names, motion.constraint_forces.T, strict=True)
     )
-    # A name is the title of the constraint, "F" or "tau", and the axis.
+    # A name is the title of the constraint, "force" or "torque", and the axis.
     titles = dict.fromkeys(name.rsplit(".", 2)[0] for name in columns)
     for title in titles:
         row = [title]
-        for kind in ("F", "tau"):
-            parts = [columns.get(f"{title}.{kind}.{axis}") for axis in "xyz"]
-            known = [part for part in parts if part is not None]
-            size = np.linalg.norm(known, axis=0).max() if known else None
-            row.append("" if size is None else f"{size:.4g}")
+        for kind in ("force", "torque"):
+            parts = [columns[f"{title}.{kind}.{axis}"] for axis in "xyz"]
+            row.append(f"{np.linalg.norm(parts, axis=0).max():.4g}")
         rows.append(row)
     return [f"{grid(rows, 'l')}\n"]
 
