@@ -3,7 +3,7 @@
 import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from itertools import combinations
 from operator import attrgetter
 from typing import NamedTuple
@@ -11,10 +11,15 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.errors import ChartError, InputError, UnknownNameError
+from fflin.base.errors import (
+    ChartError,
+    ConstraintError,
+    InputError,
+    UnknownNameError,
+)
 from fflin.base.names import by_name, group_of, input_keys
 from fflin.base.rotation import row_products
-from fflin.base.validation import Array, untied
+from fflin.base.validation import Array, Indices, untied
 from fflin.base.validation import by_name as mapping
 from fflin.base.writing import reason
 from fflin.campaign.spreads import SEED, SEEDS, Inverse, inverse_of
@@ -315,6 +320,11 @@ class Dispersions:
                             f"run {start + refused} draws an invalid mass or inertia"
                         )
                         self.one(drawn[refused])
+            except ConstraintError as error:
+                raise InputError(
+                    f"the initial state of a run from {start} on cannot satisfy the constraints: "
+                    f"{error}; use a smaller dispersion"
+                ) from None
             except (ChartError, InputError) as error:
                 raise InputError(
                     f"{problem}: {error}; use a smaller dispersion"
@@ -337,7 +347,29 @@ class Dispersions:
 
     def starts(self, drawn: Array) -> tuple[Array, Array]:
         """Return the initial configurations (N, nq) and velocities (N, nv)."""
-        return self._plant.state.points(self._x0 + self._of("state", drawn))[1:]
+        q, v = self._plant.state.points(self._x0 + self._of("state", drawn))[1:]
+        constrained = self._plant.constrained
+        if constrained is None or "state" not in self._kinds:
+            return q, v
+        rows = [
+            constrained.completed(*row, self._dependent)
+            for row in zip(q, v, strict=True)
+        ]
+        closed_q, closed_v = map(np.array, zip(*rows, strict=True))
+        return closed_q, closed_v
+
+    @cached_property
+    def _dependent(self) -> Indices:
+        """Indices in nu of the coordinates that constraints determine from the drawn ones."""
+        plant = self._plant
+        assert plant.constrained is not None
+        size = plant.state.nx // 2
+        drawn = np.zeros(size, dtype=bool)
+        for column in self.columns:
+            if column.kind == "state":
+                drawn[np.array(column.at) % size] = True
+        q, _ = plant.state.to_pinocchio(self._x0)
+        return plant.constrained.dependent(q, drawn)
 
     def bodies(self, drawn: Array) -> dict[int, tuple[Array, Array, Array]]:
         """Return {joint: (masses (N,), centres of mass (N, 3), inertias (N, 3, 3))} of bodies.
@@ -499,7 +531,8 @@ class Dispersions:
         if faults is not None:
             first = [values[0] for values in faults]
             actuator_faults = ActuatorFaults(*first)
-        return Plant(state, plant.disturbance, actuator_faults), policy, q[0], v[0]
+        drawn_plant = Plant(state, plant.disturbance, actuator_faults)
+        return drawn_plant, policy, *drawn_plant.constrain(q[0], v[0])
 
 
 @dataclass(eq=False)

@@ -35,6 +35,8 @@ ENGINES = ("python", "compiled")
 _COMPILED = {
     "advance": "the loop that simulates eight runs at a time",
     "advance_one": "the loop that simulates one run",
+    "advance_constrained": "the loop that simulates eight runs with constraints at a time",
+    "advance_one_constrained": "the loop that simulates one run with constraints",
     "derive": "the batch kernel",
     "take": "the run statistics",
 }

@@ -9,9 +9,11 @@ from collections import namedtuple
 
 import numpy as np
 
+from fflin.kernel import constraints as held
 from fflin.kernel import forward
 from fflin.kernel import vectors as vec
 from fflin.kernel.allocation import allocate, write_difference
+from fflin.kernel.constraints import CONSTRAINTS
 from fflin.kernel.forward import MECHANICS, MOMENTUM_REFERENCE, POINT
 from fflin.kernel.policies import (
     LAW,
@@ -261,6 +263,14 @@ ARGUMENTS = Struct(
 ARGUMENTS_OF_ONE = ARGUMENTS.with_one_lane()
 
 
+class ConstrainedArguments(namedtuple("ConstrainedArguments", "usual constraints")):
+    """Arguments of `advance_constrained`: the arguments of `advance`, and the constraints."""
+
+
+CONSTRAINED = Struct(ConstrainedArguments, usual=ARGUMENTS, constraints=CONSTRAINTS)
+CONSTRAINED_OF_ONE = CONSTRAINED.with_one_lane()
+
+
 def _combine(shares, row, rates, out):
     """Write the sum of the rows of `rates`, with the weights in a row of `shares`.
 
@@ -321,7 +331,7 @@ def _ask(work, robot, law, channel, point, t, step, stage):
 
 def advance(words, clock, last, every, rows, work):
     """Advance eight runs; `words` are the 64-bit words of `ARGUMENTS`, see `_advance`."""
-    _advance(ARGUMENTS(words), clock, last, every, rows, work)
+    _advance(ARGUMENTS(words), None, clock, last, every, rows, work)
 
 
 def advance_one(words, clock, last, every, rows, work):
@@ -329,20 +339,38 @@ def advance_one(words, clock, last, every, rows, work):
 
     A single run would be slower in eight equal lanes.
     """
-    _advance(ARGUMENTS_OF_ONE(words), clock, last, every, rows, work)
+    _advance(ARGUMENTS_OF_ONE(words), None, clock, last, every, rows, work)
 
 
-def _advance(arguments, clock, last, every, rows, work):
+# Only robots with constraints use the next two functions, so the other robots do not wait until
+# these functions are compiled.
+
+
+def advance_constrained(words, clock, last, every, rows, work):
+    """Advance eight runs; `words` are the words of `CONSTRAINED`, see `_advance`."""
+    arguments = CONSTRAINED(words)
+    _advance(arguments.usual, arguments.constraints, clock, last, every, rows, work)
+
+
+def advance_one_constrained(words, clock, last, every, rows, work):
+    """Advance one run; `words` are the words of `CONSTRAINED_OF_ONE`, see `_advance`."""
+    arguments = CONSTRAINED_OF_ONE(words)
+    _advance(arguments.usual, arguments.constraints, clock, last, every, rows, work)
+
+
+def _advance(arguments, constraints, clock, last, every, rows, work):
     """Advance all runs to the step `last`, or until one of the runs meets a stop condition.
 
-    The function updates the point,
-    the momentum reference, the state of the policy and the state of the channel. clock (1,) is the
-    number of finished steps. Before step 0, the initial momentum and centre of mass are written
-    into the momentum reference.
+    The function updates the point, the momentum reference, the state of the policy and the state of
+    the channel. clock (1,) is the number of finished steps. Before step 0, the initial momentum and
+    centre of mass are written into the momentum reference.
+
+    `constraints` is None for a robot without constraints. The code for constraints is then not
+    compiled.
 
     If `every` is not 0, the function writes a row into `rows` at every step that is a multiple of
-    `every`. A row consists of q, nu, u, the reference momentum (6,) and the reference centre of
-    mass (3,). `work` has `WorkOffsets.size` entries.
+    `every`. A row consists of q, nu, u, the reference momentum (6,), the reference centre of mass
+    (3,), and the forces of the constraints. `work` has `WorkOffsets.size` entries.
     """
     robot = arguments.robot
     method = arguments.method
@@ -357,31 +385,26 @@ def _advance(arguments, clock, last, every, rows, work):
     if clock[0] == 0:
         forward.start_at(work, robot, kept, point)
     for step in range(clock[0], last):
+        recorded = every > 0 and step % every == 0
         vec.copy(point.q, 0, method.first, 0, len(point.q))
         vec.copy(point.nu, 0, method.rates, 0, len(point.nu))
         for stage in range(len(method.origin)):
             t = step * h + method.nodes[stage]
             if law.kind != NOTHING and (channel.sample == 0 or stage == 0):
-                if is_asked(channel, step):
-                    _ask(work, robot, law, channel, point, t, step, stage)
-                transmit(channel, step, point.nu, point.u)
+                _command(work, arguments, t, step, stage)
             forward.apply_faults(
                 robot.faults, robot.triads, step * h, h, point.u, point.pushing
             )
             forward.turn_held(robot, point)
-            if stage == 0:
-                vec.copy(point.u, 0, method.u, 0, len(point.u))
-                if every > 0 and step % every == 0:
-                    for values in (point.q, point.nu, point.u):
-                        vec.copy(values, 0, rows, at, len(values))
-                        at += len(values)
-                    momentum, center = forward.kept_at(kept, step * h)
-                    vec.put6(rows, at, momentum)
-                    vec.put3(rows, at + 6, center)
-                    at += 9
             forward.accelerate(
                 work, robot, point, t, method.rates, (1 + stage) * len(point.nu)
             )
+            if constraints is not None:
+                _constrain(work, robot, constraints, method, point, stage)
+            if stage == 0:
+                vec.copy(point.u, 0, method.u, 0, len(point.u))
+                if recorded:
+                    at = _record(kept, point, constraints, step * h, rows, at)
             if arguments.pushed:
                 weight, moment = method.weights[stage], method.moments[stage]
                 forward.add_wrench(work, robot, kept, point, weight, moment)
@@ -390,11 +413,54 @@ def _advance(arguments, clock, last, every, rows, work):
                 _combine(method.speed, stage, law.filter.rates, law.filter.z)
             forward.configure(work, robot, point.q)
         forward.end_step(kept, h)
+        if constraints is not None:
+            held.close(work, robot, constraints, point)
         if arguments.project:
             forward.impose(work, robot, kept, point, (step + 1) * h)
         clock[0] = step + 1
-        if not goes_on(arguments.stop, robot.origin, point.q, point.nu):
+        if not _continues(arguments, constraints):
             break
+
+
+def _record(kept, point, constraints, t, rows, at):
+    """Write a row into `rows`, and return the index after it."""
+    for values in (point.q, point.nu, point.u):
+        vec.copy(values, 0, rows, at, len(values))
+        at += len(values)
+    momentum, center = forward.kept_at(kept, t)
+    vec.put6(rows, at, momentum)
+    vec.put3(rows, at + 6, center)
+    at += 9
+    if constraints is not None:
+        vec.copy(constraints.forces, 0, rows, at, len(constraints.forces))
+        at += len(constraints.forces)
+    return at
+
+
+def _command(work, arguments, t, step, stage):
+    """Write the inputs that the actuator channel lets through at a stage to `point.u`."""
+    channel, point = arguments.channel, arguments.point
+    if is_asked(channel, step):
+        _ask(work, arguments.robot, arguments.law, channel, point, t, step, stage)
+    transmit(channel, step, point.nu, point.u)
+
+
+def _constrain(work, robot, constraints, method, point, stage):
+    """Correct the accelerations of a stage; keep the forces of the first stage."""
+    first = (1 + stage) * len(point.nu)
+    held.constrain(work, robot, constraints, point, method.rates, first)
+    if stage == 0:
+        forces = constraints.multipliers
+        vec.copy(forces, 0, constraints.forces, 0, len(forces))
+
+
+def _continues(arguments, constraints):
+    """Return whether no run meets a stop condition at the end of a step."""
+    robot, point = arguments.robot, arguments.point
+    good = goes_on(arguments.stop, robot.origin, point.q, point.nu)
+    if constraints is not None:
+        good = good and held.independent(constraints)
+    return good
 
 
 class RunStatistics(
@@ -481,13 +547,14 @@ def take(words, rows, first, count):
     at = stats.at
     sizes = stats.sizes
     kept = 0
-    width = len(at.q) + len(at.nu)
     inputs = len(stats.largest_u)
+    width = len(at.q) + len(at.nu)
+    stride = len(rows) // max(count, 1)
     e = stats.path.e
     while kept < len(stats.steps) and stats.steps[kept] < first:
         kept += 1
     for row in range(count):
-        step, begin = first + row, row * (width + inputs + 9)
+        step, begin = first + row, row * stride
         vec.copy(rows, begin, at.q, 0, len(at.q))
         vec.copy(rows, begin + len(at.q), at.nu, 0, len(at.nu))
         _compare(stats, step)

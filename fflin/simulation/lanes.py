@@ -25,6 +25,7 @@ from fflin.dynamics.disturbance import Wave, waves_of
 from fflin.dynamics.state import StateMap
 from fflin.kernel import allocation, forward, loop, policies
 from fflin.kernel.compiled import compiles, is_kept, kernel
+from fflin.kernel.constraints import LEAST_FRACTION, Constraints
 from fflin.kernel.limits import Task, reason_against
 from fflin.kernel.tree import LANES, batch_tree, empty, laid_out, work_space
 from fflin.robot.disturbance import BASE, UNITS, DisturbanceTerm
@@ -40,6 +41,7 @@ from fflin.simulation.run import (
     Recording,
     ending_of,
     go,
+    singular_at,
     stop_conditions,
     stop_of,
 )
@@ -67,12 +69,18 @@ def engine_of(engine: object, plan: Plan, *, many: bool = False) -> str:
     """
     if not compiles(engine, lambda: not_compilable(plan)):
         return "python"
-    wanted = (
-        engine or many or (plan.times.steps > LONG and is_kept("loop", "advance_one"))
-    )
-    if wanted:
+    long = plan.times.steps > LONG and is_kept("loop", loop_name(plan, lanes=1))
+    if engine or many or long:
         return "compiled"
     return "python"
+
+
+def loop_name(plan: Plan, *, lanes: int) -> str:
+    """Return the name of the kernel function that simulates a number of runs of a plan."""
+    name = "advance_one" if lanes == 1 else "advance"
+    if plan.plant.constrained is not None:
+        name += "_constrained"
+    return name
 
 
 def form_of(policy: Policy, robot: Robot) -> Form | None:
@@ -209,9 +217,10 @@ class LaneLoop:
 
     `lanes` is the number of runs at a time: eight, or one for a single run.
 
-    `parts` are the arguments of the loop, with one lane per run. A recorded row consists of q, nu,
-    u, momentum and centre of mass. For each of these five vectors, `ends` (5,) contains the column
-    after its last entry.
+    `parts` are the arguments of the loop, with one lane per run, and `constraints` are its
+    constraints, or None. A recorded row consists of q, nu, u, momentum, centre of mass and the
+    forces of the constraints. For each of these six vectors, `ends` (6,) contains the column after
+    its last entry.
     """
 
     def __init__(
@@ -237,19 +246,30 @@ class LaneLoop:
         self._noisy = len(parts.law.added) > len(parts.law.y)
         # `_fresh` contains a pair for each array with lanes: the array, and the column of initial
         # values that is copied to all lanes.
-        arguments = loop.ARGUMENTS
-        name = "advance"
-        if lanes == 1:
-            arguments = loop.ARGUMENTS_OF_ONE
-            name = "advance_one"
-        self.parts, self._words, self._fresh = laid_out(parts, arguments)
+        self.constraints: Constraints | None = None
+        if plan.plant.constrained is None:
+            arguments = loop.ARGUMENTS_OF_ONE if lanes == 1 else loop.ARGUMENTS
+            self.parts, self._words, self._fresh = laid_out(parts, arguments)
+        else:
+            both = loop.ConstrainedArguments(parts, constraints_of(plan))
+            constrained = loop.CONSTRAINED_OF_ONE if lanes == 1 else loop.CONSTRAINED
+            both, self._words, self._fresh = laid_out(both, constrained)
+            self.parts, self.constraints = both
         self._work = self._space(self.parts.robot.tree.offsets.size)
-        self._advance = kernel("loop", name)
+        self._advance = kernel("loop", loop_name(plan, lanes=lanes))
         robot, point = self.parts.robot, self.parts.point
         momentum_size = 6
         center_size = 3
+        forces = () if self.constraints is None else self.constraints.forces
         self.ends = np.cumsum(
-            [len(point.q), len(point.nu), len(point.u), momentum_size, center_size]
+            [
+                len(point.q),
+                len(point.nu),
+                len(point.u),
+                momentum_size,
+                center_size,
+                len(forces),
+            ]
         )
         self.width = int(self.ends[-1])
         self.done = 0
@@ -314,9 +334,10 @@ class LaneLoop:
                 bar(done, steps)
                 v = self._state.spread(point.nu.T)
                 for lane in going.nonzero()[0]:
-                    messages[lane] = self._ending(
-                        done * times.dt, point.q[:, lane], v[lane]
-                    )
+                    t = done * times.dt
+                    messages[lane] = self._ending(t, point.q[:, lane], v[lane])
+                    if not messages[lane] and not self._is_independent(int(lane)):
+                        messages[lane] = singular_at(t)
                 stop = np.array([float(stop_of(message)) for message in messages])
                 if done % statistics.span == 0:
                     over = statistics.over(point.q.T, v)[:count] & (stop == 0.0)
@@ -335,6 +356,12 @@ class LaneLoop:
         finally:
             bar.close()
         return messages
+
+    def _is_independent(self, lane: int) -> bool:
+        """Return whether the rows of the constraints are independent in a lane."""
+        if self.constraints is None:
+            return True
+        return float(self.constraints.least[0, lane]) > LEAST_FRACTION
 
     def _write_initial_values(self, runs: Runs, of_lane: Indices) -> None:
         """Write the initial values of all runs.
@@ -406,6 +433,8 @@ class LaneLoop:
             self.done * self._plan.times.dt * kept.per_mass * kept.start[:3]
         )
         last = np.vstack((point.q, point.nu, self.parts.method.u, conserved))
+        if self.constraints is not None:
+            last = np.vstack((last, self.constraints.forces))
         diverged = (stop == STOPS.index("diverged"))[:count]
         for chosen, finite in ((ending & diverged, False), (ending & ~diverged, True)):
             # the last state of a diverged run may not be finite, so it is not added
@@ -492,9 +521,28 @@ def _recording(
     count = -(-done // every)
     t = np.append(every * np.arange(count) * dt, done * dt)
     count += not stopped.startswith(("diverged", "interrupted"))
-    q, nu, u, momentum, center, _ = np.split(kept[:count], loop.ends, axis=1)
-    v = plan.plant.state.spread(nu)
-    return Recording(t[:count], q, v, u, momentum, center, done, stopped, "compiled")
+    q, nu, u, momentum, center, forces, _ = np.split(kept[:count], loop.ends, axis=1)
+    return Recording(
+        t=t[:count],
+        q=q,
+        v=plan.plant.state.spread(nu),
+        u=u,
+        momentum=momentum,
+        center=center,
+        steps=done,
+        stopped=stopped,
+        engine="compiled",
+        forces=None if loop.constraints is None else forces,
+    )
+
+
+def constraints_of(plan: Plan) -> Constraints:
+    """Return the constraints of a plan's robot for the kernel."""
+    plant = plan.plant
+    tree = batch_tree(plant.robot)
+    assert plant.constrained is not None
+    assert tree is not None
+    return plant.constrained.in_kernel(tree, len(plan.q))
 
 
 def packed(

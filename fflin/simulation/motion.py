@@ -136,6 +136,14 @@ class Motion(StatesAndInputs, Design):
     limits : ndarray (k, 2)
         Lower and upper limits of the states and inputs in `limit_names`. A missing limit is
         infinite. Limits that the simulation does not enforce are included.
+    constraint_names : tuple of str
+        Names of the recorded forces [N] and torques [N m] of constraints, such as "grip.force.x"
+        and "grip.torque.z" for a constraint named "grip"; see `ConstraintForce`.
+    constraint_forces : ndarray (N, k)
+        Forces and torques that each constraint exerts on its `frame`, just after each time t, in
+        the axes of its placement. The last row repeats the row before it, as in `u`. Redundant
+        constraints leave some of them open; then the smallest ones are recorded, and a note says
+        so.
     phases, starts : tuple of str, ndarray (k,)
         Names and start times [s] of the phases, if `then` joined the motion from several phases.
 
@@ -151,7 +159,8 @@ class Motion(StatesAndInputs, Design):
 
     _SHAPES = (
         "t:t q:tq v:tv x:tx u:tu momentum:tm state_names:x input_names:u "
-        "wheels:w wheel_inertias:w modes:k mode_rotations:k phases:p starts:p"
+        "wheels:w wheel_inertias:w modes:k mode_rotations:k phases:p starts:p "
+        "constraint_names:c"
     )
 
     t: Vector
@@ -191,6 +200,8 @@ class Motion(StatesAndInputs, Design):
     circles: str = field(default_factory=str)  # the orbit, as text
     modes: tuple[str, ...] = field(default_factory=tuple)
     mode_rotations: Vector = field(default_factory=lambda: np.zeros(0))
+    constraint_names: tuple[str, ...] = field(default_factory=tuple)
+    constraint_forces: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     def __post_init__(self) -> None:
         rows = (
@@ -202,7 +213,9 @@ class Motion(StatesAndInputs, Design):
             self.momentum,
             self.momentum_drift,
         )
-        may_lack = (self.prediction, self.com_drift)
+        if not self.constraint_names:  # .json files have no empty matrices
+            object.__setattr__(self, "constraint_forces", np.zeros((0, 0)))
+        may_lack = (self.prediction, self.com_drift, self.constraint_forces)
         count = len(self.t)
         if any(len(x) != count for x in rows) or any(
             len(x) not in (0, count) for x in may_lack
@@ -368,7 +381,7 @@ class Motion(StatesAndInputs, Design):
                 whole = replace(whole, notes=(*whole.notes, note))
             else:
                 instance("a phase", part, Motion, "a Motion, or an Impact before one")
-                name = event or part.robot
+                name = event or _named_phase(robot, part)
                 _require_start(name, part._robot, part.q[0], part.v[0], (robot, q, v))
                 robot = part._robot
                 q = part.q[-1]
@@ -508,6 +521,18 @@ def _require_start(
         )
 
 
+def _named_phase(before: Robot, motion: Motion) -> str:
+    """Return the name of a phase after a motion of the robot `before`.
+
+    The name is the robot, or the constraints that the robot no longer has.
+    """
+    held = [item.title for item in motion._robot.constraints]
+    released = [item.title for item in before.constraints if item.title not in held]
+    if released:
+        return f"{', '.join(released)} released"
+    return motion.robot
+
+
 def _in_coordinates_of(
     robot: Robot, other: Robot, last: Array, q: Array, v: Array
 ) -> tuple[Array, Array]:
@@ -536,6 +561,16 @@ def _named_frame(motion: Motion) -> str:
     if motion.circles:
         text += " in orbit"
     return text
+
+
+def _forces_named(names: Sequence[str], motion: Motion) -> Array:
+    """Return the forces of constraints (N, k) with given names; missing ones are zero."""
+    forces = np.zeros((len(motion.t), len(names)))
+    for column, name in zip(
+        motion.constraint_forces.T, motion.constraint_names, strict=True
+    ):
+        forces[:, names.index(name)] = column
+    return forces
 
 
 def _longer(whole: Motion, motion: Motion, name: str) -> Motion:
@@ -575,7 +610,12 @@ def _longer(whole: Motion, motion: Motion, name: str) -> Motion:
             u[:, held] @ other_state.reference.rotation.T @ state.reference.rotation
         )
     rows = {"t": t, "q": q, "v": v, "x": state_history(state, q, v, near, t), "u": u}
-    joined: dict[str, Any] = {}
+    names = tuple(dict.fromkeys((*whole.constraint_names, *motion.constraint_names)))
+    forces = [_forces_named(names, part) for part in (whole, motion)]
+    joined: dict[str, Any] = {
+        "constraint_names": names,
+        "constraint_forces": np.concatenate(forces),
+    }
     for key in (*rows, "energy", "momentum", "momentum_drift", "com_drift"):
         added = rows.get(key, getattr(motion, key))
         joined[key] = np.concatenate((getattr(whole, key), added))

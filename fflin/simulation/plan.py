@@ -155,6 +155,7 @@ class Plan:
         self.q, self.v = points.point_of(
             state, options.x0, options.q0, options.v0, default
         )
+        self.q, self.v = plant.constrain(self.q, self.v)
         points.require_slow("the initial velocity", self.v)
         if plant.field:
             plant.field.require_near(self.q)
@@ -208,7 +209,10 @@ class Plan:
             self.near = state.read(*self.reference(0.0)[:2])
         # Whether each step ends with a correction that sets momentum and centre of mass to their
         # predicted values. In orbit, momentum is not conserved, so there is no correction.
-        self.project = truth("project", options.project) and robot.orbit is None
+        # If a frame is held in the world, the constraint determines where the base is.
+        self.project = truth("project", options.project) and not (
+            robot.orbit or robot.anchored
+        )
         # Indices in v of the wheels with a speed limit.
         self.wheels = [robot.joints[row - 6].idx_v for row in self.limits.wheels.row]
         # States that the policy feeds back, if known.

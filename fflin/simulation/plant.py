@@ -17,6 +17,7 @@ from fflin.dynamics.coordinates import ANGULAR, LINEAR, forces_of
 from fflin.dynamics.disturbance import BaseDisturbance
 from fflin.dynamics.state import StateMap
 from fflin.kernel.forward import ActuatorFaults, apply_faults
+from fflin.simulation.constrained import Constrained
 
 # Generalised forces {name or group: value}, such as {"tau_b": (0, 0, 1e-3), "tau_m.joint_1": 0.2}.
 # The torque and the force on the base are in the axes of the inputs tau_b and F_b.
@@ -57,6 +58,8 @@ class Plant(Aba):
         robot.require_inertia()
         super().__init__(state)
         self.disturbance = disturbance
+        # Constraints of the robot, or None; written by `constrain`.
+        self.constrained: Constrained | None = None
         # Disturbances of the robot itself.
         self.on_base = BaseDisturbance(robot, state.field)
         # Whether the warning about a disturbance given as an array was already issued.
@@ -137,6 +140,28 @@ class Plant(Aba):
             push = np.append(power, np.zeros(5))
         return rate, push
 
+    def constrain(self, q: Array, v: Array) -> tuple[Array, Array]:
+        """Return an initial q (nq,) and v (nv,) on the constraints of the robot, if it has some.
+
+        From then on, `constrained` is set. Raise `ConstraintError` if q or v is far from them.
+        """
+        if not self.robot.constraints:
+            return q, v
+        self.constrained = Constrained(self.state, q)
+        return self.constrained.start(q, v)
+
+    def constrained_stage(
+        self, t: float, q: Array, v: Array, u: Array
+    ) -> tuple[Array, Array]:
+        """Return dv/dt and the external wrench as `stage`, for a robot with constraints."""
+        assert self.constrained is not None
+        rate, push = self.stage(t, q, v, u)
+        rate, wrench = self.constrained.accelerate(q, v, rate)
+        # In orbit, `push` contains a power, and constraints do no work.
+        if self.constrained.outside:
+            push = push + wrench
+        return rate, push
+
     def disturbing(self, t: float, q: Array, v: Array) -> Array:
         """Return the generalised force (nv,) of the disturbance, or raise `InputError`."""
         assert self.disturbance is not None
@@ -197,5 +222,6 @@ class Plant(Aba):
             self.on_base.waves,
             any(self.robot.gravity),
             self.robot.orbit,
+            self.constrained is not None and self.constrained.outside,
         )
         return not (base or any(outside))

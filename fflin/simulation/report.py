@@ -508,6 +508,7 @@ def motion_report(motion: Motion) -> str:
         parts.append(_largest_modes(motion))
     if kinds or motion.u.any():
         parts.append(_largest_inputs(motion))
+    parts += _largest_forces(motion)
     limit_messages = [
         *(f"limit exceeded: {violation}" for violation in motion.passed),
         *map(str, motion.saturated),
@@ -541,6 +542,25 @@ def motion_report(motion: Motion) -> str:
             f"largest difference from the linear model: {size} in {motion.state_names[most]}"
         )
     return "\n".join(parts)
+
+
+def _largest_forces(motion: Motion) -> list[str]:
+    """Return a table of the largest force and torque of each constraint, if there are some."""
+    if not motion.constraint_names:
+        return []
+    rows = [["constraint", "largest force [N]", "largest torque [N m]"]]
+    columns = dict(
+        zip(motion.constraint_names, motion.constraint_forces.T, strict=True)
+    )
+    # A name is the title of the constraint, "force" or "torque", and the axis.
+    titles = dict.fromkeys(name.rsplit(".", 2)[0] for name in columns)
+    for title in titles:
+        row = [title]
+        for kind in ("force", "torque"):
+            parts = [columns[f"{title}.{kind}.{axis}"] for axis in "xyz"]
+            row.append(f"{np.linalg.norm(parts, axis=0).max():.4g}")
+        rows.append(row)
+    return [f"{grid(rows, 'l')}\n"]
 
 
 def _heading(motion: Motion, kinds: list[ErrorSize]) -> list[str]:

@@ -28,7 +28,7 @@ from fflin.dynamics.points import LARGEST_SPEED
 from fflin.kernel.loop import StopConditions, goes_on
 from fflin.robot.joints import ROOT
 from fflin.simulation.plan import Plan
-from fflin.simulation.plant import LARGEST_TURN
+from fflin.simulation.plant import LARGEST_TURN, Plant
 
 STOPS = ("", "diverged", "left the chart", "stopped")
 
@@ -225,6 +225,7 @@ class Recording(NamedTuple):
     steps: int  # number of steps that were begun
     stopped: str  # reason if the run ended early, or an empty text
     engine: str  # name of the engine
+    forces: Array | None = None  # (N, r) of constraints, or None without constraints
 
 
 def _follower(plan: Plan) -> Callable[[int], None] | None:
@@ -251,6 +252,13 @@ class _Rows:
         self._callback = plan.options.callback
         self._ends = np.cumsum([len(plan.q), len(plan.v), len(plan.initial), 6])
         self._rows = np.empty((plan.times.rows, self._ends[-1] + 3))
+        self._constrained = plan.plant.constrained
+        self._forces = list[Array]()
+
+    def add_forces(self, forces: Array) -> None:
+        """Record the forces of the constraints in the latest row, unless it already has some."""
+        if len(self._forces) < len(self.times):
+            self._forces.append(forces)
 
     def add(self, t: float, q: Array, v: Array, u: Array) -> None:
         """Record a row, and call the callback of the run."""
@@ -265,6 +273,11 @@ class _Rows:
         """Return the rows of a run that ended after `steps` for the reason `stopped`."""
         parts = np.split(self._rows[: len(self.times)], self._ends, axis=1)
         q, v, u, momentum, center = parts
+        forces = None
+        if self._constrained is not None:
+            # No step begins at the last row, so this row repeats the forces before it.
+            rows = self._forces + self._forces[-1:]
+            forces = np.array(rows[: len(q)])
         return Recording(
             t=np.array(self.times),
             q=q,
@@ -275,7 +288,34 @@ class _Rows:
             steps=steps,
             stopped=stopped,
             engine="python",
+            forces=forces,
         )
+
+
+def _stage_of(plant: Plant, rows: _Rows) -> Callable[..., tuple[Array, Array]]:
+    """Return the function of (t, q, v, u) for the accelerations and the external wrench."""
+    constrained = plant.constrained
+    if constrained is None:
+        return plant.stage
+
+    def stage(t: float, q: Array, v: Array, u: Array) -> tuple[Array, Array]:
+        result = plant.constrained_stage(t, q, v, u)
+        rows.add_forces(constrained.forces)
+        return result
+
+    return stage
+
+
+def _corrected(
+    plan: Plan, kept: Conserved, t: float, q: Array, v: Array
+) -> tuple[Array, Array]:
+    """Return q and v at the end of a step, on the constraints and with the predicted momentum."""
+    constrained = plan.plant.constrained
+    if constrained is not None:
+        q, v = constrained.close(q, v)
+    if plan.project:
+        kept.impose(t, q, v)
+    return q, v
 
 
 # A diverging motion may overflow before it is stopped, so NumPy's warnings are suppressed.
@@ -287,10 +327,11 @@ def go(plan: Plan, hint: str = "") -> Recording:
     kept = Conserved(plan)
     applied = None if law is None else plan.applied_by(law)
     ask = partial(applied, 0) if applied and not times.sample else None
-    take, stage = plan.method(plant.robot.model, dt).step, plant.stage
+    take = plan.method(plant.robot.model, dt).step
     follow = _follower(plan)
     pushed = not plant.isolated(driven=law is not None)
     rows = _Rows(plan, kept)
+    stage = _stage_of(plant, rows)
     t, stages = 0.0, 0
 
     def acceleration(t: float, q: Array, v: Array) -> Array:
@@ -322,8 +363,7 @@ def go(plan: Plan, hint: str = "") -> Recording:
             if pushed:
                 kept.advance()
             t = (step + 1) * dt
-            if plan.project:
-                kept.impose(t, q, v)
+            q, v = _corrected(plan, kept, t, q, v)
             if stopped := ending(t, q, v):
                 break
             if step % _LOOK == 0:
@@ -361,8 +401,12 @@ def ending_of(plan: Plan, stop: StopConditions) -> Callable[[float, Array, Array
     any_attitude = stop._replace(sign=[0.0])
     origin = [0.0, 0.0, 0.0, *plan.plant.state.origin_quaternion.tolist()]
 
+    constrained = plan.plant.constrained
+
     def ending(t: float, q: Array, v: Array) -> str:
         place, rates = q.tolist(), v.tolist()
+        if constrained is not None and not constrained.independent():
+            return singular_at(t)
         if goes_on(stop, origin, place, rates):
             for event in plan.events:
                 value = event(t, q.copy(), v.copy())
@@ -389,6 +433,14 @@ def ending_of(plan: Plan, stop: StopConditions) -> Callable[[float, Array, Array
         return f"diverged at t = {t:g} s in steps of {dt:g} s{shown}; {advice}"
 
     return ending
+
+
+def singular_at(t: float) -> str:
+    """Return the message for constraints that become singular at time t [s]."""
+    return (
+        f"stopped at t = {t:g} s: the constraints are singular, because one of them follows from "
+        "the others at this configuration; their forces are not determinate there"
+    )
 
 
 def stop_of(message: str) -> int:

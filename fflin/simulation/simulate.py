@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from operator import attrgetter
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -27,7 +28,7 @@ from fflin.kernel.compiled import is_kept
 from fflin.linear.model import Delay, LinearModel
 from fflin.robot.fields import limits_of
 from fflin.robot.robot import Robot
-from fflin.simulation.lanes import engine_of, not_compilable, recorded
+from fflin.simulation.lanes import engine_of, loop_name, not_compilable, recorded
 from fflin.simulation.motion import Motion
 from fflin.simulation.plan import Callback, Event, Limits, Plan, SimulationOptions
 from fflin.simulation.plant import Disturbance
@@ -268,7 +269,7 @@ def simulate(
         run = recorded(plan) if compiled else go(plan, hint)
         if hint and (spent := perf_counter() - began) > LONG_RUN:
             once = ""
-            if not is_kept("loop", "advance_one"):
+            if not is_kept("loop", loop_name(plan, lanes=1)):
                 once = f", and {_COMPILING:g} s once to compile"
             message = "the simulation took %.0f s in Python; engine='compiled' (--engine compiled)"
             _log.warning(
@@ -335,6 +336,8 @@ def motion_of(plan: Plan, run: Recording, foresees: Predictor | None = None) -> 
     loop_notes: tuple[str, ...] = ()
     if plan.policy:
         loop_notes = plan.policy.loop_notes(plan.times.sample * plan.times.dt)
+    if plant.constrained is not None:
+        notes = (*notes, *plant.constrained.notes(plan.q))
     limits = limits_of(plan.options.robot) | plan.acting
     # In orbit, `com_drift` is empty, because the centre of mass moves on a curve even without
     # inputs and disturbances.
@@ -383,7 +386,19 @@ def motion_of(plan: Plan, run: Recording, foresees: Predictor | None = None) -> 
         ),
         limit_names=tuple(limits),
         limits=np.array(list(limits.values())).reshape(-1, 2),
+        **_constraint_forces(plan, run),
     )
+
+
+def _constraint_forces(plan: Plan, run: Recording) -> dict[str, Any]:
+    """Return the fields of a motion about the forces of constraints."""
+    constrained = plan.plant.constrained
+    if constrained is None or run.forces is None:
+        return {}
+    return {
+        "constraint_names": constrained.names,
+        "constraint_forces": constrained.wrenches(run.q, run.forces),
+    }
 
 
 def _energy_note(
