@@ -44,8 +44,8 @@ _LEAST_REACH = 1e-3
 # most this times the entry i of D (10.7), both about the centre of mass.
 _IDLE = 1e-12
 
-# Constraints carry an input if its weight is at most the first value times the largest weight, and a
-# combination of inputs of a block if its squared effect is at most the second value.
+# Constraints carry an input if its weight is at most the first value times the largest weight. They
+# carry a combination of inputs of a block if its squared effect is at most the second value.
 _CARRIED, _CARRIED_TOGETHER = 1e-20, 1e-12
 
 # Nor do the inputs have an effect in a direction in which the eigenvalue of S R^-1 S', in units of
