@@ -84,7 +84,7 @@ class ClassicalConstraints:
             given = multipliers[pair.rows]
             joint = self._data.oMi[pair.first.joint]
             R = joint.rotation @ pair.first.placement.rotation
-            torque = np.zeros(3)
+            torque: Array = np.zeros(3)
             if isinstance(pair.constraint, Hinge):
                 torque = pair.selected[3:, 3:].T @ given[3:]
             elif not isinstance(pair.constraint, Spherical):
@@ -103,7 +103,7 @@ class ClassicalConstraints:
             biases.append(second.acceleration - first.acceleration)
             if isinstance(pair.constraint, Spherical):
                 continue
-            across = np.eye(3)
+            across: Array = np.eye(3)
             if isinstance(pair.constraint, Hinge):
                 across = pair.selected[3:, 3:].T
             across = first.rotation @ across

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.errors import ConstraintError, FflinWarning, InputError
+from fflin.base.errors import ConstraintError, FflinWarning, InputError, listed
 from fflin.base.validation import Array, ArrayLike, instance
 from fflin.dynamics.constraints import Constraints
 from fflin.dynamics.state import StateMap
@@ -30,6 +30,8 @@ _CLOSED, _ARRIVED, _LEFT = 1e-13, 1e-11, 1e-11
 # count for the rank, and values below _ZERO are rounding errors. A value between them means that
 # the rank changes nearby.
 _REGULAR, _ZERO = 1e-6, 1e-10
+# Least size of J in units of equal inertia: if J is smaller, nothing moves the constrained frames.
+_LEAST = 1e-3
 
 # A rank is constant nearby if no motion on the manifold accelerates redundant rows by more than
 # this fraction of the motion's own accelerations.
@@ -203,10 +205,16 @@ class Closure:
         columns = np.sqrt(mass / M.diagonal())
         row_scale = self._row_scale(q)
         U, sizes, Vt = np.linalg.svd(row_scale[:, None] * J * columns)
-        relative = sizes / sizes[0]
+        relative = sizes / max(sizes[0], _LEAST)
         rank = int(np.count_nonzero(relative > _REGULAR))
         if rank < len(relative) and relative[rank] > _ZERO:
             raise self._singular(relative[rank])
+        if not rank:
+            titles = listed(item.title for item in self.constraints.items)
+            raise ConstraintError(
+                f"constraints {titles} have no effect, because no motion of "
+                f"'{self.state.robot.name}' moves their frames relative to each other; remove them"
+            )
         space = TangentSpace(
             rank=rank,
             jacobian=J,

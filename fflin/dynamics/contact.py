@@ -48,6 +48,13 @@ class Contact:
     forces_by_x: Array
     forces_by_u: Array
 
+    def added_to(self, wrenches: pin.StdVec_Force | None) -> pin.StdVec_Force:
+        """Return the wrenches of the constraints plus other wrenches on the joints."""
+        total = pin.StdVec_Force(self.wrenches)
+        for joint, wrench in enumerate(wrenches or ()):
+            total[joint] += wrench
+        return total
+
     def require_determinate(self, names: Sequence[str], components: Array) -> None:
         """Raise an error if components of lam depend on internal stresses of redundant rows.
 

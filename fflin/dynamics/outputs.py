@@ -15,8 +15,8 @@ from fflin.base.validation import Array
 from fflin.dynamics.coordinates import PIN_ANGULAR, PIN_LINEAR
 from fflin.dynamics.state import StateMap
 from fflin.robot.joints import ROOT, Carried, by_joint, find_frame
-from fflin.robot.robot import Robot
 from fflin.robot.outputs import BasePose, FullState, JointOutput, JointPositions, Output
+from fflin.robot.robot import Robot
 
 _LOCAL = pin.ReferenceFrame.LOCAL
 

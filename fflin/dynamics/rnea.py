@@ -207,8 +207,6 @@ class AccelerationDerivatives(NamedTuple):
     slopes: Array
     by_u: Array  # D_u (.., 6 + n, nu) of (3.3), for u in base axes
     gravity: Array  # (.., 3) [m/s^2] in base axes; `GravityGradient.fall` in orbit
-    # constraint forces of a robot with constraints, for which c and its derivatives are constrained
-    contact: Contact | None = None
 
     @property
     def by_turn(self) -> Array:
@@ -240,7 +238,8 @@ class AccelerationDerivatives(NamedTuple):
 class Accelerations:
     """Solution c of the equations of motion ``M c + b = B_u u`` (3.1), with its derivatives.
 
-    Springs and dampers add their forces to the right side.
+    Springs and dampers add their forces to the right side. If the robot has constraints, their
+    `closure` must be given. The accelerations and derivatives are then constrained.
     """
 
     def __init__(
@@ -253,6 +252,8 @@ class Accelerations:
         robot = state.robot
         self._state, self._actuation, self._data = state, actuation, data
         self._contacts = ContactSolver(closure) if closure is not None else None
+        # Constraint forces at the last point of `rates`; None for a robot without constraints.
+        self.contact: Contact | None = None
         self._model = robot.model
         self._nv = 6 + robot.n
         self.inertia = Inertia(state, data)
@@ -315,21 +316,15 @@ class Accelerations:
             bias = bias - turning
         if tide:
             bias = bias - pull
-        force = u
-        if not actuation.default:
-            force = columns.dot(u)
+        force = u if actuation.default else columns.dot(u)
         force = force - state.forces(bias)
         if self._resists:
             force[6:] += self._springs.force(state.joint_positions(q), nu[6:])
         c = inverse.dot(force)
-        contact = None
         if self._contacts is not None:
-            contact = self._contacts.contact(q, v, nu, c, inverse)
-            c = contact.c
-            loads = pin.StdVec_Force(contact.wrenches)
-            for joint, wrench in enumerate(wrenches or ()):
-                loads[joint] += wrench
-            wrenches = loads
+            self.contact = self._contacts.contact(q, v, nu, c, inverse)
+            c = self.contact.c
+            wrenches = self.contact.added_to(wrenches)
 
         # Derivatives of M c + b - B_u u minus the forces of springs and dampers (3.3), (7.1). The
         # wrenches of inputs are constant in the frames of their links. So the derivatives of RNEA
@@ -342,24 +337,28 @@ class Accelerations:
             by_q, by_v = by_q - turning_by_q, by_v - turning_by_v
         if tide:
             by_q = by_q - pull_by_q
-        state.project_transposed(by_q, self._by_q_m)
-        state.project_transposed(by_v, self._by_nu)
-        self._by_linear[:] = 0.0
-        if self._resists:
-            self._of_stiffness += self._springs.stiffness
-            self._of_damping += self._springs.damping
+        self._write_force_slopes(by_q, by_v)
         if tide:
             by_spin = self._by_nu[ANGULAR].T.dot(skew(tide.spin))
             self._by_turn[:] = (by_spin - state.forces(pull_by_turn)).T
         np.negative(inverse, self._minus_inverse).dot(self._force_slopes, slopes)
         if not actuation.default:
             inverse.dot(columns, by_u)
-        if self._contacts is not None and contact is not None:
+        if self._contacts is not None and self.contact is not None:
             self._contacts.differentiate(
-                contact, q, v, nu, -self._minus_inverse, slopes, by_u
+                self.contact, q, v, nu, -self._minus_inverse, slopes, by_u
             )
         gravity = tide.fall if tide else state.gravity(q)
-        return AccelerationDerivatives(c, slopes, by_u, gravity, contact)
+        return AccelerationDerivatives(c, slopes, by_u, gravity)
+
+    def _write_force_slopes(self, by_q: Array, by_v: Array) -> None:
+        """Write the derivatives (nv, nv) of RNEA, with springs and dampers, in state order."""
+        self._state.project_transposed(by_q, self._by_q_m)
+        self._state.project_transposed(by_v, self._by_nu)
+        self._by_linear[:] = 0.0
+        if self._resists:
+            self._of_stiffness += self._springs.stiffness
+            self._of_damping += self._springs.damping
 
     def _gyroscopic(
         self, q: Array, v: Array, wrenches: pin.StdVec_Force | None

@@ -161,7 +161,14 @@ class Route:
         A, B = self._assembled(dynamics)
         more = [self._assembled(other) for other in others]
         lower = B[nv:]
-        mobility = np.sqrt(np.einsum("ik,ij,jk->k", lower, self.M, lower))
+        free = lower
+        if self.state.robot.constraints:
+            # An input without effect on the constrained robot has an effect on the free one.
+            data = self.state.robot.create_data()
+            forces = self.aba.actuation.columns(data, self.q)
+            chart = self.state.chart(self.q)
+            free = inverse @ self.state.to_frame(chart, forces)
+        mobility = np.sqrt(np.einsum("ik,ij,jk->k", free, self.M, free))
         self.input_mobility = np.where(mobility > 0.0, mobility, 1.0)
 
         sums_A, sums_B = self._sums(dynamics)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fflin.base import html
+from fflin.base.errors import InputError
 from fflin.base.tables import folded, grid
 from fflin.base.validation import Array, instance, share
 from fflin.dynamics.coordinates import ANGULAR, LINEAR
@@ -241,10 +242,10 @@ def _comparisons(robot: Robot, lin: LinearModel) -> Iterator[Row]:
 def _require_independent(robot: Robot, lin: LinearModel) -> None:
     """Raise `InputError` if a model does not have as many states as the robot's motions."""
     expected = StateMap(robot).nx - 2 * lin.rank
-    if lin.rank == 0 or len(lin.state_names) != expected:
+    if len(lin.state_names) != expected:
         raise InputError(
-            f"the model has {len(lin.state_names)} states and the rank {lin.rank} of constraints, "
-            f"but '{robot.name}' has constraints; make the model with fflin.linearize"
+            f"the model has {len(lin.state_names)} states and constraints of rank {lin.rank}, but "
+            f"'{robot.name}' then has {expected} states; make the model with fflin.linearize"
         )
 
 

@@ -21,7 +21,7 @@ from fflin.dynamics.outputs import Measuring
 from fflin.dynamics.state import StateMap
 from fflin.linear.aba_route import Route, inertia_matrix
 from fflin.linear.model import Certificate, LinearModel
-from fflin.linear.nonlinear import Nonlinear, jacobians
+from fflin.linear.nonlinear import Nonlinear, jacobian, jacobians
 from fflin.linear.scales import (
     DIFFERENCE_TOLERANCE,
     EPS,
@@ -41,6 +41,13 @@ _STEP = 2e-3
 
 # Newton's method on the manifold: number of steps, and step at which it ends.
 _STEPS, _ARRIVED = 12, 1e-13
+
+# Step of the differences from which the steps of the other differences follow.
+_ROUGH = 1e-6
+
+# Rounding errors of the two computations, relative to the largest entry of a row. Pinocchio's
+# proximal solver has an error of this size if rows are redundant.
+_ROUNDING, _PROXIMAL = 1e-13, 1e-11
 
 # Largest residual [m, rad] of a closed operating point.
 _CLOSED = 1e-9
@@ -126,12 +133,14 @@ class ConstrainedReferences:
         self._manifold = OnManifold(state, lin)
         self._kept = self._manifold.kept
         self._groups = groups_of(lin.state_names)
-        self._inputs = self.route.aba.actuation.groups
+        inputs = self.route.aba.actuation.groups
+        self._inputs = {key: np.array(x, dtype=np.intp) for key, x in inputs.items()}
+        self._differentiated = False
         self._nonlinear = Nonlinear(self.route.aba, replace(lin, x0=self._manifold.x0))
         self._measuring = Measuring(state, lin.q)
         self._units = self.route.units[self._kept]
         self._input_units = 1.0 / self.route.input_mobility
-        self._by_motion()
+        self._differentiate_states()
         self._by_pinocchio()
 
     def _rates(self, point: Array) -> Array:
@@ -158,64 +167,66 @@ class ConstrainedReferences:
     def _measures_forces(self) -> bool:
         return any(x.WORD == "force" for x in self.route.state.robot.outputs)
 
-    def _by_motion(self) -> None:
-        """Differentiate the nonlinear motion, the outputs and all states on the manifold."""
-        lin, manifold = self._lin, self._manifold
+    def _differentiate_states(self) -> None:
+        """Differentiate all states on the manifold with respect to the independent states."""
+        manifold = self._manifold
         d = len(self._kept) // 2
         z0 = manifold.z0
-        curved = np.arange(2 * d) < d
-        rough = 1e-6 * np.ones(2 * d)
+        self._curved = np.arange(2 * d) < d
         # A rough T gives the steps: no coordinate moves by more than _STEP.
-        rough_T = jacobians(manifold.states, z0, rough, curved)[0]
-        steps = self._steps(rough_T)
-        T, again = jacobians(manifold.states, z0, steps, curved)
-        self.T = T
-        self._T_error = np.max([np.abs(x - T) for x in again], axis=0)
-        point = np.concatenate((z0, lin.u0))
+        rough = jacobian(manifold.states, z0, np.full(2 * d, _ROUGH), self._curved)
+        self._steps = self._chosen_steps(rough)
+        self.T, again = jacobians(manifold.states, z0, self._steps, self._curved)
+        self._T_error = np.max([np.abs(x - self.T) for x in again], axis=0)
+
+    def _by_motion(self) -> None:
+        """Differentiate the nonlinear motion and the outputs on the manifold, once."""
+        if self._differentiated:
+            return
+        self._differentiated = True
+        lin, count = self._lin, len(self._kept)
+        point = np.concatenate((self._manifold.z0, lin.u0))
         acceleration = np.abs(self.route.accelerations.rates / self.route.base_mobility)
         of_inputs = max(1.0, float(acceleration.max())) * self._input_units
-        all_steps = np.concatenate((steps, of_inputs))
-        is_curved = np.append(curved, np.zeros(len(lin.u0), dtype=bool))
+        steps = np.concatenate((self._steps, of_inputs))
+        is_curved = np.append(self._curved, np.zeros(len(lin.u0), dtype=bool))
         values = self._rates(point[None])[0]
-        jacobian, repetitions = jacobians(self._rates, point, all_steps, is_curved)
-        count = 2 * d
-        rounding = ULPS * EPS * self._terms()[:, None] / all_steps
+        slopes, repetitions = jacobians(self._rates, point, steps, is_curved)
+        rounding = ULPS * EPS * self._terms()[:, None] / steps
         rounding += sampled(
-            self._groups,
-            jacobian[:count],
-            [x[:count] for x in repetitions],
-            self._units,
+            self._groups, slopes[:count], [x[:count] for x in repetitions], self._units
         )
-        A, B = np.split(jacobian[:count], [count], axis=1)
+        rounding += _noise(slopes[:count], self._all_units, _ROUNDING)
+        A, B = np.split(slopes[:count], [count], axis=1)
         self.f0 = values[:count]
         self._differences = (
             self._reference(A, rounding[:, :count], self._groups, self._units),
             self._reference(B, rounding[:, count:], self._inputs, self._input_units),
         )
-        ny = len(lin.y0)
-        outputs = {k: slice(k, k + 1) for k in range(ny)}
-        ones = np.ones(ny)
-        of_y = jacobian[count:]
-        size = (
-            np.abs(values[count:, None]) + np.abs(of_y) @ np.abs(point)[:, None] + 1.0
-        )
-        error = ULPS * EPS * size / all_steps
-        error += sampled(outputs, of_y, [x[count:] for x in repetitions], ones)
-        scale = np.maximum(np.abs(of_y), np.abs(of_y).max(axis=0, initial=0.0))
-        scale = np.where(scale > 0.0, scale, 1.0)
-        whole = Reference(of_y, scale, error)
-        self._C, self._D = (
-            Reference(*(array[:, part] for array in whole))
-            for part in (slice(count), slice(count, None))
-        )
         self._y0 = values[count:]
+        size = np.abs(self._y0) + np.abs(slopes[count:]) @ np.abs(point) + 1.0
+        by_y = slopes[count:]
+        rows = {k: slice(k, k + 1) for k in range(len(by_y))}
+        ones = np.ones(len(by_y))
+        error = ULPS * EPS * size[:, None] / steps
+        error += sampled(rows, by_y, [x[count:] for x in repetitions], ones)
+        largest = np.abs(by_y).max(axis=0, initial=0.0)
+        scale = np.broadcast_to(np.where(largest > 0.0, largest, 1.0), by_y.shape)
+        columns = slice(count), slice(count, None)
+        self._C, self._D = (
+            Reference(by_y[:, part], scale[:, part], error[:, part]) for part in columns
+        )
+
+    @property
+    def _all_units(self) -> Array:
+        return np.concatenate((self._units, self._input_units))
 
     def _terms(self) -> Array:
         """Return the magnitudes (2 d,) of the terms of dz/dt."""
         terms: Array = self.route.rate_terms(np.zeros(len(self.route.M)))[self._kept]
         return terms
 
-    def _steps(self, T: Array) -> Array:
+    def _chosen_steps(self, T: Array) -> Array:
         """Return the steps (2 d,) of the independent states."""
         state = self.route.state
         d = len(self._kept) // 2
@@ -251,8 +262,12 @@ class ConstrainedReferences:
         size = np.abs(T)
         A, B = route.A, route.B
         rounding = A.rounding[kept] @ size + np.abs(A.value[kept]) @ self._T_error
-        self.A = Reference(A.value[kept] @ T, A.scale[kept] @ size, rounding)
-        self.B = Reference(B.value[kept], B.scale[kept], B.rounding[kept])
+        value = A.value[kept] @ T
+        whole = np.hstack((value, B.value[kept]))
+        noise = _noise(whole, self._all_units, _PROXIMAL)
+        of_A, of_B = np.split(noise, [len(kept)], axis=1)
+        self.A = Reference(value, A.scale[kept] @ size, rounding + of_A)
+        self.B = Reference(B.value[kept], B.scale[kept], B.rounding[kept] + of_B)
 
     @property
     def _has_pinocchio(self) -> bool:
@@ -261,9 +276,9 @@ class ConstrainedReferences:
 
     def certificate(self, lin: LinearModel) -> Certificate:
         """Return the certificate of a model: its errors, and properties of its inertia."""
-        A, B = self._differences
-        if self._has_pinocchio:
-            A, B = self.A, self.B
+        if not self._has_pinocchio:
+            self._by_motion()
+        A, B = (self.A, self.B) if self._has_pinocchio else self._differences
         scale = 1.0 / np.sqrt(lin.M.diagonal())
         scaled = scale[:, None] * lin.M * scale
         residual = scaled @ np.linalg.inv(scaled) - np.eye(len(scaled))
@@ -277,6 +292,7 @@ class ConstrainedReferences:
 
     def rows(self, lin: LinearModel) -> Iterator[Row]:
         """Compare a model that has this operating point."""
+        self._by_motion()
         if self._has_pinocchio:
             yield from self._blocks(
                 "constrained derivatives", lin, self.A, self.B, DIFFERENCE_TOLERANCE
@@ -318,6 +334,15 @@ class ConstrainedReferences:
             for column, indices in self._inputs.items():
                 block = of_B[np.ix_(rows, indices)]
                 yield worst(test, f"B[{row}, {column}]", block, least)
+
+
+def _noise(x: Array, column_units: Array, fraction: float) -> Array:
+    """Return rounding errors that are a fraction of the largest entry of each row of x.
+
+    Entries of a row are compared in units (k,) of the columns.
+    """
+    largest = np.abs(x * column_units).max(axis=1, initial=0.0)
+    return fraction * np.outer(largest, 1.0 / column_units)
 
 
 def groups_of(names: tuple[str, ...]) -> dict[str, Indices]:

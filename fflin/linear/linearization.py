@@ -385,7 +385,14 @@ class Linearizer:
             x0 = state.compose(chart, r_b, state.joint_positions(q), nu)
             point = q, v, nu, u_base
             seen = output_equations(
-                ready.sensing, actuation, self._data, chart, rates, x0, point
+                ready.sensing,
+                actuation,
+                self._data,
+                chart,
+                rates,
+                x0,
+                point,
+                self._accelerations.contact,
             )
             _require_finite(*seen.values())
         rate = assemble(actuation, chart, nu, u_base, rates, A, moving=ready.moving)
@@ -395,11 +402,11 @@ class Linearizer:
         made = {"A": A, "B": B, "q": q, "v": v, "u0": u, self._rate: rate} | seen
         for array in made.values():
             array.setflags(write=False)
-        if self._reducer is None or rates.contact is None:
+        contact = self._accelerations.contact
+        if self._reducer is None or contact is None:
             return LinearModel(self._fields | made)
         whole = LinearModel(self._fields | made)
-        space = rates.contact.space
-        reduction = self._reducer.reduction(chart, q, v, nu, space)
+        reduction = self._reducer.reduction(chart, q, v, nu, contact.space)
         fields = reduced_fields(state, reduction, whole)
         return LinearModel(
             {**self._fields, "_computed": {}, **made, **fields}

@@ -10,6 +10,7 @@ import pinocchio as pin
 
 from fflin.base.rotation import product, skew
 from fflin.base.validation import Array
+from fflin.dynamics.contact import Contact
 from fflin.dynamics.coordinates import ANGULAR, LINEAR, Chart, times
 from fflin.dynamics.outputs import Sensing
 from fflin.dynamics.rnea import AccelerationDerivatives
@@ -36,7 +37,6 @@ def assemble(
     state = actuation.state
     g = state.groups
     nv = state.nx // 2
-    anchored = state.robot.anchored
     lower = rates.slopes
     omega_in_reference, v_in_reference = state.axes
     w, v = nu[..., ANGULAR], nu[..., LINEAR]
@@ -69,14 +69,7 @@ def assemble(
     # Rotate the rows of the accelerations from base axes to the axes of the frame.
     if not chart.at_reference:
         chart.turn_rows(state.in_reference, lower)  # (4.6)
-        if omega_in_reference:
-            chart.turn_rows((ANGULAR,), rates.by_nu.mT)
-        if anchored:
-            # Otherwise, the columns of the base's position and linear velocity are zero before
-            # (4.5) below.
-            chart.turn_rows((LINEAR,), lower.mT)
-            if v_in_reference:
-                chart.turn_rows((LINEAR,), rates.by_nu.mT)
+        _turn_columns(state, chart, rates)
         chart.turn_rows(state.in_reference, rates.by_u)  # (4.7)
         chart.turn_rows(actuation.held, rates.by_u.mT)
     if state.falls:
@@ -98,6 +91,20 @@ def assemble(
     if not chart.at_reference:
         chart.turn_rows(state.in_reference, f0[..., nv:, None])
     return f0
+
+
+def _turn_columns(
+    state: StateMap, chart: Chart, rates: AccelerationDerivatives
+) -> None:
+    """Convert the columns of the base in the accelerations' derivatives to the frame, in place."""
+    omega_in_reference, v_in_reference = state.axes
+    if omega_in_reference:
+        chart.turn_rows((ANGULAR,), rates.by_nu.mT)
+    if state.robot.anchored:
+        # For other robots, the columns of the base's position and linear velocity are zero.
+        chart.turn_rows((LINEAR,), rates.slopes.mT)
+        if v_in_reference:
+            chart.turn_rows((LINEAR,), rates.by_nu.mT)
 
 
 def _rotation_derivative(
@@ -169,10 +176,12 @@ def output_equations(
     rates: AccelerationDerivatives,
     x0: Array,
     point: Sequence[Array],
+    contact: Contact | None = None,
 ) -> dict[str, Array]:
     """Return C, D and y0 at one point.
 
     `point` consists of q and v in Pinocchio's order, and of nu (6 + n,) and u (nu,) in base axes.
+    `contact` contains the constraint forces, if there are any.
     """
     state = sensing.state
     a = rates.c.copy()
@@ -199,8 +208,7 @@ def output_equations(
             by_position += by_rate.dot(rates.by_position)
         by_u = by_rate.dot(rates.by_u)
         for rows, components in sensing.forces:
-            assert rates.contact is not None
-            contact = rates.contact
+            assert contact is not None
             contact.require_determinate(sensing.names[rows], components)
             by_x = components.dot(contact.forces_by_x)
             sensed.y[rows] = components.dot(contact.forces)
