@@ -179,8 +179,8 @@ class Constrained:
         ]
         if titles:
             yield (
-                f"the rows of the constraints are redundant; the forces of {listed(titles)} are "
-                "not determinate, and the smallest are recorded"
+                f"the constraints are redundant: the forces of {listed(titles)} are not "
+                "determinate, so the smallest are recorded"
             )
 
     def in_kernel(self, tree: Tree, nq: int) -> kernel.Constraints:
