@@ -214,11 +214,13 @@ class Constrained:
             basis=np.zeros(r * size),
             triangle=np.zeros(r * r),
             error=np.zeros(r),
+            roots=np.zeros(size),
             change=np.zeros(size),
             multipliers=np.zeros(r),
             forces=np.zeros(r),
             least=np.ones(1),
             at=np.zeros(nq),
+            packed=np.zeros(len(tree.path)),
         )
 
     def _correction(self, q: Array, J: Array, error: Array) -> Correction:

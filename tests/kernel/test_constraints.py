@@ -80,8 +80,9 @@ def test_corrections_end_on_the_constraints_and_move_loops_without_momentum(kind
     of_kernel = point.q, plant.state.spread(point.nu)
     of_python = plant.constrained.close(q, v)
     for new_q, new_v in (of_kernel, of_python):
-        assert np.abs(rows.residual(new_q)).max() < 1e-14
-        assert np.abs(rows.jacobian(new_q) @ new_v).max() < 1e-13
+        # The kernel corrects nothing whose squared errors add up to less than 1e-24.
+        assert np.abs(rows.residual(new_q)).max() < 1e-12
+        assert np.abs(rows.jacobian(new_q) @ new_v).max() < 1e-12
         # Neither engine moves further than the displacement, up to the ratio of inertias.
         assert np.abs(pin.difference(model, q, new_q)).max() < 1e-4
     # The engines use the inertia at different configurations, 1e-6 apart.
