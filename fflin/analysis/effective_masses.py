@@ -9,7 +9,7 @@ from fflin.base import html
 from fflin.base.errors import InputError
 from fflin.base.tables import counted, folded, grid
 from fflin.base.validation import Array, FrozenArrays, instance
-from fflin.dynamics.coordinates import ANGULAR, LINEAR
+from fflin.dynamics.coordinates import ANGULAR, LINEAR, refuse_constraints
 from fflin.dynamics.state import StateMap
 from fflin.linear.model import LinearModel
 
@@ -155,6 +155,8 @@ def effective_masses(lin: LinearModel) -> EffectiveMasses:
     instance("lin", lin, LinearModel, "a fflin.LinearModel")
     lin.require_unchanged()
     robot = lin._robot
+    if robot is not None:
+        refuse_constraints(robot, "effective masses")
     if robot is None or len(lin.M) != 6 + robot.n:
         raise InputError(
             "effective masses need the springs of the robot, which a reduced model and a model "

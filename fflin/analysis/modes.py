@@ -459,6 +459,9 @@ def energies_of(
     moved = shapes[:, : shapes.shape[1] // 2].T
     if isinstance(lin, ReducedModel):
         moved = lin.T[: len(lin.T) // 2, : len(moved)] @ moved
+    if lin._all_states is not None:
+        rows, columns = lin._all_states.shape
+        moved = lin._all_states[: rows // 2, : columns // 2] @ moved
     # The kinetic energy is computed with displacements, in base axes, instead of velocities. In a
     # mode, the velocities are the displacements times the pole, so the fractions are the same.
     moved = np.vstack((chart.J @ moved[:3], chart.R.T @ moved[3:6], moved[6:]))

@@ -75,13 +75,19 @@ def conserved(lin: LinearModel) -> ConservedInMotion:
             f"the model of '{lin.robot}' is from a file and its operating point moves, so its "
             "conserved momenta are unknown; use the model that linearize returns for the robot"
         )
-    if robot.orbit or len(lin.A) != 12 + 2 * robot.n:
+    count = 12 + 2 * robot.n - 2 * lin.rank
+    if robot.orbit or robot.anchored or len(lin.A) != count:
         return empty
     measured = robot.replace(outputs=[Momentum(), CenterOfMass()])
     if lin.moving:
-        linearizer = Linearizer(measured, moving=True)
+        linearizer = Linearizer(measured, moving=True, independent=lin.independent)
     else:
-        linearizer = Linearizer(measured, frame=lin.frame, reference=lin.reference)
+        linearizer = Linearizer(
+            measured,
+            frame=lin.frame,
+            reference=lin.reference,
+            independent=lin.independent,
+        )
     # The wrench of each input on the whole robot, with exact zeros.
     wrenches = linearizer.prepared.actuation.columns(robot.create_data(), lin.q)[:6]
     if wrenches[LINEAR].any():

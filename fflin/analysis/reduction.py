@@ -24,7 +24,7 @@ from fflin.base.errors import InputError, StabilizabilityError, listed
 from fflin.base.names import input_keys
 from fflin.base.tables import counted, folded
 from fflin.base.validation import Array, Indices, Mask, frozen
-from fflin.dynamics.coordinates import ANGULAR, LINEAR
+from fflin.dynamics.coordinates import ANGULAR, LINEAR, refuse_constraints
 from fflin.dynamics.state import StateMap, selection
 from fflin.linear.files import given
 from fflin.linear.model import Delay, LinearModel
@@ -326,6 +326,7 @@ def generalized_jacobian(
     (6, 3)
     """
     state = StateMap(robot)
+    refuse_constraints(robot, "generalized Jacobians")
     q = robot.neutral() if q is None else robot.checked_configuration(q)
     model = robot.model
     data = robot.create_data()

@@ -23,7 +23,12 @@ from fflin.batch.configurations import Configurations, checked_points, checked_r
 from fflin.batch.files import FileStore, MemoryStore, is_constant, output_path
 from fflin.batch.linear_batch import AT_ROOT, TEXTS, LinearBatch
 from fflin.batch.run import Execution, Progress, Rows, run_chunks
-from fflin.dynamics.coordinates import SMALLEST_Q0, Chart, ReferenceChart
+from fflin.dynamics.coordinates import (
+    SMALLEST_Q0,
+    Chart,
+    ReferenceChart,
+    refuse_constraints,
+)
 from fflin.dynamics.rnea import AccelerationDerivatives
 from fflin.kernel.compiled import compiles
 from fflin.kernel.limits import Task, reason_against
@@ -157,6 +162,7 @@ def sweep(
     >>> len(batch), batch[3].B.shape
     (10, (18, 9))
     """
+    refuse_constraints(robot, "sweeps")
     how = Execution(executor, workers, threads, chunk, progress)
     path = None if out is None else output_path(out)
     linearizer = Linearizer(robot, frame=frame, reference=reference, moving=moving)

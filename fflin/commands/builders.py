@@ -113,6 +113,9 @@ def load_robot(arguments: Namespace) -> fflin.Robot:
             robot = robot.replace(inputs=new_inputs)
     if outputs := getattr(arguments, "output", None):
         given["outputs"] = outputs
+    if welds := getattr(arguments, "weld", None):
+        added = [fflin.Weld(frame, to) for frame, to in welds]
+        given["constraints"] = [*robot.constraints, *added]
     return robot.merged(given)
 
 
@@ -181,6 +184,10 @@ def state_of(
     v = None
     if state["velocity"]:
         v = fflin.velocity(robot, state["velocity"])
+    if robot.constraints:
+        from fflin.dynamics.closure import closed_point
+
+        return closed_point(robot, q, v)
     return q, v
 
 

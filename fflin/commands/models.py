@@ -98,6 +98,17 @@ def info(arguments: Namespace) -> Report:
         rows.append(row)
     table = grid(cut(rows, "see --json"), "ll")
     text = f"{robot_info(robot, str(properties))}\n\n{table}"
+    constraints: dict[str, object] = {}
+    if robot.constraints:
+        from fflin.dynamics.closure import redundancy
+
+        found = redundancy(robot, q)
+        lines = [f"constraints: {found}", *map(str, robot.constraints)]
+        text += f"\n\n{folded(lines)}"
+        constraints = {
+            "constraints": [item.title for item in robot.constraints],
+            **found._asdict(),
+        }
     notes = robot.notes
     if remark := ideal_inputs(robot):
         notes = (*notes, remark)
@@ -113,6 +124,7 @@ def info(arguments: Namespace) -> Report:
         "input_units": inputs.units,
         "limits": limits,
         "notes": notes,
+        **constraints,
     }
     return Report(robot.name, result, text)
 

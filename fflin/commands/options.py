@@ -16,7 +16,7 @@ TRAJECTORY, CONTROLLER, SIMULATION = "trajectory", "controller", "simulation"
 _POSE = "joint rpy position velocity"
 _TARGET = "target-joint target-rpy target-position target-velocity"
 _INPUTS = "effort equilibrium tilt relative-equilibrium"
-_SYSTEM = "lock xacro orbit stiffness damping gravity passive inputs output"
+_SYSTEM = "lock weld xacro orbit stiffness damping gravity passive inputs output"
 _TRAJECTORY = "trajectory hold strict"
 _WEIGHTS = "weights q r bryson sample reduce wheel-speeds"
 _SCENE = "scene tool follow"
@@ -44,7 +44,7 @@ OPTIONS: dict[str, dict[str, str]] = {
     "view": {
         "": "ROBOT",
         POINT: _POSE,
-        ROBOT: "lock xacro orbit",
+        ROBOT: "lock weld xacro orbit",
         OUTPUT: f"frame {_SCENE} no-open port",
     },
     "linearize": {
@@ -192,6 +192,8 @@ ABOUT: dict[str, str] = {
     "pose at the operating point (base, default), or the world frame (world)",
     "lock": "lock a joint at VALUE [rad|m]. Without VALUE, the joint is locked at its neutral "
     "position. In every option, NAME can also be a pattern such as 'hinge_*'",
+    "weld": "weld a frame to the frame TO or, without TO, to inertial space, in the pose that they "
+    "have at the operating point. The welds are added to the constraints in robot.toml",
     "xacro": "value of an argument of a xacro file",
     "orbit": "circular orbit at an altitude [m] above a central body: earth (default), moon, mars "
     "... The world is then the orbital frame. `none` removes the orbit of a robot file",
@@ -206,7 +208,7 @@ ABOUT: dict[str, str] = {
     "output": "outputs of the model: state (default), base, joints, rates, joints:NAME, rates:NAME "
     "(a joint or a pattern), com, momentum, frame:NAME (pose and velocity), pose:NAME, "
     "velocity:NAME, gyroscope:NAME, accelerometer:NAME, relative:NAME:TO (frame NAME relative to "
-    "frame TO)",
+    "frame TO), force:NAME (of the constraint NAME)",
     "trajectory": f"use the trajectory in FILE: {_SAVED} or .csv; see "
     "fflin.Trajectory.load. --frame states the axes in which FILE gives base velocities and "
     "wrenches. The default of --frame is the frame named in FILE or, if there is none, local",

@@ -106,6 +106,16 @@ def lock(text: str) -> tuple[str, float | None]:
     return text, None
 
 
+def weld(text: str) -> tuple[str, str | None]:
+    """Read FRAME=TO or FRAME; return (frame, to), or (frame, None) for inertial space."""
+    frame, equals, to = text.partition("=")
+    if not frame or (equals and not to):
+        raise argparse.ArgumentTypeError(
+            f"'{text}' is not FRAME or FRAME=TO, such as tool_left=tool_right"
+        )
+    return frame, to or None
+
+
 def xacro_argument(text: str) -> tuple[str, str]:
     """Read NAME=VALUE, the value of an argument of a xacro file."""
     name, equals, value = text.partition("=")
@@ -235,6 +245,7 @@ FORMS: dict[str, Form] = {
     "show": _NAMES,
     "output": many(str, "SPEC"),
     "lock": many(lock, "NAME[=VALUE]"),
+    "weld": many(weld, "FRAME[=TO]"),
     "xacro": many(xacro_argument, "NAME=VALUE"),
     "vary": many(parameter_range, "NAME=RANGE", required=True),
     "grid": many(grid_axis, "JOINT=LO:HI:N"),

@@ -257,6 +257,7 @@ def _felt(lin: LinearModel, keys: list[str]) -> dict[str, Array] | None:
         frame=lin.frame,
         reference=lin.reference,
         moving=lin.moving,
+        independent=lin.independent,
     )
     names = input_keys(pushed)
     return {key: pushed.D[:, names.index(key)] for key in keys}

@@ -44,6 +44,10 @@ _LEAST_REACH = 1e-3
 # most this times the entry i of D (10.7), both about the centre of mass.
 _IDLE = 1e-12
 
+# Constraints carry an input if its weight is at most the first value times the largest weight. They
+# carry a combination of inputs of a block if its squared effect is at most the second value.
+_CARRIED, _CARRIED_TOGETHER = 1e-20, 1e-12
+
 # Nor do the inputs have an effect in a direction in which the eigenvalue of S R^-1 S', in units of
 # D, is below this.
 _NO_EFFECT = 1e-9
@@ -393,6 +397,9 @@ def _input_costs(lin: LinearModel, S: Array, D: Array) -> Array:
     The weight of an input is s' D^-1 s (10.7), with the generalised forces s of the input.
     """
     cost: Array = (S * np.linalg.solve(D, S)).sum(axis=0)
+    if lin.dependent:
+        # Constraints may carry an input entirely. Its gain is zero at every weight.
+        cost[cost <= _CARRIED * cost.max()] = cost.max()
     if not cost.all():
         raise InputError(
             f"input {lin.input_names[int(cost.argmin())]} has no effect on any coordinate; remove "
@@ -422,7 +429,12 @@ def _reference_effect(lin: LinearModel, S: Array, D: Array) -> Array:
     for block in blocks:
         forces = S[:, block]
         weight = forces.T @ np.linalg.solve(D, forces)
-        effect += forces @ np.linalg.solve(weight, forces.T)
+        if lin.dependent:
+            # Constraints may carry some combinations of the inputs.
+            inverse = np.linalg.pinv(weight, _CARRIED_TOGETHER, hermitian=True)
+            effect += forces @ inverse @ forces.T
+        else:
+            effect += forces @ np.linalg.solve(weight, forces.T)
     return effect
 
 

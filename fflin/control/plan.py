@@ -18,7 +18,7 @@ from fflin.control.optimal.plan_search import Search, excess
 from fflin.control.optimal.shooting import Point, Shooting
 from fflin.control.weights import Weight, weight
 from fflin.dynamics import points
-from fflin.dynamics.coordinates import refuse_orbit
+from fflin.dynamics.coordinates import refuse_constraints, refuse_orbit
 from fflin.dynamics.state import Actuation, StateMap
 from fflin.linear.model import LinearModel
 from fflin.linear.optimality import STATIONARY, Optimality
@@ -154,6 +154,7 @@ def plan(
     """
     state = StateMap(robot)
     refuse_orbit(robot, "plans")
+    refuse_constraints(robot, "plans")
     start = points.point_of(state, x0, q0, v0, partial(points.start_of, robot))
     end = _goal_point(state, goal)
     knots, duration = whole("knots", knots, 3, 10_000), number("duration", duration)

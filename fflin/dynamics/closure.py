@@ -6,7 +6,7 @@ Displacements and velocities are in state order (angular, linear, joints), in ba
 from __future__ import annotations
 
 import warnings
-from typing import NamedTuple
+from typing import NamedTuple, overload
 
 import numpy as np
 import pinocchio as pin
@@ -254,6 +254,76 @@ class Closure:
 def closure_of(state: StateMap) -> Closure | None:
     """Return the closure of a robot's constraints, or None if it has none."""
     return Closure(state) if state.robot.constraints else None
+
+
+def closed_point(robot: Robot, q: Array, v: Array | None) -> tuple[Array, Array | None]:
+    """Return the closed point nearest to q and v, and warn if q was off a constraint.
+
+    Commands call it, because their point is given by single joints and not as a whole.
+    """
+    closure = Closure(StateMap(robot))
+    closure.constraints.settle(q)
+    distance, text = closure.distance(q)
+    if distance > _NEAR:
+        warnings.warn(
+            f"the point is off {text}; the nearest closed configuration is used instead",
+            FflinWarning,
+            stacklevel=2,
+        )
+    if v is None:
+        return closure.nearest(q), None
+    q, v = closed(robot, q, v)
+    return q, v
+
+
+class Redundancy(NamedTuple):
+    """Numbers of rows and independent rows of a robot's constraints, and what they leave free."""
+
+    rows: int
+    rank: int
+    free: int  # number of velocities that the constraints permit
+    # names of the constraints that the others imply, at least in part
+    redundant: tuple[str, ...]
+
+    def __str__(self) -> str:
+        text = (
+            f"{self.rows} rows of rank {self.rank}, {self.free} velocities remain free"
+        )
+        if self.redundant:
+            text += (
+                f"; {self.rows - self.rank} redundant rows in {', '.join(self.redundant)}: forces "
+                "there may depend on internal stresses"
+            )
+        return text
+
+
+def redundancy(robot: Robot, q: Array) -> Redundancy:
+    """Return the rank and the redundancy of the constraints of a robot at a closed q (nq,)."""
+    closure = Closure(StateMap(robot))
+    closure.constraints.settle(q)
+    space = closure.tangent(q)
+    titles = [
+        pair.constraint.title
+        for pair in closure.constraints.pairs
+        if np.abs(space.redundant[:, pair.rows] / space.row_scale[pair.rows]).max(
+            initial=0.0
+        )
+        > _CONSTANT
+    ]
+    return Redundancy(
+        rows=closure.constraints.count,
+        rank=space.rank,
+        free=space.basis.shape[1],
+        redundant=tuple(titles),
+    )
+
+
+@overload
+def closed(robot: Robot, q: ArrayLike, v: None = None) -> Array: ...
+
+
+@overload
+def closed(robot: Robot, q: ArrayLike, v: ArrayLike) -> tuple[Array, Array]: ...
 
 
 def closed(

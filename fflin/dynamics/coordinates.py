@@ -8,7 +8,7 @@ from typing import ClassVar, Literal, NamedTuple, cast, get_args
 
 import numpy as np
 
-from fflin.base.errors import InputError
+from fflin.base.errors import InputError, listed
 from fflin.base.rotation import product, rotation_matrices, rotation_matrix, skew
 from fflin.base.validation import Array, Indices
 from fflin.robot.inputs import BaseForce, BaseTorque
@@ -68,6 +68,16 @@ def refuse_orbit(robot: Robot, what: str) -> None:
         raise InputError(
             f"{what} are defined only without an orbit, but '{robot.name}' is in orbit; remove the "
             "orbit with robot.replace(orbit=None)"
+        )
+
+
+def refuse_constraints(robot: Robot, what: str) -> None:
+    """Raise `InputError` if a robot has constraints; `what` names the unsupported feature."""
+    if getattr(robot, "constraints", None):
+        names = listed(item.title for item in robot.constraints)
+        raise InputError(
+            f"{what} do not support constraints, but '{robot.name}' has the constraints {names}; "
+            "remove them with robot.replace(constraints=[])"
         )
 
 

@@ -180,6 +180,7 @@ def reduced_fields(
         "x0": whole.x0[kept],
         "y0": whole.y0,
         "placement": whole.placement,
+        "_all_states": T,
     }
     if whole.drift is not None:
         arrays["drift"] = whole.drift[kept]

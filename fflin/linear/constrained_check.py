@@ -78,7 +78,8 @@ class OnManifold:
 
     def states(self, z: Array) -> Array:
         """Return all states (N, 12 + 2 n) for rows (N, 2 d) of independent states."""
-        return np.array([self._state(row) for row in z])
+        rows = [self._state(row) for row in z]
+        return np.array(rows).reshape(len(z), self.state.nx)
 
     def residuals(self) -> tuple[float, float]:
         """Return the largest residuals of the constraints at q, and of their rates at v."""
@@ -161,7 +162,7 @@ class ConstrainedReferences:
             base = aba.actuation.in_base_axes(self.route.state.unchecked_chart(q[k]), u)
             forces = aba.constraint_forces(*at, base) if self._measures_forces else {}
             rows.append(self._measuring(x, *at, a[k], forces))
-        return np.array(rows)
+        return np.array(rows).reshape(len(point), len(self._lin.y0))
 
     @property
     def _measures_forces(self) -> bool:

@@ -22,6 +22,7 @@ from fflin.dynamics.coordinates import (
     Frame,
     forces_of,
     frame_of,
+    refuse_constraints,
 )
 from fflin.dynamics.disturbance import BaseDisturbance
 from fflin.dynamics.orbital import OrbitField, mean_motion
@@ -208,6 +209,7 @@ def equilibrium(
     True
     """
     state = StateMap(robot, frame=frame, reference=reference)
+    refuse_constraints(robot, "equilibria")
     tilt = truth("tilt", tilt)
     pushed = BaseDisturbance(robot, state.field, constant=True)
     if not truth("disturbed", disturbed):
@@ -689,6 +691,7 @@ def relative_equilibria(
     (24, True)
     """
     instance("robot", robot, Robot, "a fflin.Robot")
+    refuse_constraints(robot, "relative equilibria")
     if robot.orbit is None:
         raise InputError(
             f"'{robot.name}' is not in orbit; give it an orbit by "

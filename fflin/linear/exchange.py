@@ -12,7 +12,7 @@ import pinocchio as pin
 from fflin.base.errors import InputError
 from fflin.base.record import Design
 from fflin.base.validation import Array, Vector, instance, number, shaped, vector
-from fflin.dynamics.coordinates import Frame
+from fflin.dynamics.coordinates import Frame, refuse_constraints
 from fflin.dynamics.integrators import held_exponential
 from fflin.dynamics.state import StateMap
 from fflin.linear.fit import require_fit
@@ -135,6 +135,7 @@ def transform(
     """
     instance("lin", lin, LinearModel, "a fflin.LinearModel").require_unchanged()
     refuse_delayed(lin, f"the conversion to {tool}")
+    refuse_constraints(robot, f"the coordinates of {tool}")
     require_fit(lin, robot, StateMap(robot, frame=lin.frame))
     sampled = lin.dt
     whole = lin.generator

@@ -14,6 +14,7 @@ import numpy as np
 from fflin.base.errors import InputError
 from fflin.base.process import in_one_thread
 from fflin.base.validation import Array, ArrayLike
+from fflin.dynamics.coordinates import refuse_constraints
 from fflin.dynamics.integrators import GAUSS, HEAVY, LIGHT, held_exponential
 from fflin.linear.check import Check, check_all
 from fflin.linear.fit import require_same
@@ -251,6 +252,7 @@ def linearize_trajectory(
     >>> along.A.shape, along.check().ok
     ((11, 18, 18), True)
     """
+    refuse_constraints(robot, "linear models along trajectories")
     if isinstance(t, Trajectory):
         if options or not q is v is u is None:
             raise InputError(

@@ -290,6 +290,8 @@ class LinearModel(ModelHeader, StateSpace):
     mean_motion: float = 0.0
     added: tuple[str, ...] = ()
     dependent: tuple[str, ...] = ()
+    # Map (12 + 2 n, nx) from the states to all states of a robot with constraints.
+    _all_states: Array | None = None
     _delays: tuple[float, ...] = ()  # empty if no input is delayed
 
     def __init__(
@@ -366,6 +368,17 @@ class LinearModel(ModelHeader, StateSpace):
     def rank(self) -> int:
         """Rank of the constraints: the number of velocities that they remove; 0 without any."""
         return len(self.dependent) // 2
+
+    @property
+    def independent(self) -> tuple[str, ...] | None:
+        """Independent coordinates of a robot with constraints, as for `linearize`; None without.
+
+        They are the positions among the states.
+        """
+        if not self.dependent:
+            return None
+        states = self.robot_states
+        return states[: len(states) // 2]
 
     @property
     def delay(self) -> Array:

@@ -583,6 +583,7 @@ def _forces_of(model: LinearModel) -> tuple[tuple[str, ...], Array]:
         model.v,
         frame=model.frame,
         reference=model.reference,
+        independent=model.independent,
     )
     rows = [larger.state_names.index(name) for name in model.state_names]
     return input_keys(larger), larger.B[rows]

@@ -14,6 +14,7 @@ from fflin.base.tables import folded, grid
 from fflin.base.validation import Array, FrozenArrays, instance, numbers, shaped, whole
 from fflin.base.writing import as_path
 from fflin.control.gain import Gain, gain_matrix
+from fflin.dynamics.coordinates import refuse_constraints
 from fflin.linear.files import record_of
 from fflin.linear.model import LinearModel
 from fflin.uncertainty.derivatives import ModelDerivatives
@@ -396,6 +397,7 @@ def sensitivity(lin: LinearModel) -> Sensitivity:
         raise InputError(
             "the model was loaded from a file, which contains no robot; linearise the robot again"
         )
+    refuse_constraints(robot, "sensitivities")
     source = lin.generator
     if source is None:
         raise InputError(

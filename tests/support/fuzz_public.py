@@ -111,6 +111,7 @@ def light(folder):
             **{"altitude": 7e5, "mean_motion": None, "body": "earth", "mu": None},
             "body_radius": None,
         },
+        "closed": {"robot": robot, "q": q, "v": v},
         "configuration": {
             "robot": robot,
             "joints": {joint: 0.1},
@@ -173,10 +174,10 @@ def light(folder):
             "bias_noise": None,
             "disturbance_frequency": {"tau_b.x": [0.01]},
         },
-        "linearize": result | place,
+        "linearize": result | place | {"independent": ["q_b"]},
         "linearize_trajectory": knots
         | {"robot": robot, "strict": False, "hold": "previous", "frame": "world"},
-        "Linearizer": {"robot": robot} | place,
+        "Linearizer": {"robot": robot} | place | {"independent": ["q_b"]},
         "list_robots": {},
         "LinearController": {"system": -gain.K, "lin": lin, "sign": -1, "noise": None},
         "load": {
@@ -244,6 +245,7 @@ def light(folder):
             "base": None,
         },
         "RelativePose": {"frame": "base", "to": "base"},
+        "ConstraintForce": {"name": "held", "components": ("force.x",)},
         "ReactionWheel": {
             "axis": vector,
             "frame": None,

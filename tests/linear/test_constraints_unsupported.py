@@ -1,0 +1,49 @@
+"""Functions that do not support constraints refuse a robot with constraints."""
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import fflin
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return fflin.load(
+        "dual_arm", constraints=[fflin.Weld("tool_left", "tool_right", name="grasp")]
+    )
+
+
+@pytest.fixture(scope="module")
+def lin(robot):
+    return fflin.linearize(robot)
+
+
+PAYLOAD = pin.Inertia(1.0, np.zeros(3), np.eye(3))
+CALLS = {
+    "capture": lambda robot, _: fflin.capture(robot, "tool_left", PAYLOAD),
+    "effective_masses": lambda _, lin: fflin.effective_masses(lin),
+    "equilibrium": lambda robot, _: fflin.equilibrium(robot),
+    "from_tool": lambda robot, lin: fflin.from_tool(robot, "drake", lin.q),
+    "generalized_jacobian": lambda robot, _: fflin.generalized_jacobian(
+        robot, frame="tool_left"
+    ),
+    "jam": lambda robot, _: fflin.jam(robot, "left_1"),
+    "linearize_trajectory": lambda robot, lin: fflin.linearize_trajectory(
+        robot, [0.0, 1.0], [lin.q] * 2, [lin.v] * 2, [lin.u0] * 2
+    ),
+    "plan": lambda robot, _: fflin.plan(robot, {}, duration=10.0),
+    "relative_equilibria": lambda robot, _: fflin.relative_equilibria(robot),
+    "sensitivity": lambda _, lin: fflin.sensitivity(lin),
+    "sweep": lambda robot, lin: fflin.sweep(robot, lin.q[None]),
+    "to": lambda _, lin: lin.to("mujoco"),
+    "gain.to": lambda _, lin: fflin.lqr(lin).to("drake"),
+    "transform": lambda robot, lin: fflin.transform(robot, lin, "pinocchio"),
+    "uncertain": lambda robot, _: fflin.uncertain(robot, {"base.mass": 0.1}),
+}
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_a_function_without_support_names_the_constraints(name, robot, lin):
+    with pytest.raises(fflin.InputError, match=r"not support constraints.*grasp"):
+        CALLS[name](robot, lin)
