@@ -24,14 +24,18 @@ from collections import namedtuple
 from fflin.base.validation import Array
 from fflin.kernel import bodies
 from fflin.kernel import vectors as vec
-from fflin.kernel.bodies import BIAS, VELOCITY, at_parent, joint_axis, motion_cross
+from fflin.kernel.bodies import BIAS, VELOCITY, joint_axis, motion_cross
 from fflin.kernel.tree import INDICES, LANED, MOTION, PLACE, REALS, Struct
 from fflin.kernel.vectors import below, called, chosen, compiled_as, load, root, store
 
-# Corrections of the position, and of the velocity, at the end of each step. The factors of the
-# first correction serve for all, so a position error e of the step becomes an error of order e^3.
-# The number is fixed, because a lane must not depend on the errors of other lanes.
-_CORRECTIONS = 2
+# Largest number of corrections of the position, and of the velocity, at the end of a step. The
+# factors of the first correction serve for all, so a position error e becomes an error of order
+# e^2, then e^3.
+_CORRECTIONS = 3
+
+# Sum of the squared errors of all rows, in m and rad or m/s and rad/s, up to which a position or a
+# velocity is not corrected.
+_CLOSED = 1e-24
 
 # Smallest squared orthogonal fraction of a row for which the rows count as independent.
 LEAST_FRACTION = 1e-10
@@ -48,7 +52,7 @@ class Constraints(
     namedtuple(
         "Constraints",
         "first second first_pose second_pose pair component location jacobian basis triangle "
-        "error change multipliers forces least at",
+        "error roots change multipliers forces least at packed",
     )
 ):
     """Constraints between k pairs of frames, with r independent rows, and their work space.
@@ -64,13 +68,14 @@ class Constraints(
     - `location` (k, 21): the locations of the frames; see `locate`.
     - `jacobian` (r, 6 + n): J. `basis` (r, 6 + n): the columns of Q. `triangle` (r, r): R.
     - `error` (r,): values of the rows that a correction must set to zero.
+    - `roots` (6 + n,): the diagonal of D^(-1/2).
     - `change` (6 + n,): the correction of the accelerations, the velocities or the position.
       `multipliers` (r,): its multipliers.
     - `forces` (r,): the forces [N] and moments [N m] on the second frame in axes of the first
       frame, which the constraints exert at the first stage of the latest step.
     - `least` (1,): the smallest fraction of a column of Z that is orthogonal to the columns before
       it, squared. If it is zero, the rows are not independent.
-    - `at` (nq,): a displaced configuration.
+    - `at` (nq,): a displaced configuration. `packed`: a copy of the packed M.
     """
 
 
@@ -216,19 +221,29 @@ def locate(work, robot, constraints, q):
 
 
 def write_positions(constraints):
-    """Write the position errors of all rows to `constraints.error`; call `locate` before."""
+    """Write the position errors of all rows to `constraints.error`; call `locate` before.
+
+    Return the sum of their squares.
+    """
     for row in range(len(constraints.error)):
         at = constraints.pair[row] * LOCATION + ROTATION
         value = load(constraints.location, at + constraints.component[row])
         store(constraints.error, row, value)
+    error = constraints.error
+    return _product(error, 0, error, 0, len(error))
 
 
 def write_velocities(constraints, nu):
-    """Write the velocities of all rows to `constraints.error`; call `write_jacobian` before."""
+    """Write the velocities of all rows to `constraints.error`; call `write_jacobian` before.
+
+    Return the sum of their squares.
+    """
     size = len(constraints.change)
     for row in range(len(constraints.error)):
         value = _product(constraints.jacobian, row * size, nu, 0, size)
         store(constraints.error, row, value)
+    error = constraints.error
+    return _product(error, 0, error, 0, len(error))
 
 
 def _direction(constraints, row):
@@ -238,73 +253,86 @@ def _direction(constraints, row):
     return vec.get3(constraints.location, at), component < 3
 
 
-def _unit_wrench(axis, lever, angular):
-    """Return the wrench about a joint of a unit moment, or of a unit force at a lever's end."""
-    if angular:
-        return axis, vec.minus(axis, axis)
-    return vec.cross(lever, axis), axis
+@called
+def _add_column(work, tree, constraints, pair, body, lever, sign):
+    """Add the twists that a joint causes, at the end of a lever from the joint, to rows of J.
+
+    The rows are the rows of a pair of frames.
+    """
+    size = len(constraints.change)
+    w, v = joint_axis(work, tree, body)
+    v = vec.plus(v, vec.cross(w, lever))
+    for row in range(len(constraints.error)):
+        if constraints.pair[row] == pair:
+            axis, angular = _direction(constraints, row)
+            value = vec.dot(axis, v)
+            if angular:
+                value = vec.dot(axis, w)
+            at = row * size + tree.coordinate[body]
+            vec.add(constraints.jacobian, at, value * sign)
+
+
+def _put_base(constraints, pair, lever):
+    """Write the columns of the base into the rows of a pair; the lever is from the base."""
+    size = len(constraints.change)
+    for row in range(len(constraints.error)):
+        if constraints.pair[row] == pair:
+            axis, angular = _direction(constraints, row)
+            if angular:
+                vec.put3(constraints.jacobian, row * size, axis)
+            else:
+                columns = vec.cross(lever, axis), axis
+                vec.put6(constraints.jacobian, row * size, columns)
 
 
 @called
 def write_jacobian(work, robot, constraints):
     """Write J; `locate` must be called before.
 
-    A row of J is the generalised force of a unit wrench on the second body, and of the opposite
-    wrench on the first body. The forces cancel on the common path of both bodies to the base.
+    The motions of the joints on the common path of both bodies to the base cancel.
     """
     tree = robot.tree
-    size = len(constraints.change)
     places = tree.offsets.places
-    jacobian = constraints.jacobian
-    vec.clear(jacobian, 0, len(jacobian))
-    for row in range(len(constraints.error)):
-        pair = constraints.pair[row]
-        at = row * size
-        axis, angular = _direction(constraints, row)
-        lever = vec.get3(constraints.location, pair * LOCATION + FIRST_LEVER)
-        reaction = vec.times6(_unit_wrench(axis, lever, angular), -1.0)
-        lever = vec.get3(constraints.location, pair * LOCATION + SECOND_LEVER)
-        wrench = _unit_wrench(axis, lever, angular)
+    location = constraints.location
+    vec.clear(constraints.jacobian, 0, len(constraints.jacobian))
+    for pair in range(len(constraints.first)):
         first, second = max(constraints.first[pair], 0), constraints.second[pair]
+        first_lever = vec.get3(location, pair * LOCATION + FIRST_LEVER)
+        second_lever = vec.get3(location, pair * LOCATION + SECOND_LEVER)
         # The index of a body is larger than the index of its parent. So the body with the larger
         # index is not on the path of the other one.
         while first != second:
             if second > first:
-                value = vec.dot6(joint_axis(work, tree, second), wrench)
-                vec.add(jacobian, at + tree.coordinate[second], value)
-                wrench = at_parent(work, places + second * PLACE, wrench)
+                _add_column(work, tree, constraints, pair, second, second_lever, 1.0)
+                shift = vec.get3(work, places + second * PLACE + 9)
+                second_lever = vec.plus(second_lever, shift)
                 second = tree.parent[second]
             else:
-                value = vec.dot6(joint_axis(work, tree, first), reaction)
-                vec.add(jacobian, at + tree.coordinate[first], value)
-                reaction = at_parent(work, places + first * PLACE, reaction)
+                _add_column(work, tree, constraints, pair, first, first_lever, -1.0)
+                shift = vec.get3(work, places + first * PLACE + 9)
+                first_lever = vec.plus(first_lever, shift)
                 first = tree.parent[first]
         if constraints.first[pair] < 0:
-            vec.put6(jacobian, at, wrench)
+            _put_base(constraints, pair, second_lever)
 
 
 @called
 def factorise(work, tree, constraints):
     """Write Q and R for the present J; `bodies.factorise` must have factorised M."""
-    basis = constraints.basis
+    basis, roots = constraints.basis, constraints.roots
     size = len(tree.row)
+    for k in range(size):
+        at = tree.offsets.scaled + tree.row[k] + tree.depth[k]
+        store(roots, k, root(load(work, at)))
     vec.copy(constraints.jacobian, 0, basis, 0, len(basis))
     for row in range(len(constraints.error)):
-        bodies.solve_inwards(work, tree, basis, row * size)
+        at = row * size
+        bodies.solve_inwards(work, tree, basis, at)
         for k in range(size):
-            store(
-                basis,
-                row * size + k,
-                load(basis, row * size + k) * _scale(work, tree, k),
-            )
+            store(basis, at + k, load(basis, at + k) * load(roots, k))
     orthonormalise(
         basis, constraints.triangle, constraints.least, len(constraints.error)
     )
-
-
-def _scale(work, tree, k):
-    """Return D^(-1/2) of row k, for the factor of M."""
-    return root(load(work, tree.offsets.scaled + tree.row[k] + tree.depth[k]))
 
 
 @called
@@ -325,7 +353,7 @@ def correct(work, tree, constraints):
     # L^-1 D^(-1/2) y
     for k in range(len(tree.row)):
         row = tree.row[k]
-        value = load(change, k) * _scale(work, tree, k)
+        value = load(change, k) * load(constraints.roots, k)
         for t in range(tree.depth[k]):
             above = load(change, tree.path[row + t])
             value = value - load(work, tree.offsets.packed + row + t) * above
@@ -352,14 +380,11 @@ def write_accelerations(work, robot, constraints, point):
     tree = robot.tree
     location = constraints.location
     size = len(constraints.change)
-    for row in range(len(constraints.error)):
-        pair = constraints.pair[row]
-        axis, angular = _direction(constraints, row)
+    for pair in range(len(constraints.first)):
+        first, second = constraints.first[pair], constraints.second[pair]
         lever = vec.get3(location, pair * LOCATION + SECOND_LEVER)
-        second = constraints.second[pair]
         twist = _twist(work, tree, second, VELOCITY, lever)
         alpha, a = _twist(work, tree, second, BIAS, lever)
-        first = constraints.first[pair]
         if first >= 0:
             lever = vec.get3(location, pair * LOCATION + FIRST_LEVER)
             change = motion_cross(_twist(work, tree, first, VELOCITY, lever), twist)
@@ -370,13 +395,16 @@ def write_accelerations(work, robot, constraints, point):
             gravity = vec.across(vec.axes_of(point.q), vec.get3(robot.gravity, 0))
             transport = vec.cross(twist[0], vec.get3(point.nu, 3))
             a = vec.plus(a, vec.minus(gravity, transport))
-        value = vec.dot(axis, a)
-        if angular:
-            value = vec.dot(axis, alpha)
-        value = value + _product(
-            constraints.jacobian, row * size, work, tree.offsets.c, size
-        )
-        store(constraints.error, row, value)
+        for row in range(len(constraints.error)):
+            if constraints.pair[row] == pair:
+                axis, angular = _direction(constraints, row)
+                value = vec.dot(axis, a)
+                if angular:
+                    value = vec.dot(axis, alpha)
+                by_c = _product(
+                    constraints.jacobian, row * size, work, tree.offsets.c, size
+                )
+                store(constraints.error, row, value + by_c)
 
 
 @called
@@ -413,23 +441,49 @@ def close(work, robot, constraints, point):
 
     Before and after, the poses of the bodies and M are those of `point.q`.
     """
-    tree = robot.tree
-    size = len(tree.row)
-    locate(work, robot, constraints, point.q)
+    tree, q, nu = robot.tree, point.q, point.nu
+    locate(work, robot, constraints, q)
     write_jacobian(work, robot, constraints)
+    square = write_positions(constraints)
+    rate = write_velocities(constraints, nu)
+    if below(square, _CLOSED) and below(rate, _CLOSED):
+        return
+    packed = tree.offsets.packed
+    vec.copy(work, packed, constraints.packed, 0, len(tree.path))
     bodies.factorise(work, tree)
     factorise(work, tree, constraints)
+    moved = False
     for _ in range(_CORRECTIONS):
-        write_positions(constraints)
+        square = write_positions(constraints)
+        if below(square, _CLOSED):
+            break
+        moved = True
         correct(work, tree, constraints)
-        vec.displace(tree, point.q, constraints.change, constraints.at)
-        vec.copy(constraints.at, 0, point.q, 0, len(point.q))
-        bodies.outwards(work, tree, point.q)
-        locate(work, robot, constraints, point.q)
-    write_jacobian(work, robot, constraints)
+        vec.displace(tree, q, constraints.change, constraints.at)
+        _replace(q, constraints.at, square)
+        bodies.outwards(work, tree, q)
+        locate(work, robot, constraints, q)
+    if moved:
+        write_jacobian(work, robot, constraints)
     for _ in range(_CORRECTIONS):
-        write_velocities(constraints, point.nu)
+        rate = write_velocities(constraints, nu)
+        if below(rate, _CLOSED):
+            break
         correct(work, tree, constraints)
-        for index in range(size):
-            vec.add(point.nu, index, load(constraints.change, index))
-    bodies.inwards(work, tree)
+        for index in range(len(nu)):
+            vec.add(constraints.change, index, load(nu, index))
+        _replace(nu, constraints.change, rate)
+    if moved:
+        bodies.inwards(work, tree)
+    else:
+        vec.copy(constraints.packed, 0, work, packed, len(tree.path))
+
+
+def _replace(values, corrected, square):
+    """Replace values by their corrections in the lanes in which the squared error is too large.
+
+    The other lanes do not change, so a lane does not depend on the errors of other lanes.
+    """
+    for index in range(len(values)):
+        value = chosen(_CLOSED, square, load(corrected, index), load(values, index))
+        store(values, index, value)

@@ -179,8 +179,8 @@ class Constrained:
         ]
         if titles:
             yield (
-                f"the rows of the constraints are redundant; the forces of {listed(titles)} are "
-                "not determinate, and the smallest are recorded"
+                f"the constraints are redundant: the forces of {listed(titles)} are not "
+                "determinate, so the smallest are recorded"
             )
 
     def in_kernel(self, tree: Tree, nq: int) -> kernel.Constraints:
@@ -214,11 +214,13 @@ class Constrained:
             basis=np.zeros(r * size),
             triangle=np.zeros(r * r),
             error=np.zeros(r),
+            roots=np.zeros(size),
             change=np.zeros(size),
             multipliers=np.zeros(r),
             forces=np.zeros(r),
             least=np.ones(1),
             at=np.zeros(nq),
+            packed=np.zeros(len(tree.path)),
         )
 
     def _correction(self, q: Array, J: Array, error: Array) -> Correction:

@@ -96,6 +96,7 @@ class Plant(Aba):
             any(robot.gravity),
             robot.orbit,
             robot.disturbance,
+            robot.constraints,
         )
         self._plain = state.S is None and not self.actuation.carried and not any(others)
 
@@ -148,6 +149,9 @@ class Plant(Aba):
         if not self.robot.constraints:
             return q, v
         self.constrained = Constrained(self.state, q)
+        # `stage` then computes the accelerations without constraints, which `constrained_stage`
+        # corrects.
+        self._constraints = None
         return self.constrained.start(q, v)
 
     def constrained_stage(

@@ -545,22 +545,23 @@ def motion_report(motion: Motion) -> str:
 
 
 def _largest_forces(motion: Motion) -> list[str]:
-    """Return a table of the largest force and torque of each constraint, if there are some."""
-    if not motion.constraint_names:
-        return []
-    rows = [["constraint", "largest force [N]", "largest torque [N m]"]]
+    """Return a line with the largest force and torque of each constraint."""
+    lines = list[str]()
     columns = dict(
         zip(motion.constraint_names, motion.constraint_forces.T, strict=True)
     )
     # A name is the title of the constraint, "force" or "torque", and the axis.
     titles = dict.fromkeys(name.rsplit(".", 2)[0] for name in columns)
     for title in titles:
-        row = [title]
+        sizes = list[float]()
         for kind in ("force", "torque"):
             parts = [columns[f"{title}.{kind}.{axis}"] for axis in "xyz"]
-            row.append(f"{np.linalg.norm(parts, axis=0).max():.4g}")
-        rows.append(row)
-    return [f"{grid(rows, 'l')}\n"]
+            sizes.append(float(np.linalg.norm(parts, axis=0).max()))
+        lines.append(
+            f"largest force of constraint '{title}': {sizes[0]:.4g} N; largest torque: "
+            f"{sizes[1]:.4g} N m"
+        )
+    return lines
 
 
 def _heading(motion: Motion, kinds: list[ErrorSize]) -> list[str]:
