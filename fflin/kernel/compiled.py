@@ -35,7 +35,10 @@ ENGINES = ("python", "compiled")
 _COMPILED = {
     "advance": "the loop that simulates eight runs at a time",
     "advance_one": "the loop that simulates one run",
+    "advance_in_orbit": "the loop that simulates eight runs at a time in orbit",
+    "advance_one_in_orbit": "the loop that simulates one run in orbit",
     "derive": "the batch kernel",
+    "derive_in_orbit": "the batch kernel in orbit",
     "take": "the run statistics",
 }
 

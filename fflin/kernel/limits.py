@@ -68,10 +68,6 @@ class Limit(NamedTuple):
     reason: str
 
 
-def _is_in_orbit(robot: Robot) -> bool:
-    return robot.orbit is not None
-
-
 def _has_other_joint(robot: Robot) -> bool:
     return batch_tree(robot) is None
 
@@ -87,10 +83,6 @@ LIMITS = (
     Limit(lambda task: task.callback, "callbacks are called in Python"),
     Limit(lambda task: task.disturbance, "disturbances are computed in Python"),
     Limit(lambda task: task.python_policy, "a {} is computed in Python"),
-    Limit(
-        lambda task: task.first(_is_in_orbit),
-        "'{}' is in orbit, whose field is computed in Python",
-    ),
     Limit(
         lambda task: task.first(_has_other_joint),
         "a joint of '{}' does not move along a screw with a fixed axis",

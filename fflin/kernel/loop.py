@@ -13,6 +13,7 @@ from fflin.kernel import forward
 from fflin.kernel import vectors as vec
 from fflin.kernel.allocation import allocate, write_difference
 from fflin.kernel.forward import MECHANICS, MOMENTUM_REFERENCE, POINT
+from fflin.kernel.orbit import ORBIT
 from fflin.kernel.policies import (
     LAW,
     NOTHING,
@@ -233,10 +234,14 @@ class StopConditions(namedtuple("StopConditions", "squares sign")):
 
 class Arguments(
     namedtuple(
-        "Arguments", "robot method law channel reference project pushed stop point"
+        "Arguments",
+        "robot orbit method law channel reference project pushed stop point",
     )
 ):
     """Arguments of `advance`.
+
+    `orbit` is used by `advance_in_orbit` and `advance_one_in_orbit` only. The reference then
+    contains the Jacobi integral in place of the momentum.
 
     If `project` is true, `forward.impose` corrects the base's position and velocity at the end of
     each step. After the correction, momentum and centre of mass match the momentum reference. If
@@ -251,6 +256,7 @@ ARGUMENTS = Struct(
     Arguments,
     FLAG,
     robot=MECHANICS,
+    orbit=ORBIT,
     method=METHOD,
     law=LAW,
     channel=CHANNEL,
@@ -308,10 +314,10 @@ def _move(robot, method, point, stage):
         vec.displace(robot.tree, point.q, along, point.q)
 
 
-def _ask(work, robot, law, channel, point, t, step, stage):
+def _ask(work, robot, orbit, law, channel, point, t, step, stage):
     """Write the command of the policy to `point.u`, and correct the memory of the policy."""
     count = step // max(channel.sample, 1)
-    command(work, robot, law, point, t, count, stage)
+    command(work, robot, orbit, law, point, t, count, stage)
     allocate(law.allocation, point, law.u)
     if len(law.filter.E) > 0:
         limit(channel, point.u)
@@ -321,7 +327,7 @@ def _ask(work, robot, law, channel, point, t, step, stage):
 
 def advance(words, clock, last, every, rows, work):
     """Advance eight runs; `words` are the 64-bit words of `ARGUMENTS`, see `_advance`."""
-    _advance(ARGUMENTS(words), clock, last, every, rows, work)
+    _advance(ARGUMENTS(words), None, clock, last, every, rows, work)
 
 
 def advance_one(words, clock, last, every, rows, work):
@@ -329,10 +335,22 @@ def advance_one(words, clock, last, every, rows, work):
 
     A single run would be slower in eight equal lanes.
     """
-    _advance(ARGUMENTS_OF_ONE(words), clock, last, every, rows, work)
+    _advance(ARGUMENTS_OF_ONE(words), None, clock, last, every, rows, work)
 
 
-def _advance(arguments, clock, last, every, rows, work):
+def advance_in_orbit(words, clock, last, every, rows, work):
+    """Advance eight runs of a robot in orbit; the arguments are the arguments of `advance`."""
+    arguments = ARGUMENTS(words)
+    _advance(arguments, arguments.orbit, clock, last, every, rows, work)
+
+
+def advance_one_in_orbit(words, clock, last, every, rows, work):
+    """Advance one run of a robot in orbit; the arguments are the arguments of `advance_one`."""
+    arguments = ARGUMENTS_OF_ONE(words)
+    _advance(arguments, arguments.orbit, clock, last, every, rows, work)
+
+
+def _advance(arguments, orbit, clock, last, every, rows, work):
     """Advance all runs to the step `last`, or until one of the runs meets a stop condition.
 
     The function updates the point,
@@ -342,7 +360,7 @@ def _advance(arguments, clock, last, every, rows, work):
 
     If `every` is not 0, the function writes a row into `rows` at every step that is a multiple of
     `every`. A row consists of q, nu, u, the reference momentum (6,) and the reference centre of
-    mass (3,). `work` has `WorkOffsets.size` entries.
+    mass (3,). `work` has `WorkOffsets.size` entries. `orbit` is None without an orbit.
     """
     robot = arguments.robot
     method = arguments.method
@@ -355,7 +373,7 @@ def _advance(arguments, clock, last, every, rows, work):
     at = 0
     forward.configure(work, robot, point.q)
     if clock[0] == 0:
-        forward.start_at(work, robot, kept, point)
+        forward.start_at(work, robot, orbit, kept, point)
     for step in range(clock[0], last):
         vec.copy(point.q, 0, method.first, 0, len(point.q))
         vec.copy(point.nu, 0, method.rates, 0, len(point.nu))
@@ -363,7 +381,7 @@ def _advance(arguments, clock, last, every, rows, work):
             t = step * h + method.nodes[stage]
             if law.kind != NOTHING and (channel.sample == 0 or stage == 0):
                 if is_asked(channel, step):
-                    _ask(work, robot, law, channel, point, t, step, stage)
+                    _ask(work, robot, orbit, law, channel, point, t, step, stage)
                 transmit(channel, step, point.nu, point.u)
             forward.apply_faults(
                 robot.faults, robot.triads, step * h, h, point.u, point.pushing
@@ -379,12 +397,11 @@ def _advance(arguments, clock, last, every, rows, work):
                     vec.put6(rows, at, momentum)
                     vec.put3(rows, at + 6, center)
                     at += 9
-            forward.accelerate(
-                work, robot, point, t, method.rates, (1 + stage) * len(point.nu)
-            )
+            to = (1 + stage) * len(point.nu)
+            forward.accelerate(work, robot, orbit, point, t, method.rates, to)
             if arguments.pushed:
                 weight, moment = method.weights[stage], method.moments[stage]
-                forward.add_wrench(work, robot, kept, point, weight, moment)
+                forward.add_wrench(work, robot, orbit, kept, point, weight, moment)
             _move(robot, method, point, stage)
             if len(law.filter.rates) > len(law.filter.z):
                 _combine(method.speed, stage, law.filter.rates, law.filter.z)

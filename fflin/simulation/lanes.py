@@ -22,12 +22,13 @@ from fflin.control.loops import Sample, measured_at
 from fflin.control.policy import Form, OutputForm, PathForm, Policy, StateForm
 from fflin.control.tracking import AT_THE_END, TrajectoryFeedback
 from fflin.dynamics.disturbance import Wave, waves_of
+from fflin.dynamics.orbital import mean_motion
 from fflin.dynamics.state import StateMap
-from fflin.kernel import allocation, forward, loop, policies
+from fflin.kernel import allocation, forward, loop, orbit, policies
 from fflin.kernel.compiled import compiles, is_kept, kernel
 from fflin.kernel.limits import Task, reason_against
 from fflin.kernel.tree import LANES, batch_tree, empty, laid_out, work_space
-from fflin.robot.disturbance import BASE, UNITS, DisturbanceTerm
+from fflin.robot.disturbance import BASE, INERTIAL, UNITS, DisturbanceTerm
 from fflin.robot.fields import input_limits, limits_of
 from fflin.robot.inputs import BaseTorque
 from fflin.robot.joints import ROOT, find_frame
@@ -68,11 +69,19 @@ def engine_of(engine: object, plan: Plan, *, many: bool = False) -> str:
     if not compiles(engine, lambda: not_compilable(plan)):
         return "python"
     wanted = (
-        engine or many or (plan.times.steps > LONG and is_kept("loop", "advance_one"))
+        engine
+        or many
+        or (plan.times.steps > LONG and is_kept("loop", _loop_of(plan.plant, 1)))
     )
     if wanted:
         return "compiled"
     return "python"
+
+
+def _loop_of(plant: Plant, lanes: int) -> str:
+    """Return the name of the compiled loop for a plant and a number of lanes."""
+    name = "advance_one" if lanes == 1 else "advance"
+    return f"{name}_in_orbit" if plant.field else name
 
 
 def form_of(policy: Policy, robot: Robot) -> Form | None:
@@ -238,13 +247,11 @@ class LaneLoop:
         # `_fresh` contains a pair for each array with lanes: the array, and the column of initial
         # values that is copied to all lanes.
         arguments = loop.ARGUMENTS
-        name = "advance"
         if lanes == 1:
             arguments = loop.ARGUMENTS_OF_ONE
-            name = "advance_one"
         self.parts, self._words, self._fresh = laid_out(parts, arguments)
         self._work = self._space(self.parts.robot.tree.offsets.size)
-        self._advance = kernel("loop", name)
+        self._advance = kernel("loop", _loop_of(plan.plant, lanes))
         robot, point = self.parts.robot, self.parts.point
         momentum_size = 6
         center_size = 3
@@ -519,6 +526,7 @@ def packed(
     channel = channel_of(plan.limits, u, times.sample, delays)
     return loop.Arguments(
         robot=mechanics,
+        orbit=orbit_of(plant),
         method=loop.Method(
             h=h,
             origin=method.origins,
@@ -589,7 +597,22 @@ def mechanics_of(plant: Plant, *, dispersed: bool = False) -> forward.Mechanics:
             rate=[wave.rate for wave in waves],
             at=[0 if wave.name == BaseTorque.GROUP else 3 for wave in waves],
             held=[wave.axes != BASE for wave in waves],
+            inertial=[bool(plant.field) and wave.axes == INERTIAL for wave in waves],
         ),
+    )
+
+
+def orbit_of(plant: Plant) -> orbit.Orbit:
+    """Return the kernel's parameters of the orbit of a plant; empty without an orbit."""
+    none: orbit.Orbit = empty(orbit.ORBIT)
+    field = plant.field
+    if field is None:
+        return none
+    return none._replace(
+        outwards=field.axes[:, 0],
+        normal=field.axes[:, 2],
+        mean_motion=[mean_motion(plant.robot)],
+        now=np.zeros(4),
     )
 
 
