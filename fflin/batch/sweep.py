@@ -332,7 +332,8 @@ class ChunkJob:
         nv = nu.shape[1]
         A[:, :nv] = ready.rest["A"][:nv]
         c, good = kernel.write(q, nu, q_m, u, A, B)
-        rates = AccelerationDerivatives(c, A[:, nv:], B, state.gravity(q))
+        gravity = state.field.falls(q) if state.field else state.gravity(q)
+        rates = AccelerationDerivatives(c, A[:, nv:], B, gravity)
         f0 = assemble(actuation, chart, nu, u, rates, A, moving=ready.moving)
         out["_x0"][:] = state.compose(chart, r_b, q_m, nu)
         out["f0"][:] = 0.0 if ready.moving else f0

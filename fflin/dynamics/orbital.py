@@ -8,8 +8,8 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import FflinWarning, InputError
-from fflin.base.rotation import skew
-from fflin.base.validation import Array
+from fflin.base.rotation import rotation_matrices, skew
+from fflin.base.validation import Array, Mask
 from fflin.dynamics.coordinates import ANGULAR, LINEAR, PIN_ANGULAR, PIN_LINEAR
 from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
@@ -40,6 +40,7 @@ class OrbitField:
       frame's origin is `tide` x.
     - `pull` (3, 3): matrix K of (14.2). A free mass that is at rest in the frame at x has the
       acceleration `pull` x relative to the frame.
+    - `gradient`: the gravitational parameter divided by the cube of the radius [1/s^2].
     - `axes` (3, 3): its columns are three unit vectors: away from the central body, along the
       orbit, and along the orbit normal.
     """
@@ -49,9 +50,11 @@ class OrbitField:
         n = mean_motion(robot)
         bodies = robot.model.inertias.tolist()[ROOT:]
         self.robot = robot
+        self._radius = robot.orbit.radius if robot.orbit else math.inf
         self._root = robot.model.jointPlacements[ROOT]
         self._stored = robot.stored_momentum
         self.rate: Array = n * z
+        self.gradient = n * n
         self.tide: Array = n * n * (3.0 * np.outer(r, r) - np.eye(3))
         self.axes: Array = np.column_stack((r, np.cross(z, r), z))
         self._turning = skew(self.rate)
@@ -70,6 +73,28 @@ class OrbitField:
         base = self._root * pin.XYZQUATToSE3(q[:7])
         return base.rotation, base.translation
 
+    def attitudes(self, q: Array) -> Array:
+        """Return the attitudes (N, 3, 3) of the base in the orbital frame at rows q (N, nq)."""
+        rotations: Array = self._root.rotation @ rotation_matrices(q[:, 3:7])
+        return rotations
+
+    def positions(self, q: Array) -> Array:
+        """Return the positions (N, 3) of the base in the orbital frame at rows q (N, nq)."""
+        positions: Array = q[:, :3] @ self._root.rotation.T + self._root.translation
+        return positions
+
+    def falls(self, q: Array) -> Array:
+        """Return `GravityGradient.fall` (N, 3) at rows q (N, nq)."""
+        pull = (self.positions(q) @ self.pull.T)[:, None]
+        fall: Array = (pull @ self.attitudes(q))[:, 0]
+        return fall
+
+    def is_near(self, q: Array) -> Mask:
+        """Return a mask (N,) of the rows q (N, nq) at which `require_near` gives no warning."""
+        distance = np.linalg.norm(self.positions(q), axis=1) + self._reach
+        near: Mask = 1.5 * distance <= _COARSE * self._radius
+        return near
+
     def require_near(self, q: Array) -> None:
         """Check that the robot is near the origin of the orbital frame, where (14.1) is accurate.
 
@@ -77,10 +102,7 @@ class OrbitField:
         exceed `_USELESS`.
         """
         distance = float(np.linalg.norm(self.base(q)[1])) + self._reach
-        radius = math.inf
-        if self.robot.orbit:
-            radius = self.robot.orbit.radius
-        error = 1.5 * distance / radius
+        error = 1.5 * distance / self._radius
         message = (
             f"'{self.robot.name}' extends to {distance / 1e3:.4g} km from the origin of its orbit "
             f"frame, where the linear gravity gradient has an error of up to {100.0 * error:.2g} %"

@@ -282,14 +282,15 @@ def at_parent(work, place, force):
     return vec.plus(force[0], vec.cross(vec.get3(work, place + 9), force[1])), force[1]
 
 
-def move_bodies(work, tree, nu):
+def move_bodies(work, tree, nu, omega_b):
     """Write the velocities, Psi' and the accelerations of all bodies, from the base to the tips.
 
-    The velocities are for v_b = 0, and the accelerations are for c = 0.
+    The velocities are for v_b = 0, and the accelerations are for c = 0. `omega_b` is the angular
+    velocity of the base relative to inertial space. The joint rates are entries of nu.
     """
     offsets = tree.offsets
     vec.clear(work, offsets.motion, MOTION)
-    vec.put3(work, offsets.motion, vec.get3(nu, 0))
+    vec.put3(work, offsets.motion, omega_b)
     for body in range(1, len(tree.parent)):
         at = offsets.motion + body * MOTION
         above = offsets.motion + tree.parent[body] * MOTION

@@ -37,7 +37,10 @@ _COMPILED = {
     "advance_one": "the loop that simulates one run",
     "advance_constrained": "the loop that simulates eight runs with constraints at a time",
     "advance_one_constrained": "the loop that simulates one run with constraints",
+    "advance_in_orbit": "the loop that simulates eight runs at a time in orbit",
+    "advance_one_in_orbit": "the loop that simulates one run in orbit",
     "derive": "the batch kernel",
+    "derive_in_orbit": "the batch kernel in orbit",
     "take": "the run statistics",
 }
 

@@ -33,7 +33,9 @@ from collections import namedtuple
 
 import numpy as np
 
+from fflin.base.rotation import skew
 from fflin.base.validation import Array, Mask
+from fflin.dynamics.coordinates import ANGULAR
 from fflin.dynamics.rnea import WARNING_COUPLING
 from fflin.dynamics.state import Actuation, StateMap
 from fflin.kernel import bodies
@@ -50,6 +52,7 @@ from fflin.kernel.bodies import (
 )
 from fflin.kernel.bodies import spatial_inertia_times as inertia_times
 from fflin.kernel.compiled import kernel
+from fflin.kernel.orbit import add_gradient, subtract_gradient_slopes
 from fflin.kernel.tree import INERTIA, LANES, LOAD, MOTION, PLACE, Tree, work_space
 from fflin.kernel.vectors import load, store
 
@@ -201,7 +204,7 @@ def _push(work, tree, by_u):
             store(work, by_u + row * count + tree.input[index], total)
 
 
-def _solve(work, tree, slopes):
+def _solve(work, tree, slopes, field):
     """Write the derivatives (6 + n, 12 + 2 n) of the accelerations c.
 
     They are -M^-1 D, where D is the matrix that `differentiate` writes. Six columns are computed at
@@ -211,16 +214,17 @@ def _solve(work, tree, slopes):
     size = len(tree.row)
     width = 2 * len(tree.row)
     none = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-    # The first six columns are for the base's rotation and translation. These columns are zero,
-    # because the kernel supports no orbits.
-    for row in range(size):
-        vec.clear(work, slopes + row * width, 6)
+    # The first six columns are for the base's rotation and translation. Without an orbit, these
+    # columns are zero.
+    groups = (width + 5) // 6
+    if field is None:
+        groups = (width - 1) // 6
+        for row in range(size):
+            vec.clear(work, slopes + row * width, 6)
     # The groups of six columns end at the last column. The first group may therefore begin among
-    # the zero columns.
-    first = width % 6
-    if first == 0:
-        first = 6
-    for column in range(first, width, 6):
+    # the zero columns, or contain columns of the second group.
+    for group in range(groups):
+        column = max(width - 6 * (groups - group), 0)
         # Copy six columns of D next to each other, because each row of M^-1 reads all of them.
         for k in range(size):
             entries = vec.get6(work, offsets.lower + column + k * width)
@@ -253,12 +257,25 @@ def _unpack(work, start, entries, out, first, offset):
 
 
 def derive(tree, points, out, lanes, work):
+    """Linearise at N points without an orbit; see `_derive`."""
+    _derive(tree, points, None, out, lanes, work)
+
+
+def derive_in_orbit(tree, points, field, out, lanes, work):
+    """Linearise at N points in orbit; see `_derive`."""
+    _derive(tree, points, field, out, lanes, work)
+
+
+def _derive(tree, points, field, out, lanes, work):
     """Write the accelerations c, their derivatives and the sums of the couplings at N points.
 
     N must be at least 8. All arrays in `points` and `out` have one row per point.
 
     - `points`: q, nu, force and u. `force` contains the generalised forces of springs, dampers and
-      all inputs that are not body-fixed. For points at rest, nu, force and u are empty.
+      all inputs that are not body-fixed. For points at rest, nu, force and u are empty. In orbit,
+      nu contains the inertial angular velocity of the base.
+    - `field`: None without an orbit. In orbit, a row consists of the unit vector (3,) away from the
+      central body in base axes, and of k [1/s^2]; see `kernel.orbit`.
     - `out`: c, A, by_u and judged. A row of A is a flattened matrix (nx, nx). The lower half of
       this matrix receives the derivatives of c with respect to displacements of the state. For
       points at rest, c and A are not written. `by_u` receives D_u (3.3), flattened. `judged` (N, 1)
@@ -283,7 +300,7 @@ def derive(tree, points, out, lanes, work):
             _pack(nu, first, lanes.nu)
             _pack(force, first, lanes.force)
             _pack(u, first, lanes.u)
-            bodies.move_bodies(work, tree, lanes.nu)
+            bodies.move_bodies(work, tree, lanes.nu, vec.get3(lanes.nu, 0))
             bodies.load_bodies(work, tree)
             bodies.load_carried(work, tree, lanes.u)
         bodies.write_columns(work, tree)
@@ -295,6 +312,10 @@ def derive(tree, points, out, lanes, work):
             for index in range(size):
                 value = load(lanes.force, index) - load(work, offsets.bias + index)
                 store(work, offsets.c + index, value)
+            if field is not None:
+                _pack(field, first, lanes.field)
+                r, k = vec.get3(lanes.field, 0), load(lanes.field, 3)
+                add_gradient(work, tree, r, k)
             bodies.solve(work, tree, offsets.c)
         bodies.invert_factor(work, tree)
         bodies.multiply(work, tree, coupling)
@@ -304,7 +325,10 @@ def derive(tree, points, out, lanes, work):
         if moves:
             bodies.accelerate_bodies(work, tree)
             differentiate(work, tree)
-            _solve(work, tree, slopes)
+            if field is not None:
+                r, k = vec.get3(lanes.field, 0), load(lanes.field, 3)
+                subtract_gradient_slopes(work, tree, r, k)
+            _solve(work, tree, slopes, field)
             _unpack(work, offsets.c, size, c, first, 0)
             lower = size * 2 * size
             _unpack(work, slopes, lower, A, first, A.shape[1] - lower)
@@ -314,8 +338,8 @@ def derive(tree, points, out, lanes, work):
 _FARTHEST = 1e6
 
 
-class Packed(namedtuple("Packed", "q nu force u")):
-    """Arrays (entries, 8) of q, nu, force and u at eight points, one column for each point."""
+class Packed(namedtuple("Packed", "q nu force u field")):
+    """Arrays (entries, 8) at eight points, one column for each point; see `_derive`."""
 
 
 class RowAccelerations:
@@ -331,7 +355,7 @@ class RowAccelerations:
         nv = state.nx // 2
         nu = len(actuation.names)
         self.state, self._actuation, self._tree = state, actuation, tree
-        self._sizes = state.robot.nq, nv, nv, nu
+        self._sizes = state.robot.nq, nv, nv, nu, 4
         self._work = tree.offsets.size + nv * state.nx + nv * nu + 1
         self._least_coupling = 0.999 * nv
 
@@ -352,17 +376,47 @@ class RowAccelerations:
         force = u @ self._actuation.fixed.T
         force[:, 6:] += self.state.robot.springs.force(q_m, nu[:, 6:])
         c = np.empty(nu.shape)
-        return c, self._derive((q, nu, force, u), c, A.reshape(len(q), -1), by_u)
+        rows = A.reshape(len(q), -1)
+        field = self.state.field
+        if field is None:
+            return c, self._derive((q, nu, force, u), c, rows, by_u)
+        # In orbit, the equations hold for the inertial angular velocity of the base. A rotation of
+        # the base changes this velocity in base axes.
+        R = field.attitudes(q)
+        spin = field.rate @ R
+        nu = nu.copy()
+        nu[:, ANGULAR] += spin
+        radial = np.column_stack(
+            (field.axes[:, 0] @ R, np.full(len(q), field.gradient))
+        )
+        accurate = self._derive((q, nu, force, u), c, rows, by_u, radial)
+        slopes = A[:, A.shape[1] // 2 :]
+        by_omega = slopes[:, :, nu.shape[1] :][:, :, ANGULAR]
+        slopes[:, :, ANGULAR] += by_omega @ skew(spin)
+        return c, accurate & field.is_near(q)
 
     def _derive(
-        self, points: tuple[Array, ...], c: Array, A: Array, by_u: Array
+        self,
+        points: tuple[Array, ...],
+        c: Array,
+        A: Array,
+        by_u: Array,
+        field: Array | None = None,
     ) -> Mask:
-        """Call the kernel `derive`, which writes to c, A and by_u; return the mask of `write`."""
+        """Call the kernel, which writes to c, A and by_u; return the mask of `write`.
+
+        `field` is the argument of `_derive`.
+        """
         couplings = np.empty((len(by_u), 1))
-        kernel("derivatives", "derive")(
-            self._tree,
-            # Copy read-only arrays, because numba would compile a second function for such arrays.
-            tuple(np.require(rows, np.float64, ("C", "W")) for rows in points),
+        # Copy read-only arrays, because numba would compile a second function for such arrays.
+        points = tuple(np.require(rows, np.float64, ("C", "W")) for rows in points)
+        name = "derive"
+        given: tuple[object, ...] = (self._tree, points)
+        if field is not None:
+            name = "derive_in_orbit"
+            given = (self._tree, points, field)
+        kernel("derivatives", name)(
+            *given,
             (c, A, by_u.reshape(len(by_u), -1), couplings),
             Packed(*map(work_space, self._sizes)),
             work_space(self._work),

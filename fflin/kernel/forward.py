@@ -17,6 +17,19 @@ from collections import namedtuple
 from fflin.kernel import bodies
 from fflin.kernel import vectors as vec
 from fflin.kernel.bodies import spatial_inertia_times, stored_momentum
+from fflin.kernel.orbit import (
+    RATE_CHANGE,
+    STRENGTH,
+    add_gradient,
+    from_inertial_axes,
+    kinetic_energy,
+    normal_at,
+    orbital_potential,
+    outwards_at,
+    pull_on,
+    spin_at,
+    write_now,
+)
 from fflin.kernel.tree import FLAGS, INDICES, LANED, REALS, TREE, Struct
 from fflin.kernel.vectors import Entries, angle, called, chosen, load, store
 
@@ -58,13 +71,17 @@ class ActuatorFaults(namedtuple("ActuatorFaults", "gain bias until turn")):
     """
 
 
-class BaseDisturbance(namedtuple("BaseDisturbance", "vector phase rate at held")):
+class BaseDisturbance(
+    namedtuple("BaseDisturbance", "vector phase rate at held inertial")
+):
     """Torques and forces on the base: k terms, each a vector times sin(rate t + phase).
 
     - `vector` (k, 3): torques [N m] and forces [N]. `phase` (k,): phases [rad].
     - `rate` (k,): angular frequencies [rad/s], 0 for a constant, whose phase is pi / 2.
     - `at` (k,): 0 for a torque, 3 for a force.
     - `held` (k,): True if the vector is in world axes, False if it is in base axes.
+    - `inertial` (k,): True if the vector is in inertial axes and the world is an orbital frame.
+      The inertial axes are the axes of the orbital frame at t = 0.
     """
 
 
@@ -83,7 +100,9 @@ class CommonPoint(Point):
     """Point whose arrays have no axis of lanes, because all lanes have the same point."""
 
 
-BASE_DISTURBANCE = Struct(BaseDisturbance, LANED, rate=REALS, at=INDICES, held=FLAGS)
+BASE_DISTURBANCE = Struct(
+    BaseDisturbance, LANED, rate=REALS, at=INDICES, held=FLAGS, inertial=FLAGS
+)
 ACTUATOR_FAULTS, POINT = Struct(ActuatorFaults, LANED), Struct(Point, LANED)
 COMMON_POINT = Struct(CommonPoint)
 _OF_MECHANICS = {FLAGS: "circling springy", REALS: "gravity scale rest origin"}
@@ -171,21 +190,26 @@ def push(work, tree, pushing):
 
 
 @called
-def disturb(work, robot, point, t):
+def disturb(work, robot, orbit, point, t):
     """Add the disturbances at time t [s] to the generalised force that `push` has written."""
     disturbance = robot.disturbance
     for index in range(len(disturbance.at)):
         phase = disturbance.rate[index] * t + load(disturbance.phase, index)
         sine = vec.cosine_and_sine(phase)[1]
         force = vec.times(vec.get3(disturbance.vector, 3 * index), sine)
+        if orbit is not None and disturbance.inertial[index]:
+            force = from_inertial_axes(orbit, force)
         if disturbance.held[index]:
             force = vec.across(vec.axes_of(point.q), force)
         vec.add3(work, robot.tree.offsets.c + disturbance.at[index], force)
 
 
 @called
-def accelerate(work, robot, point, t, rates, to):
+def accelerate(work, robot, orbit, point, t, rates, to):
     """Write d(nu)/dt at time t [s] into `rates` from the index `to` on.
+
+    `orbit` is None without an orbit. In orbit, nu is relative to the orbital frame, and the first
+    entry of `point.wrench` is the power [W] of inputs, disturbances and dampers.
 
     First, the equation of motion (3.1) is solved for the accelerations c: M c is the force of the
     inputs, minus the bias, minus the force of springs and dampers. `configure` must be called
@@ -196,9 +220,16 @@ def accelerate(work, robot, point, t, rates, to):
     size = len(tree.row)
     bodies.write_columns(work, tree)
     push(work, tree, point.pushing)
-    disturb(work, robot, point, t)
+    omega_b = vec.get3(nu, 0)
+    if orbit is not None:
+        write_now(orbit, t)
+        omega_b = vec.plus(omega_b, spin_at(orbit, point.q))
+    disturb(work, robot, orbit, point, t)
     vec.copy(work, force, point.wrench, 0, 6)
-    bodies.move_bodies(work, tree, nu)
+    if orbit is not None:
+        store(point.wrench, 0, _power(work, tree, nu))
+        add_gradient(work, tree, outwards_at(orbit, point.q), orbit.now[STRENGTH])
+    bodies.move_bodies(work, tree, nu, omega_b)
     bodies.load_bodies(work, tree)
     bodies.collect(work, tree)
     for index in range(size):
@@ -213,11 +244,37 @@ def accelerate(work, robot, point, t, rates, to):
     # `solve` replaces the force M c by the accelerations c.
     bodies.solve(work, tree, force)
     vec.copy(work, force, rates, to, size)
+    if orbit is not None:
+        _turn_with_orbit(orbit, point, rates, to)
+        return
     # By (3.2), dv_b/dt is the linear part of c plus gravity, minus omega_b x v_b.
     gravity = vec.across(vec.axes_of(point.q), vec.get3(robot.gravity, 0))
     transport = vec.cross(vec.get3(nu, 0), vec.get3(nu, 3))
     fall = vec.minus(gravity, transport)
     vec.put3(rates, to + 3, vec.plus(vec.get3(rates, to + 3), fall))
+
+
+def _power(work, tree, nu):
+    """Return the power [W] of the generalised force of inputs and disturbances, and of dampers."""
+    total = 0.0
+    for index in range(len(tree.row)):
+        total = total + load(work, tree.offsets.c + index) * load(nu, index)
+    for joint in range(len(tree.damping)):
+        rate = load(nu, 6 + joint)
+        total = total - load(tree.damping, joint) * rate * rate
+    return total
+
+
+def _turn_with_orbit(orbit, point, rates, to):
+    """Convert the accelerations c at `rates[to]` to d(nu)/dt relative to the frame (14.2)."""
+    q, w, v = point.q, vec.get3(point.nu, 0), vec.get3(point.nu, 3)
+    spin = spin_at(orbit, q)
+    change = vec.times(normal_at(orbit, q), orbit.now[RATE_CHANGE])
+    angular = vec.minus(vec.cross(w, spin), change)
+    position = vec.across(vec.axes_of(q), vec.get3(q, 0))
+    turning = vec.cross(vec.plus(w, vec.plus(spin, spin)), v)
+    linear = vec.minus(pull_on(orbit, q, position), turning)
+    vec.add6(rates, to, (angular, linear))
 
 
 # Offsets of the four vectors in `MomentumReference.sums`.
@@ -243,12 +300,16 @@ class MomentumReference(namedtuple("MomentumReference", "start weight per_mass s
 MOMENTUM_REFERENCE = Struct(MomentumReference, LANED)
 
 
-def add_wrench(work, robot, reference, point, weight, moment):
+def add_wrench(work, robot, orbit, reference, point, weight, moment):
     """Add the external wrench at a stage of the integrator to the sums of the current step.
 
     `weight` [s] is the weight of the stage in an integral over the step. `moment` [s^2] is the
-    weight of the stage in a double integral.
+    weight of the stage in a double integral. In orbit, the work replaces the impulse, because the
+    Jacobi integral replaces the momentum.
     """
+    if orbit is not None:
+        vec.add(reference.sums, STEP_IMPULSE, load(point.wrench, 0) * weight)
+        return
     axes = vec.axes_of(point.q)
     moments, force = vec.get6(point.wrench, 0)
     position = vec.minus(vec.get3(point.q, 0), vec.get3(reference.start, 9))
@@ -294,7 +355,7 @@ def kept_at(reference, t):
     return momentum, vec.plus(shift, flown)
 
 
-def start_at(work, robot, reference, point):
+def start_at(work, robot, orbit, reference, point):
     """Write the robot's initial momentum and centre of mass into `reference.start`.
 
     `point` is the initial point. `configure` must be called before this function. The last three
@@ -311,6 +372,22 @@ def start_at(work, robot, reference, point):
     vec.put6(reference.start, 0, (linear, angular))
     lever = vec.times(vec.product(axes, lever), load(reference.per_mass, 0))
     vec.put3(reference.start, 6, vec.plus(position, lever))
+    if orbit is not None:
+        write_now(orbit, 0.0)
+        _start_in_orbit(work, robot, orbit, reference, point)
+
+
+def _start_in_orbit(work, robot, orbit, reference, point):
+    """Replace the initial momentum in `reference.start` by the Jacobi integral and five zeros."""
+    tree = robot.tree
+    total = kinetic_energy(work, tree, point.nu)
+    total = total + orbital_potential(work, tree, orbit, point.q)
+    for joint in range(len(robot.index)):
+        if robot.springy[joint]:
+            stretch = joint_position(robot, point.q, joint) - load(robot.rest, joint)
+            total = total + 0.5 * load(tree.stiffness, joint) * stretch * stretch
+    vec.clear(reference.start, 0, 6)
+    store(reference.start, 0, total)
 
 
 def _momentum_error(work, robot, nu, momentum):

@@ -68,10 +68,6 @@ class Limit(NamedTuple):
     reason: str
 
 
-def _is_in_orbit(robot: Robot) -> bool:
-    return robot.orbit is not None
-
-
 def _has_other_joint(robot: Robot) -> bool:
     return batch_tree(robot) is None
 
@@ -84,6 +80,10 @@ def _has_constraints(robot: Robot) -> bool:
     return bool(robot.constraints)
 
 
+def _has_constraints_in_orbit(robot: Robot) -> bool:
+    return bool(robot.constraints) and robot.orbit is not None
+
+
 LIMITS = (
     Limit(lambda task: not numba_is_there() and without_numba(), "{}"),
     Limit(lambda task: task.outputs, "the outputs are not the state"),
@@ -91,10 +91,6 @@ LIMITS = (
     Limit(lambda task: task.callback, "callbacks are called in Python"),
     Limit(lambda task: task.disturbance, "disturbances are computed in Python"),
     Limit(lambda task: task.python_policy, "a {} is computed in Python"),
-    Limit(
-        lambda task: task.first(_is_in_orbit),
-        "'{}' is in orbit, whose field is computed in Python",
-    ),
     Limit(
         lambda task: task.first(_has_other_joint),
         "a joint of '{}' does not move along a screw with a fixed axis",
@@ -106,6 +102,10 @@ LIMITS = (
     Limit(
         lambda task: not task.simulated and task.first(_has_constraints),
         "the constraints of '{}' are linearised in Python",
+    ),
+    Limit(
+        lambda task: task.first(_has_constraints_in_orbit),
+        "the constraints of '{}' are simulated in orbit in Python",
     ),
     Limit(
         lambda task: task.own_sample_time,

@@ -15,6 +15,7 @@ from fflin.kernel import vectors as vec
 from fflin.kernel.allocation import allocate, write_difference
 from fflin.kernel.constraints import CONSTRAINTS
 from fflin.kernel.forward import MECHANICS, MOMENTUM_REFERENCE, POINT
+from fflin.kernel.orbit import ORBIT
 from fflin.kernel.policies import (
     LAW,
     NOTHING,
@@ -235,10 +236,14 @@ class StopConditions(namedtuple("StopConditions", "squares sign")):
 
 class Arguments(
     namedtuple(
-        "Arguments", "robot method law channel reference project pushed stop point"
+        "Arguments",
+        "robot orbit method law channel reference project pushed stop point",
     )
 ):
     """Arguments of `advance`.
+
+    `orbit` is used by `advance_in_orbit` and `advance_one_in_orbit` only. The reference then
+    contains the Jacobi integral in place of the momentum.
 
     If `project` is true, `forward.impose` corrects the base's position and velocity at the end of
     each step. After the correction, momentum and centre of mass match the momentum reference. If
@@ -253,6 +258,7 @@ ARGUMENTS = Struct(
     Arguments,
     FLAG,
     robot=MECHANICS,
+    orbit=ORBIT,
     method=METHOD,
     law=LAW,
     channel=CHANNEL,
@@ -318,10 +324,10 @@ def _move(robot, method, point, stage):
         vec.displace(robot.tree, point.q, along, point.q)
 
 
-def _ask(work, robot, law, channel, point, t, step, stage):
+def _ask(work, robot, orbit, law, channel, point, t, step, stage):
     """Write the command of the policy to `point.u`, and correct the memory of the policy."""
     count = step // max(channel.sample, 1)
-    command(work, robot, law, point, t, count, stage)
+    command(work, robot, orbit, law, point, t, count, stage)
     allocate(law.allocation, point, law.u)
     if len(law.filter.E) > 0:
         limit(channel, point.u)
@@ -331,7 +337,7 @@ def _ask(work, robot, law, channel, point, t, step, stage):
 
 def advance(words, clock, last, every, rows, work):
     """Advance eight runs; `words` are the 64-bit words of `ARGUMENTS`, see `_advance`."""
-    _advance(ARGUMENTS(words), None, clock, last, every, rows, work)
+    _advance(ARGUMENTS(words), None, None, clock, last, every, rows, work)
 
 
 def advance_one(words, clock, last, every, rows, work):
@@ -339,34 +345,48 @@ def advance_one(words, clock, last, every, rows, work):
 
     A single run would be slower in eight equal lanes.
     """
-    _advance(ARGUMENTS_OF_ONE(words), None, clock, last, every, rows, work)
+    _advance(ARGUMENTS_OF_ONE(words), None, None, clock, last, every, rows, work)
 
 
-# Only robots with constraints use the next two functions, so the other robots do not wait until
-# these functions are compiled.
+# Only robots with constraints use the next two functions, and only robots in orbit use the two
+# functions after them, so that other robots do not wait until they are compiled.
 
 
 def advance_constrained(words, clock, last, every, rows, work):
     """Advance eight runs; `words` are the words of `CONSTRAINED`, see `_advance`."""
     arguments = CONSTRAINED(words)
-    _advance(arguments.usual, arguments.constraints, clock, last, every, rows, work)
+    usual = arguments.usual
+    _advance(usual, None, arguments.constraints, clock, last, every, rows, work)
 
 
 def advance_one_constrained(words, clock, last, every, rows, work):
     """Advance one run; `words` are the words of `CONSTRAINED_OF_ONE`, see `_advance`."""
     arguments = CONSTRAINED_OF_ONE(words)
-    _advance(arguments.usual, arguments.constraints, clock, last, every, rows, work)
+    usual = arguments.usual
+    _advance(usual, None, arguments.constraints, clock, last, every, rows, work)
 
 
-def _advance(arguments, constraints, clock, last, every, rows, work):
+def advance_in_orbit(words, clock, last, every, rows, work):
+    """Advance eight runs of a robot in orbit; the arguments are the arguments of `advance`."""
+    arguments = ARGUMENTS(words)
+    _advance(arguments, arguments.orbit, None, clock, last, every, rows, work)
+
+
+def advance_one_in_orbit(words, clock, last, every, rows, work):
+    """Advance one run of a robot in orbit; the arguments are the arguments of `advance_one`."""
+    arguments = ARGUMENTS_OF_ONE(words)
+    _advance(arguments, arguments.orbit, None, clock, last, every, rows, work)
+
+
+def _advance(arguments, orbit, constraints, clock, last, every, rows, work):
     """Advance all runs to the step `last`, or until one of the runs meets a stop condition.
 
     The function updates the point, the momentum reference, the state of the policy and the state of
     the channel. clock (1,) is the number of finished steps. Before step 0, the initial momentum and
     centre of mass are written into the momentum reference.
 
-    `constraints` is None for a robot without constraints. The code for constraints is then not
-    compiled.
+    `orbit` is None without an orbit, and `constraints` is None for a robot without constraints. The
+    code for them is then not compiled.
 
     If `every` is not 0, the function writes a row into `rows` at every step that is a multiple of
     `every`. A row consists of q, nu, u, the reference momentum (6,), the reference centre of mass
@@ -383,7 +403,7 @@ def _advance(arguments, constraints, clock, last, every, rows, work):
     at = 0
     forward.configure(work, robot, point.q)
     if clock[0] == 0:
-        forward.start_at(work, robot, kept, point)
+        forward.start_at(work, robot, orbit, kept, point)
     for step in range(clock[0], last):
         recorded = every > 0 and step % every == 0
         vec.copy(point.q, 0, method.first, 0, len(point.q))
@@ -391,14 +411,13 @@ def _advance(arguments, constraints, clock, last, every, rows, work):
         for stage in range(len(method.origin)):
             t = step * h + method.nodes[stage]
             if law.kind != NOTHING and (channel.sample == 0 or stage == 0):
-                _command(work, arguments, t, step, stage)
+                _command(work, arguments, orbit, t, step, stage)
             forward.apply_faults(
                 robot.faults, robot.triads, step * h, h, point.u, point.pushing
             )
             forward.turn_held(robot, point)
-            forward.accelerate(
-                work, robot, point, t, method.rates, (1 + stage) * len(point.nu)
-            )
+            to = (1 + stage) * len(point.nu)
+            forward.accelerate(work, robot, orbit, point, t, method.rates, to)
             if constraints is not None:
                 _constrain(work, robot, constraints, method, point, stage)
             if stage == 0:
@@ -407,7 +426,7 @@ def _advance(arguments, constraints, clock, last, every, rows, work):
                     at = _record(kept, point, constraints, step * h, rows, at)
             if arguments.pushed:
                 weight, moment = method.weights[stage], method.moments[stage]
-                forward.add_wrench(work, robot, kept, point, weight, moment)
+                forward.add_wrench(work, robot, orbit, kept, point, weight, moment)
             _move(robot, method, point, stage)
             if len(law.filter.rates) > len(law.filter.z):
                 _combine(method.speed, stage, law.filter.rates, law.filter.z)
@@ -437,11 +456,12 @@ def _record(kept, point, constraints, t, rows, at):
     return at
 
 
-def _command(work, arguments, t, step, stage):
+def _command(work, arguments, orbit, t, step, stage):
     """Write the inputs that the actuator channel lets through at a stage to `point.u`."""
     channel, point = arguments.channel, arguments.point
     if is_asked(channel, step):
-        _ask(work, arguments.robot, arguments.law, channel, point, t, step, stage)
+        robot, law = arguments.robot, arguments.law
+        _ask(work, robot, orbit, law, channel, point, t, step, stage)
     transmit(channel, step, point.nu, point.u)
 
 

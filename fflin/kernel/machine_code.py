@@ -279,27 +279,31 @@ class PartLibrary(CPUCodeLibrary):
         self._ensure_finalized()
         return 0
 
-    def _called(self, modules: dict[CodeLibrary, ir.Module]) -> None:
-        """Add to the dict `modules` the LLVM code of all functions that this part calls.
+    def _called(self, seen: set[CodeLibrary], order: list[CodeLibrary]) -> None:
+        """Append to `order` all functions that this part calls, each after its own callees.
 
-        Indirectly called functions are included. Each function is added once.
+        Indirectly called functions are included. `seen` is the set of functions that need not be
+        appended, because they have already been.
         """
         for library in self._linking_libraries:
-            if library not in modules:
-                part = isinstance(library, PartLibrary)
-                get = CPUCodeLibrary if part else type(library)
-                modules[library] = get._get_module_for_linking(library)
-                if part:
-                    library._called(modules)
+            if library not in seen:
+                seen.add(library)
+                if isinstance(library, PartLibrary):
+                    library._called(seen, order)
+                order.append(library)
 
     def _get_module_for_linking(self) -> ir.Module:
         """Return the LLVM code of this part together with one copy of each called function."""
         if self._whole is None:
-            modules = {self: super()._get_module_for_linking()}
-            self._called(modules)
-            part, *called = modules.values()
-            self._whole = part.clone()
-            for module in called:
+            self._whole = super()._get_module_for_linking().clone()
+            order: list[CodeLibrary] = []
+            self._called({self}, order)
+            # LLVM drops a function that no code linked so far calls. So callers must be linked
+            # before callees. A branch that is never taken may leave a function without callers.
+            for library in reversed(order):
+                part = isinstance(library, PartLibrary)
+                get = CPUCodeLibrary if part else type(library)
+                module = get._get_module_for_linking(library)
                 self._whole.link_in(module, preserve=True)
         return self._whole
 

@@ -11,6 +11,7 @@ from fflin.kernel import vectors as vec
 from fflin.kernel.allocation import ALLOCATION
 from fflin.kernel.bodies import move_bodies
 from fflin.kernel.forward import COMMON_POINT, joint_position
+from fflin.kernel.orbit import spin_at, write_now
 from fflin.kernel.tree import (
     FLAG,
     FLAGS,
@@ -287,11 +288,12 @@ def _times(matrix, row, x):
     return total
 
 
-def command(work, robot, law, point, t, count, stage):
+def command(work, robot, orbit, law, point, t, count, stage):
     """Write the command of a policy into `law.u`.
 
     t [s] is the time of the run, and `stage` the index of the stage in the step. `count` is the
-    index of the sample, or the index of the step if commands are continuous.
+    index of the sample, or the index of the step if commands are continuous. `orbit` is None
+    without an orbit.
     """
     if law.kind == TRACK:
         track(robot, law.path, point, law.u, t)
@@ -304,7 +306,11 @@ def command(work, robot, law, point, t, count, stage):
     tree = robot.tree
     offsets = tree.offsets
     if len(gyros) > 0:
-        move_bodies(work, tree, point.nu)
+        omega_b = vec.get3(point.nu, 0)
+        if orbit is not None:
+            write_now(orbit, t)
+            omega_b = vec.plus(omega_b, spin_at(orbit, point.q))
+        move_bodies(work, tree, point.nu, omega_b)
     for index in range(len(gyros)):
         rate = vec.get3(work, offsets.motion + gyros[index] * MOTION)
         axes = vec.get_columns(work, offsets.places + gyros[index] * PLACE)

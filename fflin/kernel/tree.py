@@ -186,13 +186,16 @@ PLACE, INERTIA = 12, 10
 # MOTION is the number of entries for a body's motion. LOAD is the number of entries for the forces
 # and momenta of the body's subtree. The offsets of the entries are in `kernel.bodies`.
 MOTION, LOAD = 30, 27
+# FIELD is the number of entries of a body for the gravity gradient: the position of its joint
+# relative to the base's origin, and the moment and force on its subtree.
+FIELD = 9
 
 
 class WorkOffsets(
     namedtuple(
         "WorkOffsets",
         "places body_inertias subtree_inertias packed scaled diagonal square motion load bias "
-        "c columns lower block size",
+        "c columns lower block field size",
     )
 ):
     """Offsets of the arrays in the work space of a tree. `size` is the size of the work space.
@@ -206,6 +209,7 @@ class WorkOffsets(
     - `columns` (6 + n, number of body-fixed inputs): the columns of B_u of body-fixed inputs.
     - `lower` (6 + n, 12 + 2 n): the matrix of `kernel.derivatives.differentiate`. `block` (6 + n,
       6): a copy of six of its columns.
+    - `field`: positions and forces of `kernel.orbit.add_gradient`; empty without an orbit.
     """
 
 
@@ -288,11 +292,9 @@ TREE = Struct(
 def batch_tree(robot: Robot) -> Tree | None:
     """Return the tree of a robot.
 
-    Return None if the robot is in orbit, or if a joint is not a screw joint. A screw joint is
-    revolute, prismatic or helical, with a constant axis.
+    Return None if a joint is not a screw joint. A screw joint is revolute, prismatic or helical,
+    with a constant axis.
     """
-    if robot.orbit:
-        return None
     model = robot.model
     joints = model.joints.tolist()[ROOT:]
     screws = [screw_of(model, joint) for joint in joints[1:]]
@@ -348,7 +350,13 @@ def batch_tree(robot: Robot) -> Tree | None:
         stored=np.array(stored).ravel(),
         stiffness=np.array(robot.springs.stiffness),
         damping=np.array(robot.springs.damping),
-        offsets=_work_offsets(bodies, size, sum(map(len, paths)), len(inputs)),
+        offsets=_work_offsets(
+            bodies,
+            size,
+            sum(map(len, paths)),
+            len(inputs),
+            bodies * FIELD if robot.orbit else 0,
+        ),
     )
 
 
@@ -422,10 +430,13 @@ def _wrenches(
     return wrench_body, inputs, wrenches
 
 
-def _work_offsets(bodies: int, size: int, entries: int, fixed: int) -> WorkOffsets:
+def _work_offsets(
+    bodies: int, size: int, entries: int, fixed: int, of_field: int
+) -> WorkOffsets:
     """Return the offsets in the work space, whose arrays follow one another.
 
-    M has `size` rows and `entries` packed entries. `fixed` is the number of body-fixed inputs.
+    M has `size` rows and `entries` packed entries. `fixed` is the number of body-fixed inputs, and
+    `of_field` the number of entries for the gravity gradient.
     """
     places = 0
     body_inertias = places + bodies * PLACE
@@ -441,6 +452,7 @@ def _work_offsets(bodies: int, size: int, entries: int, fixed: int) -> WorkOffse
     columns = c + size
     lower = columns + size * fixed
     block = lower + size * 2 * size
+    field = block + size * 6
     return WorkOffsets(
         places=places,
         body_inertias=body_inertias,
@@ -456,7 +468,8 @@ def _work_offsets(bodies: int, size: int, entries: int, fixed: int) -> WorkOffse
         columns=columns,
         lower=lower,
         block=block,
-        size=block + size * 6,
+        field=field,
+        size=field + of_field,
     )
 
 

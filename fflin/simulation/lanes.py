@@ -22,13 +22,14 @@ from fflin.control.loops import Sample, measured_at
 from fflin.control.policy import Form, OutputForm, PathForm, Policy, StateForm
 from fflin.control.tracking import AT_THE_END, TrajectoryFeedback
 from fflin.dynamics.disturbance import Wave, waves_of
+from fflin.dynamics.orbital import mean_motion
 from fflin.dynamics.state import StateMap
-from fflin.kernel import allocation, forward, loop, policies
+from fflin.kernel import allocation, forward, loop, orbit, policies
 from fflin.kernel.compiled import compiles, is_kept, kernel
 from fflin.kernel.constraints import LEAST_FRACTION, Constraints
 from fflin.kernel.limits import Task, reason_against
 from fflin.kernel.tree import LANES, batch_tree, empty, laid_out, work_space
-from fflin.robot.disturbance import BASE, UNITS, DisturbanceTerm
+from fflin.robot.disturbance import BASE, INERTIAL, UNITS, DisturbanceTerm
 from fflin.robot.fields import input_limits, limits_of
 from fflin.robot.inputs import BaseTorque
 from fflin.robot.joints import ROOT, find_frame
@@ -79,8 +80,8 @@ def loop_name(plan: Plan, *, lanes: int) -> str:
     """Return the name of the kernel function that simulates a number of runs of a plan."""
     name = "advance_one" if lanes == 1 else "advance"
     if plan.plant.constrained is not None:
-        name += "_constrained"
-    return name
+        return f"{name}_constrained"
+    return f"{name}_in_orbit" if plan.plant.field else name
 
 
 def form_of(policy: Policy, robot: Robot) -> Form | None:
@@ -567,6 +568,7 @@ def packed(
     channel = channel_of(plan.limits, u, times.sample, delays)
     return loop.Arguments(
         robot=mechanics,
+        orbit=orbit_of(plant),
         method=loop.Method(
             h=h,
             origin=method.origins,
@@ -637,7 +639,22 @@ def mechanics_of(plant: Plant, *, dispersed: bool = False) -> forward.Mechanics:
             rate=[wave.rate for wave in waves],
             at=[0 if wave.name == BaseTorque.GROUP else 3 for wave in waves],
             held=[wave.axes != BASE for wave in waves],
+            inertial=[bool(plant.field) and wave.axes == INERTIAL for wave in waves],
         ),
+    )
+
+
+def orbit_of(plant: Plant) -> orbit.Orbit:
+    """Return the kernel's parameters of the orbit of a plant; empty without an orbit."""
+    none: orbit.Orbit = empty(orbit.ORBIT)
+    field = plant.field
+    if field is None:
+        return none
+    return none._replace(
+        outwards=field.axes[:, 0],
+        normal=field.axes[:, 2],
+        mean_motion=[mean_motion(plant.robot)],
+        now=np.zeros(4),
     )
 
 

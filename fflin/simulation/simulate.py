@@ -188,9 +188,8 @@ def simulate(
     engine : {"python", "compiled"}, optional
         Engine that runs the simulation. The default is "python". But a run of more than 20,000
         steps uses "compiled" by default if this engine has already been compiled. The compiled
-        engine needs numba. It does not support orbits. It also does not support functions written
-        in Python, such as policies, events, callbacks and disturbances. The results of both engines
-        agree to machine precision.
+        engine needs numba. It does not support functions written in Python, such as policies,
+        events, callbacks and disturbances. The results of both engines agree to machine precision.
 
     Returns
     -------

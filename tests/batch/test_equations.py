@@ -10,6 +10,7 @@ import fflin
 from fflin.batch.sweep import ChunkJob
 from fflin.kernel import limits
 from fflin.kernel.compiled import kernel
+from tests.support.orbits import in_orbit
 from tests.support.robots import BUNDLED, LINKS, MIMIC, random_tree
 
 pytest.importorskip("numba")
@@ -102,6 +103,14 @@ def test_kernel_knows_springs_gravity_thrusters_and_wheels(case, robots):
         gravity=(1.0, 2.0, -9.81),
     )
     assert agreement(robot, **CASES[case]) < 1e-13
+
+
+@pytest.mark.parametrize("case", ["hill", "lvlh", "lvlh, tilted"])
+def test_kernel_knows_the_gravity_gradient(case, robots):
+    options = CASES["hybrid, tilted"] if "tilted" in case else {}
+    robot = in_orbit(robots["servicer_7dof"].replace(stiffness=2.0, damping=0.1))
+    options = options | {"frame": case.partition(",")[0]}
+    assert agreement(robot, **options) < 1e-13
 
 
 def test_kernel_counts_rotors(robots):

@@ -40,6 +40,30 @@ def test_a_loop_in_orbit_settles(regulated):
 
 
 @pytest.mark.compiled
+def test_compiled_campaigns_agree_with_the_python_engine(regulated):
+    robot, lin, gain = regulated
+    policy = fflin.StateFeedback(lin, gain.K)
+    spread = {"q_b": 0.05, "base.mass": 0.1, "*.com": 0.01, "r_b": 0.2}
+    options = {"runs": 3, "duration": 0.5, "seed": 2}
+    one, other = (
+        fflin.monte_carlo(robot, policy, spread, engine=engine, **options)
+        for engine in ("compiled", "python")
+    )
+    for name in ("q", "v", "u", "x"):
+        expected = getattr(other, name)
+        # Rounding errors of all steps, relative to the largest entry.
+        size = np.maximum(1.0, np.abs(expected).max())
+        assert np.abs(getattr(one, name) - expected).max() < 1e-12 * size, name
+
+
+@pytest.mark.compiled
+def test_validity_in_orbit_is_compiled(regulated):
+    robot, lin, gain = regulated
+    result = fflin.validity(robot, lin, gain, samples=2, attitude=20.0)
+    assert result.outcomes == ("settled", "settled")
+    assert not result.notes
+
+
 def test_refused(regulated):
     robot, lin, gain = regulated
     free = robot.replace(orbit=None)
@@ -49,10 +73,6 @@ def test_refused(regulated):
     knots = [np.tile(row, (2, 1)) for row in (q, v, u)]
     free_model = fflin.linearize(free)
     policy = fflin.StateFeedback(free_model, fflin.lqr(free_model).K)
-    with pytest.raises(fflin.InputError, match="compiled"):
-        fflin.monte_carlo(
-            robot, None, {"q_b": 0.1}, runs=2, duration=0.1, engine="compiled"
-        )
     for refused in (
         lambda: fflin.funnel(robot, schedule, goal={"attitude": 1.0}),
         lambda: fflin.simulate(robot, schedule),

@@ -77,7 +77,8 @@ def advanced(plan, about=None, every=1, cuts=()):
     clock, pieces = np.zeros(1, dtype=int), []
     for last in (*cuts, times.steps):
         rows, first = np.zeros((times.steps, width)), clock[0]
-        loop.advance(
+        advance = loop.advance_in_orbit if plan.plant.field else loop.advance
+        advance(
             parts, clock, last, every, rows.ravel(), np.zeros(robot.tree.offsets.size)
         )
         count = -(-clock[0] // every) - -(-first // every) if every else 0

@@ -4,19 +4,23 @@ import subprocess
 import sys
 from importlib.util import find_spec
 
-# Two processes, for two cores. Each loads a robot and calls what its kernels serve.
+# Two processes, for two cores. Each loads a robot and calls what its kernels serve. The second
+# process also calls what the kernels for orbits serve.
 _CALLS = (
     """
 law = fflin.StateFeedback(lin, fflin.lqr(lin).K)
-spread = {"*.mass": 0.05, "q_b": 0.02}
 fflin.monte_carlo(robot, law, spread, runs=8, duration=0.02, dt=0.01, engine="compiled")
 """,
     """
 fflin.sweep(robot, [robot.neutral()])
+robot = robot.replace(orbit=700e3)
+fflin.sweep(robot, [robot.neutral()])
+fflin.monte_carlo(robot, None, spread, runs=8, duration=0.02, dt=0.01, engine="compiled")
 """,
 )
 _BEFORE = (
-    "import fflin; robot = fflin.load('planar_detumble'); lin = fflin.linearize(robot)"
+    "import fflin; robot = fflin.load('planar_detumble'); lin = fflin.linearize(robot); "
+    "spread = {'*.mass': 0.05, 'q_b': 0.02}"
 )
 
 

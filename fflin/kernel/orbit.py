@@ -1,0 +1,229 @@
+r"""Motion relative to the rotating frame of an orbit, with the gravity gradient.
+
+All vectors are in base axes, and positions are relative to the base's origin. The orbital frame
+has the angular velocity s = theta' z. Here z is the orbit normal, r is the unit vector away from
+the central body, and k is its gravitational parameter divided by the cube of the distance from the
+central body. The gravity gradient gives a point at x the acceleration T x (14.1):
+
+.. math:: T = k (3 r r^T - E)
+
+A circular orbit has a constant k = n^2 and theta' = n. Only `write_now` knows how both depend on
+time.
+"""
+
+from collections import namedtuple
+
+from fflin.kernel import vectors as vec
+from fflin.kernel.bodies import add_column, at_parent, joint_axis, stored_momentum
+from fflin.kernel.tree import FIELD, INERTIA, PLACE, REALS, Struct
+from fflin.kernel.vectors import load
+
+# Offsets in `Orbit.now`.
+STRENGTH, RATE, RATE_CHANGE, ANGLE = range(4)
+
+
+class Orbit(namedtuple("Orbit", "outwards normal mean_motion now")):
+    """Orbit of the simulated robot.
+
+    - `outwards`, `normal` (3,): the unit vectors r and z in the axes of the orbital frame.
+    - `mean_motion` (1,) [rad/s].
+    - `now` (4,): k [1/s^2], theta' [rad/s], theta'' [rad/s^2], and the angle [rad] by which the
+      orbital frame has rotated since t = 0. `write_now` writes these values.
+    """
+
+
+ORBIT = Struct(Orbit, REALS)
+
+
+def write_now(orbit, t):
+    """Write the values of the orbit at time t [s] to `orbit.now`."""
+    n = orbit.mean_motion[0]
+    orbit.now[STRENGTH] = n * n
+    orbit.now[RATE] = n
+    orbit.now[RATE_CHANGE] = 0.0
+    orbit.now[ANGLE] = n * t
+
+
+def outwards_at(orbit, q):
+    """Return the unit vector r away from the central body, in base axes."""
+    return vec.across(vec.axes_of(q), vec.get3(orbit.outwards, 0))
+
+
+def normal_at(orbit, q):
+    """Return the unit vector z along the orbit normal, in base axes."""
+    return vec.across(vec.axes_of(q), vec.get3(orbit.normal, 0))
+
+
+def spin_at(orbit, q):
+    """Return the angular velocity of the orbital frame, in base axes."""
+    return vec.times(normal_at(orbit, q), orbit.now[RATE])
+
+
+def from_inertial_axes(orbit, a):
+    """Return a vector of the axes of the orbital frame at t = 0 in the axes of the frame now."""
+    z = vec.get3(orbit.normal, 0)
+    cosine, sine = vec.cosine_and_sine(orbit.now[ANGLE])
+    along_normal = vec.times(z, vec.dot(z, a) * (1.0 - cosine))
+    turned = vec.plus(vec.times(a, cosine), along_normal)
+    return vec.minus(turned, vec.times(vec.cross(z, a), sine))
+
+
+def tide(r, k, x):
+    """Return the acceleration T x of the gravity gradient at x."""
+    return vec.times(vec.minus(vec.times(r, 3.0 * vec.dot(r, x)), x), k)
+
+
+def pull_on(orbit, q, x):
+    """Return the acceleration, relative to the orbital frame, of a mass at rest in it at x.
+
+    Here x is relative to the origin of the orbital frame, and in base axes.
+    """
+    now, z = orbit.now, normal_at(orbit, q)
+    fall = tide(outwards_at(orbit, q), now[STRENGTH], x)
+    across_normal = vec.minus(x, vec.times(z, vec.dot(z, x)))
+    fall = vec.plus(fall, vec.times(across_normal, now[RATE] * now[RATE]))
+    return vec.minus(fall, vec.times(vec.cross(z, x), now[RATE_CHANGE]))
+
+
+def _inertia_times(work, at, w):
+    """Return I w, where I is the inertia about the joint in the spatial inertia at work[at]."""
+    (xx, xy, xz), (yy, yz, zz) = vec.get6(work, at + 4)
+    return (
+        vec.dot((xx, xy, xz), w),
+        vec.dot((xy, yy, yz), w),
+        vec.dot((xz, yz, zz), w),
+    )
+
+
+def add_gradient(work, tree, r, k):
+    """Add the generalised force of the gravity gradient to work[tree.offsets.c].
+
+    In the field region of `work`, write the position of each joint, and the moment and force of
+    the field on the joint's subtree.
+    """
+    offsets = tree.offsets
+    for body in range(len(tree.parent)):
+        at = offsets.field + body * FIELD
+        inertia = offsets.body_inertias + body * INERTIA
+        if body == 0:
+            vec.clear(work, at, 3)
+        else:
+            above = vec.get3(work, offsets.field + tree.parent[body] * FIELD)
+            step = vec.get3(work, offsets.places + body * PLACE + 9)
+            vec.put3(work, at, vec.plus(above, step))
+        origin = vec.get3(work, at)
+        m, h = load(work, inertia), vec.get3(work, inertia + 1)
+        force = tide(r, k, vec.plus(vec.times(origin, m), h))
+        turning = vec.cross(r, _inertia_times(work, inertia, r))
+        moment = vec.cross(h, tide(r, k, origin))
+        moment = vec.plus(moment, vec.times(turning, 3.0 * k))
+        vec.put6(work, at + 3, (moment, force))
+    for body in range(len(tree.parent) - 1, 0, -1):
+        wrench = vec.get6(work, offsets.field + body * FIELD + 3)
+        value = vec.dot6(joint_axis(work, tree, body), wrench)
+        vec.add(work, offsets.c + tree.coordinate[body], value)
+        to = offsets.field + tree.parent[body] * FIELD + 3
+        vec.add6(work, to, at_parent(work, offsets.places + body * PLACE, wrench))
+    vec.add6(work, offsets.c, vec.get6(work, offsets.field + 3))
+
+
+def _subtract(work, at, value):
+    vec.add(work, at, -value)
+
+
+def subtract_gradient_slopes(work, tree, r, k):
+    """Subtract the derivatives of the generalised force of the gravity gradient.
+
+    They are subtracted from the matrix (6 + n, 12 + 2 n) of `derivatives.differentiate`, which is
+    written before. The first three columns are for rotations of the base. `add_gradient` must have
+    written the positions of the joints.
+    """
+    offsets = tree.offsets
+    width = 2 * len(tree.row)
+    lower = offsets.lower
+    for body in range(len(tree.parent) - 1, 0, -1):
+        inertia = offsets.subtree_inertias + body * INERTIA
+        origin = vec.get3(work, offsets.field + body * FIELD)
+        m, h = load(work, inertia), vec.get3(work, inertia + 1)
+        column_i = tree.coordinate[body]
+        row_i = lower + column_i * width
+        w, linear = joint_axis(work, tree, body)
+        # A unit motion of the joint displaces the mass at the position y from the joint by
+        # `linear` + w x y. `shift` is the integral of this displacement over the subtree's mass.
+        # The force of a mass at x becomes T (x + its displacement), and its point of action moves.
+        shift = vec.plus(vec.times(linear, m), vec.cross(w, h))
+        force = tide(r, k, shift)
+        moment = vec.cross(shift, tide(r, k, origin))
+        moment = vec.plus(moment, vec.cross(linear, tide(r, k, h)))
+        moment = vec.plus(moment, vec.cross(h, tide(r, k, linear)))
+        # The torque about the joint is 3 k r x (I r). A rotation w changes I by [w]x I - I [w]x.
+        change = vec.cross(w, _inertia_times(work, inertia, r))
+        other = _inertia_times(work, inertia, vec.cross(w, r))
+        turning = vec.cross(r, vec.minus(change, other))
+        moment = vec.plus(moment, vec.times(turning, 3.0 * k))
+        wrench = moment, force
+        above = body
+        while above > 0:
+            # The field has a potential, so the derivatives of joint forces are symmetric.
+            column_j = tree.coordinate[above]
+            row_j = lower + column_j * width
+            value = vec.dot6(joint_axis(work, tree, above), wrench)
+            _subtract(work, row_j + column_i, value)
+            if above != body:
+                _subtract(work, row_i + column_j, value)
+            wrench = at_parent(work, offsets.places + above * PLACE, wrench)
+            above = tree.parent[above]
+        add_column(work, lower + column_i, width, vec.times6(wrench, -1.0))
+        for index in range(3):
+            _subtract(work, row_i + index, wrench[0][index])
+    # A rotation of the base about the axis e changes T in base axes by -3 k (g r^T + r g^T), with
+    # g = e x r.
+    zero = 0.0
+    one = 1.0
+    axes = (one, zero, zero), (zero, one, zero), (zero, zero, one)
+    inertia = offsets.subtree_inertias
+    h = vec.get3(work, inertia + 1)
+    for index in range(3):
+        g = vec.cross(axes[index], r)
+        force = vec.plus(vec.times(g, vec.dot(r, h)), vec.times(r, vec.dot(g, h)))
+        moment = vec.cross(g, _inertia_times(work, inertia, r))
+        moment = vec.plus(moment, vec.cross(r, _inertia_times(work, inertia, g)))
+        change = vec.times6((moment, force), 3.0 * k)
+        add_column(work, lower + index, width, change)
+
+
+def kinetic_energy(work, tree, nu):
+    """Return half of nu^T M nu, with the packed M."""
+    total = 0.0
+    for k in range(len(tree.row)):
+        row = tree.row[k]
+        momentum = 0.5 * load(work, tree.offsets.packed + row + tree.depth[k])
+        momentum = momentum * load(nu, k)
+        for t in range(tree.depth[k]):
+            entry = load(work, tree.offsets.packed + row + t)
+            momentum = momentum + entry * load(nu, tree.path[row + t])
+        total = total + momentum * load(nu, k)
+    return total
+
+
+def orbital_potential(work, tree, orbit, q):
+    """Return the potential energy [J] in the orbital frame, without springs (14.3)."""
+    now, r, z = orbit.now, outwards_at(orbit, q), normal_at(orbit, q)
+    inertia = tree.offsets.subtree_inertias
+    m, h = load(work, inertia), vec.get3(work, inertia + 1)
+    position = vec.across(vec.axes_of(q), vec.get3(q, 0))
+    first = vec.plus(vec.times(position, 0.5 * m), h)
+    total = vec.dot(pull_on(orbit, q, position), first)
+    # The integral of y^T K y over the mass, with y from the base's origin. It is the sum of the
+    # products of K with the second moments P = tr(I) / 2 E - I.
+    (xx, _, _), (yy, _, zz) = vec.get6(work, inertia + 4)
+    trace = 0.5 * (xx + yy + zz)
+    along_r = trace - vec.dot(r, _inertia_times(work, inertia, r))
+    along_z = trace - vec.dot(z, _inertia_times(work, inertia, z))
+    second = now[STRENGTH] * (3.0 * along_r - trace)
+    second = second + now[RATE] * now[RATE] * (trace - along_z)
+    total = -(total + 0.5 * second)
+    for index in range(len(tree.stored_body)):
+        along = vec.dot(z, stored_momentum(work, tree, index))
+        total = total - now[RATE] * along
+    return total

@@ -1,0 +1,165 @@
+"""The kernel in orbit, uncompiled, agrees with Pinocchio's mechanics in the orbital frame."""
+
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import fflin
+from fflin.kernel import derivatives, orbit
+from fflin.simulation.lanes import orbit_of
+from fflin.simulation.run import go
+from tests.kernel.test_advance import advanced, planned
+from tests.support.marks import exhaustive
+from tests.support.orbits import N, in_orbit
+from tests.support.policies import between_gains, outputs, plain, shared, state
+from tests.support.robots import LINKS, MIMIC, random_point, random_tree
+
+# Both engines round differently in each of at most 40 steps, by some machine epsilons relative to
+# the largest entry. The Jacobi integral is a sum of larger terms that cancel.
+TOLERANCE = 1e-12
+
+
+def agree(plan, tolerance=TOLERANCE):
+    plan = plan.replace(times=plan.times._replace(every=1))
+    expected = go(plan)
+    values = dict(zip(("q", "v", "u", "momentum"), advanced(plan), strict=False))
+    for name, value in values.items():
+        other = getattr(expected, name)
+        size = np.maximum(1.0, np.abs(other).max(axis=0, initial=0.0))
+        assert (np.abs(value - other) <= tolerance * size).all(), name
+    return expected
+
+
+def tree(n, seed):
+    return random_tree(np.random.default_rng(seed), n)
+
+
+def moving(robot, seed=3):
+    """The robot in orbit, with a random point of fast motion away from the frame's origin."""
+    q, v, _ = random_point(robot, np.random.default_rng(seed), speed=0.3, degrees=40.0)
+    q[:3] += [4.0, -7.0, 2.0]
+    return in_orbit(robot), {"q0": q, "v0": v, "dt": 0.02, "duration": 0.12}
+
+
+@pytest.mark.parametrize("frame", ["hill", "lvlh"])
+@pytest.mark.parametrize("name", ["cubesat", *exhaustive("planar_detumble", "ets_vii")])
+def test_a_free_motion_matches_pinocchio(robots, name, frame):
+    robot, options = moving(robots[name])
+    agree(planned(robot, frame=frame, **options))
+
+
+@pytest.mark.parametrize("seed", [1, *exhaustive(2, 3, 4)])
+def test_springs_dampers_and_every_joint_type_match_pinocchio(seed):
+    robot, options = moving(tree(4, seed).replace(stiffness=2.0, damping=0.5))
+    run = agree(planned(robot, **options))
+    assert np.ptp(run.momentum[:, 0]) > 1e-3  # the work of the dampers
+
+
+def mimic(path):
+    """A robot with a mimic joint, and with rotors."""
+    followed = '<mimic joint="b" multiplier="-2" offset="0.3"/>'
+    types = {"a": "prismatic", "b": "continuous"}
+    document = MIMIC.format(links=LINKS, parent="la", mimic=followed, **types)
+    (path / "r.urdf").write_text(document)
+    robot = fflin.load(path / "r.urdf")
+    model = robot.model.copy()
+    model.armature = np.r_[np.zeros(6), np.linspace(0.1, 2.0, model.nv - 6)]
+    return replace(robot, model=model)
+
+
+def test_mimic_joints_and_rotors_match_pinocchio(tmp_path):
+    robot, options = moving(mimic(tmp_path))
+    agree(planned(robot, **options))
+
+
+def test_stored_momentum_matches_pinocchio(robots):
+    wheel = fflin.ReactionWheel([1.0, 2.0, -1.0], momentum=0.02)
+    robot, options = moving(robots["cubesat"].replace(inputs=[wheel]))
+    agree(planned(robot, **options))
+
+
+def test_disturbances_in_all_axes_match_pinocchio(robots):
+    inertial = {"amplitude": [0.1, 0.2, -0.1], "frequency": 0.7, "axes": "inertial"}
+    robot, options = moving(robots["cubesat"])
+    robot = robot.replace(
+        disturbance={
+            "tau_b": [{"constant": [1e-3, 0.0, 2e-3]}, inertial],
+            "F_b": [
+                {"constant": [0.1, 0.2, 0.3], "axes": "inertial"},
+                {"constant": [0.3, 0.0, 0.1], "axes": "orbital"},
+            ],
+        }
+    )
+    agree(planned(robot, **options))
+
+
+@pytest.mark.parametrize("make", [state, *exhaustive(outputs, between_gains, shared)])
+def test_every_kind_of_law_matches_pinocchio(robots, make):
+    robot, policy, options = make(in_orbit(plain(robots["planar_detumble"])))
+    q0 = fflin.configuration(robot, rpy=(8, -5, 12))
+    options = {"q0": q0, "dt": 0.02, "duration": 0.1} | options
+    run = agree(planned(robot, policy, **options))
+    assert np.abs(run.u).max() > 1e-3
+
+
+def test_the_frame_turns_a_constant_inertial_vector_back(robots):
+    plan = planned(in_orbit(robots["cubesat"]), frame="hill", duration=1.0)
+    values = orbit_of(plan.plant)
+    values = values._replace(mean_motion=np.array(values.mean_motion))
+    orbit.write_now(values, 0.7)
+    expected = pin.exp3(np.array([0.0, 0.0, -0.7 * N])) @ [1.0, 2.0, 3.0]
+    result = orbit.from_inertial_axes(values, (1.0, 2.0, 3.0))
+    assert result == pytest.approx(tuple(expected), rel=1e-15)
+
+
+def swept(robot, monkeypatch, **options):
+    """Models of the batch kernel, uncompiled, and models of `linearize`."""
+    monkeypatch.setattr(
+        derivatives, "kernel", lambda _, name: getattr(derivatives, name)
+    )
+    monkeypatch.setattr("fflin.batch.sweep.compiles", lambda *_: True)
+    rng = np.random.default_rng(5)
+    points = [random_point(robot, rng, speed=0.3, degrees=40.0) for _ in range(8)]
+    q, v = (
+        np.array(rows) for rows in zip(*(point[:2] for point in points), strict=True)
+    )
+    q[:, :3] += [40.0, -70.0, 20.0]
+    return fflin.sweep(robot, q, v, **options), [
+        fflin.linearize(robot, q_i, v_i, **options)
+        for q_i, v_i in zip(q, v, strict=True)
+    ]
+
+
+@pytest.mark.parametrize("frame", ["hill", *exhaustive("lvlh")])
+@pytest.mark.parametrize("seed", [1, *exhaustive(2, 3)])
+def test_the_batch_kernel_matches_linearize(monkeypatch, frame, seed):
+    robot = in_orbit(tree(3, seed).replace(stiffness=2.0, damping=0.5))
+    compare(*swept(robot, monkeypatch, frame=frame))
+
+
+def test_the_batch_kernel_matches_linearize_with_mimic_joints(monkeypatch, tmp_path):
+    compare(*swept(in_orbit(mimic(tmp_path)), monkeypatch))
+
+
+def compare(batch, models):
+    for k, lin in enumerate(models):
+        for name in ("A", "B", "f0"):
+            expected = getattr(lin, name)
+            # A small inertia amplifies rounding errors by the condition number of M.
+            limit = TOLERANCE * max(1.0, np.abs(expected).max())
+            assert np.abs(getattr(batch, name)[k] - expected).max() < limit, name
+
+
+def test_the_batch_kernel_leaves_points_far_from_the_frame(monkeypatch, robots):
+    robot = robots["cubesat"].replace(orbit=500e3)
+    monkeypatch.setattr(
+        derivatives, "kernel", lambda _, name: getattr(derivatives, name)
+    )
+    monkeypatch.setattr("fflin.batch.sweep.compiles", lambda *_: True)
+    q = np.tile(robot.neutral(), (8, 1))
+    fflin.sweep(robot, q)
+    q[3, 0] = 1e5  # 1.5 % of the radius
+    with pytest.warns(fflin.FflinWarning, match="linear gravity gradient"):
+        fflin.sweep(robot, q)
