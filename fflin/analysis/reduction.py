@@ -97,14 +97,21 @@ class ReducedModel(LinearModel):
 
         Of a model with delayed inputs, `T` and `S` also map the commands on their way.
         """
-        sampled = super().discretize(dt, delay)
-        count = len(sampled.added)
+        return self._extended(super().discretize(dt, delay))
+
+    def with_lags(self, lag: Delay | None = None) -> LinearModel:
+        """Return the model with the lags of its inputs, see `LinearModel.with_lags`."""
+        return self._extended(super().with_lags(lag))
+
+    def _extended(self, model: LinearModel) -> LinearModel:
+        """Return a model made from this one, whose maps also contain the states that it added."""
+        count = len(model.added) - len(self.added)
         if not count:
-            return sampled
-        assert isinstance(sampled, ReducedModel)
+            return model
+        assert isinstance(model, ReducedModel)
         none = np.zeros((len(self.momenta), count))
         return replace(
-            sampled,
+            model,
             T=block_diag(self.T, np.eye(count)),
             S=block_diag(self.S, np.eye(count)),
             momenta=np.hstack((self.momenta, none)),

@@ -287,7 +287,7 @@ def delayed_model(
             raise InputError(f"delay is {delay:g} s, expected at least 0")
         return lin, delay
     known = policy._lin if isinstance(policy, Gain) else as_policy(policy).model
-    if lin.delay.any():
+    if lin.delay.any() or lin.lag.any():
         return lin, 0.0
     if known is None:
         if isinstance(policy, Gain) and is_delayed(policy.state_names):
@@ -298,7 +298,7 @@ def delayed_model(
         return lin, 0.0
     source = lin.generator if lin.dt else lin
     if (
-        not known.delay.any()
+        not known.added
         or known.input_names != lin.input_names
         or (lin.dt and not math.isclose(lin.dt, known.dt))
     ):
@@ -308,6 +308,11 @@ def delayed_model(
             "the law was designed for delayed inputs, but lin is sampled without a delay and its "
             "continuous model is unknown; give the continuous model, or delay=0"
         )
+    if known.lag.any():
+        lags = dict(zip(input_keys(lin), known.lag.tolist(), strict=True))
+        source = source.with_lags(lags)
+    if not known.dt:
+        return source, 0.0
     delays = dict(zip(input_keys(lin), known.delay.tolist(), strict=True))
     return source.discretize(known.dt, delay=delays), 0.0
 

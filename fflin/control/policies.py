@@ -238,8 +238,9 @@ class LinearLaw(Feedback):
         """Return the predictor of the closed loop with the model `lin`."""
         if self.is_gain:
             K, constant, _ = self._gain_terms(state)
-            at_point = constant - K @ lin.x0
-            return lin, lambda e: at_point - K @ e
+            nx = K.shape[1]
+            at_point = constant - K @ lin.x0[:nx]
+            return lin, lambda e: at_point - K @ e[:nx]
         if not self.sample_time:
             both, gains, offset = self.around(lin)
             return both, lambda e: offset + gains @ e

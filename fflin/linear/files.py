@@ -67,11 +67,12 @@ _ARRAYS: dict[str, tuple[str, ...]] = {
     "drift": ("drift",),
     "limits": ("limit",),
     "delay": ("late",),
+    "lag": ("late",),
 }
 _NAMES = [f"{signal}_{field}" for field in ("names", "units") for signal in _SIGNALS]
 _LISTS = (*_NAMES, "locked", "ignorable", "wheels", "limit_names", "added")
 # Lists and arrays that files of earlier versions lack.
-_OPTIONAL = ("wheels", "added", "delay")
+_OPTIONAL = ("wheels", "added", "delay", "lag")
 _TEXTS = (
     "frame",
     "robot",
@@ -181,6 +182,9 @@ def read_model(
         delays = fields.pop("delay", np.zeros(0))
         if delays.any():
             fields["_delays"] = tuple(delays.tolist())
+        lags = fields.pop("lag", np.zeros(0))
+        if lags.any():
+            fields["_lags"] = tuple(lags.tolist())
         fields |= {
             "moving": bool(fields["moving"]),
             "verified": verified,

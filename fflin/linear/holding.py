@@ -49,7 +49,7 @@ def held(lin: LinearModel, *, tilt: bool = True) -> LinearModel:
     robot = lin._robot
     if is_held(lin) or lin.moving or robot is None or lin.u0.any():
         return lin
-    source = lin.generator or lin
+    source = (lin.generator or lin).undelayed
     if len(source.A) != 2 * robot.nv:
         return lin
     frame = frame_of(robot, source.frame)
@@ -62,6 +62,9 @@ def held(lin: LinearModel, *, tilt: bool = True) -> LinearModel:
     model = linearize(
         robot, balanced.q, source.v, balanced.u, frame=frame, reference=reference
     )
+    if lin.lag.any():
+        lags = dict(zip(input_keys(lin), lin.lag.tolist(), strict=True))
+        model = model.with_lags(lags)
     if lin.dt:
         delays = dict(zip(input_keys(lin), lin.delay.tolist(), strict=True))
         return model.discretize(lin.dt, delays)

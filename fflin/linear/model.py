@@ -14,7 +14,7 @@ import pinocchio as pin
 
 from fflin.base import html, svg
 from fflin.base.errors import InputError, optional_package
-from fflin.base.names import by_name, input_keys, past_name, undotted
+from fflin.base.names import by_name, input_keys, lag_name, past_name, undotted
 from fflin.base.validation import (
     Array,
     ArrayLike,
@@ -28,6 +28,7 @@ from fflin.base.validation import (
 from fflin.base.writing import as_path
 from fflin.dynamics.delays import HeldSystem, split
 from fflin.dynamics.integrators import held_exponential
+from fflin.robot.inputs import lags_of
 
 if TYPE_CHECKING:
     import control
@@ -249,10 +250,13 @@ class LinearModel(ModelHeader, StateSpace):
     mean_motion : float
         Mean motion of the robot's orbit [rad/s]; 0 without an orbit.
     added : tuple of str
-        Names of the last states, which are not states of the robot: the earlier commands of a
-        model with delayed inputs, see `discretize`.
+        Names of the last states, which are not states of the robot: the forces of inputs with a
+        lag, see `with_lags`, and the earlier commands of a model with delayed inputs, see
+        `discretize`.
     delay : ndarray (nu,)
         Delay of each input [s].
+    lag : ndarray (nu,)
+        Time constant of the lag of each input [s] in the model; 0 if the model has no lag.
 
     Examples
     --------
@@ -287,6 +291,7 @@ class LinearModel(ModelHeader, StateSpace):
     mean_motion: float = 0.0
     added: tuple[str, ...] = ()
     _delays: tuple[float, ...] = ()  # empty if no input is delayed
+    _lags: tuple[float, ...] = ()  # empty if no input has a lag
 
     def __init__(
         self, shared: Mapping[str, object] | None = None, /, **fields: object
@@ -356,7 +361,7 @@ class LinearModel(ModelHeader, StateSpace):
         source = self.generator
         if source is None:
             return self.f0 / self.dt
-        return np.append(source.f0, np.zeros(len(self.added)))
+        return np.append(source.f0, np.zeros(len(self.x0) - len(source.x0)))
 
     @property
     def delay(self) -> Array:
@@ -366,21 +371,29 @@ class LinearModel(ModelHeader, StateSpace):
         return np.array(self._delays)
 
     @property
+    def lag(self) -> Array:
+        """Time constant (nu,) of the lag of each input in the model [s]; 0 without a lag."""
+        if not self._lags:
+            return np.zeros(len(self.input_names))
+        return np.array(self._lags)
+
+    @property
     def robot_states(self) -> tuple[str, ...]:
         """Names of the states without those in `added`."""
         return self.state_names[: len(self.state_names) - len(self.added)]
 
     @cached_property
     def undelayed(self) -> LinearModel:
-        """The sampled model without delays of its inputs; the model itself if it has none.
+        """The model without delays and lags of its inputs; the model itself if it has none.
 
         Its states are the states of the robot. Its inputs, which are constant in time, have the
-        same effect as equal commands in all samples of the delayed model.
+        same effect as constant commands of the model with delays and lags.
         """
         if not self.added:
             return self
-        if (source := self.generator) is not None:
-            return source.discretize(self.dt)
+        source = self.generator
+        if self.dt and source is not None:
+            return source.undelayed.discretize(self.dt)
         count = len(self.robot_states)
         B = self.B[:count].copy()
         D = self.D.copy()
@@ -402,6 +415,7 @@ class LinearModel(ModelHeader, StateSpace):
             drift=None if drift is None else drift[:count],
             added=(),
             _delays=(),
+            _lags=(),
         )
         return replace(plain, _source=(plain.fingerprint, self))
 
@@ -492,6 +506,56 @@ class LinearModel(ModelHeader, StateSpace):
     def bound(self, tol: float) -> float:
         """Return the largest rate at an equilibrium: `tol`, or `tol` times mean motion in orbit."""
         return tol * min(1.0, self.mean_motion or 1.0)
+
+    def with_lags(self, lag: Delay | None = None) -> LinearModel:
+        r"""Return the model with the lags of its inputs.
+
+        The force :math:`u_a` of an input with the time constant T is a further state:
+
+        .. math:: \dot u_a = (u - u_a) / T,\qquad \dot x = A x + B u_a
+
+        The state ``lag.tau_b.x`` is the torque that acts for the command ``tau_b.x``. Designs for
+        this model contain the lags. A `StateFeedback` computes the forces from its own commands, so
+        they need no sensor. Simulations contain the lags of the robot's inputs, whatever the law.
+
+        Parameters
+        ----------
+        lag : float or mapping, optional
+            Time constant T [s]: one for all inputs, or {name, group or pattern: T} with names of
+            inputs. The default is the field `lag` of the robot's inputs.
+
+        Returns
+        -------
+        LinearModel
+            Continuous model, whose `added` states are the forces. Its `undelayed` is the model
+            without lags.
+
+        Raises
+        ------
+        InputError
+            If the model is sampled or already has lags, or a time constant is negative. Also if no
+            input has a lag, or the model was read from a file and `lag` is missing.
+        UnknownNameError
+            If there is no such input.
+
+        Examples
+        --------
+        >>> robot = fflin.load("cubesat", inputs=[fflin.BaseTorque(lag=0.1)])
+        >>> lin = fflin.linearize(robot).with_lags()
+        >>> lin.added
+        ('lag.tau_b.x', 'lag.tau_b.y', 'lag.tau_b.z')
+        >>> sampled = lin.discretize(0.25, delay=0.1)
+        >>> fflin.lqr(sampled).K.shape
+        (3, 18)
+        """
+        if self.dt:
+            raise InputError(
+                f"the model is sampled at dt = {self.dt:g} s, expected a continuous model; add the "
+                "lags first: lin.with_lags().discretize(dt)"
+            )
+        if self.added:
+            raise InputError("the model already has lags; give lin.undelayed")
+        return _lagging(self, _chosen_lags(self, lag))
 
     def discretize(self, dt: float, delay: Delay = 0.0) -> LinearModel:
         r"""Return the discrete-time model, with the input held constant between samples.
@@ -730,9 +794,67 @@ def _delayed(
         drift=None if lin.drift is None else np.append(lin.drift, nothing),
         state_names=(*lin.state_names, *added),
         state_units=(*lin.state_units, *(lin.input_units[index] for index in inputs)),
-        added=added,
+        added=(*lin.added, *added),
         _delays=tuple(delays),
     )
+
+
+def _chosen_lags(lin: LinearModel, lag: Delay | None) -> list[float]:
+    """Return the time constant [s] of the lag of each input, of which at least one is positive."""
+    count = len(lin.input_names)
+    if lag is None:
+        if lin._robot is None:
+            raise InputError(
+                "the model does not contain its robot, so the lags of its inputs are unknown; give "
+                "lag="
+            )
+        lags = list(lags_of(lin._robot.named_inputs))
+    elif isinstance(lag, Mapping):
+        values = numbers("lag", lag, "input", "lag of")
+        value_at = by_name("input", values, input_keys(lin))
+        lags = [value_at.get(index, 0.0) for index in range(count)]
+    else:
+        lags = [number("lag", lag)] * count
+    for name, value in zip(lin.input_names, lags, strict=True):
+        if value < 0.0:
+            raise InputError(f"lag of {name} is {value:g} s, expected at least 0")
+    if not any(lags):
+        raise InputError(
+            "no input has a lag; set the field lag of an input, such as "
+            "fflin.BaseTorque(lag=0.1), or give lag="
+        )
+    return lags
+
+
+def _lagging(lin: LinearModel, lags: list[float]) -> LinearModel:
+    """Return a continuous model with the forces of inputs with a lag as further states."""
+    late = np.flatnonzero(lags)
+    rates = 1.0 / np.array(lags)[late]
+    count = len(late)
+    nx, nu = lin.B.shape
+    direct = np.ones(nu)
+    direct[late] = 0.0
+    driven: Array = np.zeros((count, nu))
+    driven[np.arange(count), late] = rates
+    nothing = np.zeros(count)
+    model = replace(
+        lin,
+        A=np.block([[lin.A, lin.B[:, late]], [np.zeros((count, nx)), -np.diag(rates)]]),
+        B=np.vstack((lin.B * direct, driven)),
+        C=np.hstack((lin.C, lin.D[:, late])),
+        D=lin.D * direct,
+        f0=np.append(lin.f0, nothing),
+        x0=np.append(lin.x0, lin.u0[late]),
+        drift=None if lin.drift is None else np.append(lin.drift, nothing),
+        state_names=(
+            *lin.state_names,
+            *(lag_name(lin.input_names[index]) for index in late),
+        ),
+        state_units=(*lin.state_units, *(lin.input_units[index] for index in late)),
+        added=tuple(lag_name(lin.input_names[index]) for index in late),
+        _lags=tuple(lags),
+    )
+    return replace(model, _source=(model.fingerprint, lin))
 
 
 def refuse_delayed(lin: LinearModel, what: str) -> None:

@@ -385,7 +385,8 @@ def load_inputs(path: str | Path) -> tuple[Input, ...]:
 
     Every type also accepts ``max`` and ``min`` [N m | N], the largest and the smallest value of the
     input. For base inputs, each limit is one number, or three numbers. If ``min`` is omitted, it is
-    -max, or 0 for a thruster. With ``on_off = true``, a thruster fires in pulses of ``max``.
+    -max, or 0 for a thruster. With ``on_off = true``, a thruster fires in pulses of ``max``. Every
+    type accepts ``lag`` [s], the time constant of the actuator.
 
     Parameters
     ----------

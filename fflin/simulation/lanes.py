@@ -114,6 +114,7 @@ def task_of(plan: Plan) -> Task:
         events=bool(plan.events),
         callback=bool(plan.options.callback),
         disturbance=bool(plant.disturbance),
+        lagging=bool(plant.lags.any()),
     )
     if plan.policy is None:
         return task

@@ -38,6 +38,7 @@ from fflin.simulation.plant import ROUNDED_DOWN, ROUNDED_UP, Plant
 ROBOT = "robot"
 CLOSED_LOOP = "closed loop"
 ROTATION = "rotation of the base or of a joint"
+LAG = "lag of the inputs"
 LONGEST_STEP = 0.01  # [s] default time step, if no pole requires a shorter step
 _DAMPING, _AMPLITUDE = 0.05, 0.01  # tolerances in (11.4)
 _SHORTEST_STEP = 1e-12  # [s] at which the search for a step ends
@@ -367,6 +368,9 @@ def limits_of_step(
         limits.append(rotation(rate))
     if commands is None:
         return limits
+    if plant.lags.any():
+        rates = 1.0 / plant.lags[plant.lags > 0.0]
+        limits.append(Poles(LAG, -rates.astype(complex)))
     assert policy is not None
     trajectory = policy.followed_trajectory
     if trajectory is not None:

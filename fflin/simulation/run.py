@@ -27,6 +27,7 @@ from fflin.dynamics.integrals import integrals
 from fflin.dynamics.points import LARGEST_SPEED
 from fflin.kernel.loop import StopConditions, goes_on
 from fflin.robot.joints import ROOT
+from fflin.simulation.lag import ActuatorLag
 from fflin.simulation.plan import Plan
 from fflin.simulation.plant import LARGEST_TURN
 
@@ -242,6 +243,19 @@ def _follower(plan: Plan) -> Callable[[int], None] | None:
     )
 
 
+def _stage_of(
+    plan: Plan,
+) -> Callable[[float, Array, Array, Array], tuple[Array, Array]]:
+    """Return the function `Plant.stage` of a run, whose inputs pass the lag of the actuators."""
+    plant, times = plan.plant, plan.times
+    if not plant.lags.any():
+        return plant.stage
+    held = plan.law is None or times.sample > 0
+    initial = np.clip(plan.initial, plan.limits.low, plan.limits.high)
+    lag = ActuatorLag(plant.lags, initial, plan.method, times.dt, held=held)
+    return lambda t, q, v, u: plant.stage(t, q, v, lag.acting(u))
+
+
 class _Rows:
     """Rows that a run in Python records, with the momentum and the centre of mass of each row."""
 
@@ -287,7 +301,7 @@ def go(plan: Plan, hint: str = "") -> Recording:
     kept = Conserved(plan)
     applied = None if law is None else plan.applied_by(law)
     ask = partial(applied, 0) if applied and not times.sample else None
-    take, stage = plan.method(plant.robot.model, dt).step, plant.stage
+    take, stage = plan.method(plant.robot.model, dt).step, _stage_of(plan)
     follow = _follower(plan)
     pushed = not plant.isolated(driven=law is not None)
     rows = _Rows(plan, kept)

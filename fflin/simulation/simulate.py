@@ -12,7 +12,7 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError
-from fflin.base.names import group_of
+from fflin.base.names import group_of, input_keys
 from fflin.base.process import LONG_RUN
 from fflin.base.rotation import conjugate
 from fflin.base.validation import Array, ArrayLike, instance
@@ -484,6 +484,7 @@ def predictor(plan: Plan) -> Predictor | None:
     elif linear is not None and not linear:
         return None
     if lin is not None and lin.state_names == state.names:
+        lin = _with_lags_of(plan, lin)
         if policy is None:
             none = np.zeros(len(lin.u0))
             return lin, lambda _: none
@@ -498,6 +499,15 @@ def predictor(plan: Plan) -> Predictor | None:
         f"{kind}; leave linear= out, or give the full model of a "
         "StateFeedback, an OutputFeedback, a LinearController or no policy"
     )
+
+
+def _with_lags_of(plan: Plan, lin: LinearModel) -> LinearModel:
+    """Return the model with the lags of the simulated inputs, in continuous time if it has any."""
+    lags = plan.plant.lags
+    source = lin.generator
+    if not lags.any() or source is None:
+        return lin
+    return source.with_lags(dict(zip(input_keys(lin), lags.tolist(), strict=True)))
 
 
 # A prediction that overflows is omitted, so NumPy's warnings are suppressed.
@@ -517,7 +527,8 @@ def predict(plan: Plan, foresees: Predictor, x: Array, steps: int) -> Array:
     correct = law.correct if isinstance(law, PredictedLaw) else None
     applied = plan.applied(law, lambda e: (x0 + e)[wheel_rows], correct)
     rows: list[Array] = []
-    e: Array = np.concatenate((x[0], np.zeros(len(x0) - x.shape[1]))) - x0
+    nx = x.shape[1]
+    e: Array = np.concatenate((x[0] - x0[:nx], np.zeros(len(x0) - nx)))
 
     def rate(e: Array) -> Array:
         """Return de/dt under a continuous command."""

@@ -87,9 +87,9 @@ def light(folder):
     return {
         "Accelerometer": {"frame": "base"},
         "Allocation": {"policy": fflin.StateFeedback(lin, gain.K), "design": robot},
-        "BaseForce": {"max": 1.0, "min": (-1.0, -1.0, 0.0)},
+        "BaseForce": {"max": 1.0, "min": (-1.0, -1.0, 0.0), "lag": 0.1},
         "BasePose": {},
-        "BaseTorque": {"max": (1.0, 1.0, 1.0), "min": None},
+        "BaseTorque": {"max": (1.0, 1.0, 1.0), "min": None, "lag": 0.1},
         "bryson": {"lin": lin, "largest": {"q_b": 1.0}},
         "CenterOfMass": {},
         "capture": {
@@ -162,7 +162,7 @@ def light(folder):
         "Gyroscope": {"frame": "base"},
         "jam": {"robot": robot, "joints": [joint], "q": q, "v": v},
         "JointPositions": {"joints": (joint,)},
-        "JointTorque": {"joint": joint, "max": 1.0, "min": -0.5},
+        "JointTorque": {"joint": joint, "max": 1.0, "min": -0.5, "lag": 0.1},
         "JointVelocities": {"joints": (joint,)},
         "kalman": {
             "lin": lin,
@@ -250,6 +250,7 @@ def light(folder):
             "inertia": 0.1,
             "name": "w",
             "momentum": 0,
+            "lag": 0.1,
             "max": 1.0,
             "max_speed": 10.0,
         },
@@ -294,6 +295,7 @@ def light(folder):
         "Thruster": {
             **{"frame": "base", "position": vector, "direction": vector, "name": "t"},
             **{
+                "lag": 0.1,
                 "max": 1.0,
                 "min": None,
                 "on_off": True,
@@ -327,6 +329,7 @@ def light(folder):
         "Trajectory.resampled": {"self": along, "dt": 0.01},
         "Trajectory.save": {"self": along, "path": folder / "c.npz"},
         "LinearModel.discretize": {"self": lin, "dt": 0.1},
+        "LinearModel.with_lags": {"self": lin, "lag": 0.1},
         "LinearModel.is_equilibrium": {"self": lin, "tol": 1e-9},
         "LinearModel.load": {"path": "nosuch.npz"},
         "LinearModel.save": {"self": lin, "path": folder / "a.npz"},
