@@ -22,7 +22,7 @@ _PUBLIC = {
         "robot.loading": "load_inputs",
     },
     "Outputs": {
-        "robot.outputs": "FullState JointPositions JointVelocities BasePose FramePose "
+        "robot.outputs": "FullState JointPositions JointVelocities BasePose StarTracker FramePose "
         "FrameVelocity RelativePose Gyroscope Accelerometer CenterOfMass Momentum",
     },
     "Linear models": {
@@ -60,6 +60,7 @@ _PUBLIC = {
         "control.estimator": "Estimator",
         "control.lqg": "lqg",
         "control.compensator": "Compensator",
+        "control.multirate": "MultirateEstimator MultirateCompensator",
     },
     "Uncertainty": {
         "uncertainty.sensitivity": "sensitivity Sensitivity",
@@ -71,6 +72,7 @@ _PUBLIC = {
         "control.policies": "StateFeedback Allocation",
         "control.tracking": "TrajectoryFeedback TrajectoryOutputFeedback",
         "control.linear_controller": "OutputFeedback LinearController",
+        "control.multirate_feedback": "MultirateFeedback",
         "batch.gains": "ScheduledFeedback",
     },
     "C code": {

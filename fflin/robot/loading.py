@@ -32,6 +32,8 @@ from fflin.robot.fields import FIELDS
 from fflin.robot.inputs import KINDS, Input
 from fflin.robot.joints import ROOT, Follower, joint_of, require_room
 from fflin.robot.mass_properties import given_body, massless_note
+from fflin.robot.outputs import KINDS as OUTPUTS
+from fflin.robot.outputs import Output
 from fflin.robot.robot import Robot
 from fflin.robot.robot_data import LinkMass
 from fflin.robot.urdf.description import Mimic, is_impossible
@@ -46,7 +48,11 @@ _SKEWED = 1e-12
 
 # Fields that are arrays of tables in a robot file: {field: names of the arrays}. For example, the
 # tables [[input]] give the field `inputs`.
-_TABLES = {"inputs": ("input",), "appendages": ("flexible", "slosh")}
+_TABLES = {
+    "inputs": ("input",),
+    "outputs": ("outputs", "output"),  # texts, or tables with the properties of sensors
+    "appendages": ("flexible", "slosh"),
+}
 
 # Keys of a robot file; the guide explains them. A file without the key `urdf` contains only inputs.
 KEYS = (
@@ -59,6 +65,7 @@ KEYS = (
 )
 
 _TYPES = {kind.KEY: kind for kind in KINDS}
+_OUTPUT_TYPES = {kind.WORD: kind for kind in OUTPUTS}
 
 
 def load(
@@ -471,6 +478,13 @@ def _read_robot_file(file: RobotFile) -> tuple[TomlFile, RobotFile, dict[str, ob
             values[key] = {part: flat(value) for part, value in table.items()}
     if "input" in record:
         values["inputs"] = _read_inputs(document)
+    if "output" in record:
+        if "outputs" in record:
+            raise document.error(
+                "the file has both outputs and [[output]]; write all outputs as [[output]]",
+                "output",
+            )
+        values["outputs"] = _built(document, "output", _output_type)
     of_nastran, of_tank = FlexibleAppendage.from_nastran, Slosh.cylinder
     appendages = _built(
         document, "flexible", partial(_maker, FlexibleAppendage, of_nastran)
@@ -519,6 +533,19 @@ def _input_type(values: dict[str, object]) -> type[Input]:
     kind = str(values.pop("type"))
     require_known("valid 'type'", [kind], _TYPES)
     return _TYPES[kind]
+
+
+def _output_type(values: dict[str, object]) -> type[Output]:
+    """Remove the key `type` from the values of an output, and return the class of this type."""
+    if "type" not in values:
+        raise InputError(
+            f"the key 'type' is missing; set 'type' to one of {', '.join(_OUTPUT_TYPES)}"
+        )
+    kind = str(values.pop("type"))
+    require_known("valid 'type'", [kind], _OUTPUT_TYPES)
+    if isinstance(joints := values.get("joints"), list):
+        values["joints"] = tuple(joints)
+    return _OUTPUT_TYPES[kind]
 
 
 def _maker(

@@ -679,7 +679,7 @@ def _filtered(
         rows = min(form.samples, -(-times.steps // times.sample))
     starts = [k * times.sample * times.dt for k in range(rows)]
     _, measures, near = zip(*map(loop.at, starts), strict=True)
-    nz = len(loop.estimate)
+    nz = len(form.terms(0.0).A)
     stages = 1 if times.sample else 1 + len(plan.method.nodes)
     terms = [
         term._replace(jump=np.broadcast_to(term.jump, nz))
@@ -697,6 +697,7 @@ def _filtered(
     turns = [axes[f.joint - ROOT].T @ f.placement.rotation for f in frames]
     return law._replace(
         kind=policies.LINEAR,
+        cyclic=form.cyclic,
         origin=np.concatenate(
             [pin.SE3ToXYZQUAT(measure.state.origin) for measure in measures]
         ),
