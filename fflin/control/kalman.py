@@ -225,6 +225,7 @@ def _problem(
     covariance = weight("V", sensed, whole.output_names, definite=True)
     # Disturbances are not delayed, so they do not act on the commands that are on their way.
     added = added_states(whole.undelayed, *slow).padded(len(whole.added))
+    _require_not_felt(whole, added)
     part = _estimated_part(whole, through @ noise, wheel_speeds)
     in_part = selection(part.state_names, whole.state_names)
     seen = outputs_of(whole, in_part)
@@ -294,6 +295,18 @@ def _solved(A: Array, C: Array, W: Array, V: Array, dt: float, size: Array) -> S
     return solution._replace(
         P=solution.P * np.outer(scale, scale), K=solution.K * scale
     )
+
+
+def _require_not_felt(lin: LinearModel, added: AddedStates) -> None:
+    """Raise `InputError` if a disturbance acts directly on an output that has a lag."""
+    disturbing = [not name.startswith(BIAS) for name in added.names]
+    felt = added.C[:, disturbing].any(axis=1) & (lin.output_lag > 0.0)
+    if felt.any():
+        names = [lin.output_names[i] for i in np.flatnonzero(felt)]
+        raise InputError(
+            f"disturbances act directly on {listed(names)}, which have a lag; leave out the lag or "
+            "disturbance_noise"
+        )
 
 
 def _require_used(lin: LinearModel, added: AddedStates, seen: Array) -> None:

@@ -8,7 +8,12 @@ import numpy as np
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, vector
 from fflin.control.policy import BoundLaw, Noise
-from fflin.control.sensors import SensorMemory, timing_of_robot
+from fflin.control.sensors import (
+    SensorLag,
+    SensorMemory,
+    lags_of_robot,
+    timing_of_robot,
+)
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.outputs import KINDS, Measuring, state_indices
 from fflin.dynamics.state import StateMap
@@ -143,8 +148,13 @@ class Loop(BoundLaw):
         self._time = 0.0
         # Memory of sensors with their own sampling times or delays, or None.
         self.sensors: SensorMemory | None = None
+        # Values of sensors with a lag, or None.
+        self.lag: SensorLag | None = None
         if not measures_state:
             self.sensors = _sensor_memory(state, dt, start)
+            lags = lags_of_robot(state)
+            if lags.any():
+                self.lag = SensorLag(lags, _start_of(state, start))
         if windup is not None and nz:
             self._windup = windup
             self.correct = self._correct
@@ -163,6 +173,8 @@ class Loop(BoundLaw):
         step, measure, near = self.at(t)
         state = measure.state
         x = measure.state.read(q, v, near=near)
+        if self.lag:
+            self.lag.require_integrated()
         noise: Array | float = 0.0
         if self._noise is not None:
             noise = vector(
@@ -177,7 +189,10 @@ class Loop(BoundLaw):
             if aba := self._aba:
                 in_base = aba.actuation.in_base_axes(state.unchecked_chart(q), u)
                 a = aba.acceleration(q, v, in_base)
-            seen = np.asarray(measure(x, q, v, a) + noise)
+            values = measure(x, q, v, a)
+            if self.lag:
+                values = self.lag.values(values)
+            seen = np.asarray(values + noise)
             if self.sensors:
                 return self.sensors.received(seen)
             return seen
@@ -190,6 +205,16 @@ class Loop(BoundLaw):
         elif len(self.estimate):
             self.rates.append(after)
         return u
+
+    def observe(self, t: float, q: Array, v: Array, a: Array, weights: Array) -> None:
+        """Advance the sensors with a lag by a stage of the integrator with the acceleration a.
+
+        `weights` are those of `SensorLag.advance`.
+        """
+        assert self.lag is not None
+        _, measure, near = self.at(t)
+        x = measure.state.read(q, v, near=near)
+        self.lag.advance(measure(x, q, v, a), weights)
 
     def _correct(self, difference: Array) -> None:
         """Add E (applied - commanded) to the next z, or to dz/dt at the latest stage."""
@@ -220,12 +245,17 @@ def _sensor_memory(
     timing = timing_of_robot(state, dt)
     if timing.is_plain:
         return None
+    return SensorMemory(timing, _start_of(state, start))
+
+
+def _start_of(state: StateMap, start: Array | None) -> Array:
+    """Return the values at the start, or raise `InputError` if they are unknown."""
     if start is None:
         raise InputError(
-            f"outputs of '{state.robot.name}' have their own sample or delay, which laws along a "
-            "trajectory do not support; leave out sample and delay of the outputs"
+            f"outputs of '{state.robot.name}' have their own sample, delay or lag, which laws "
+            "along a trajectory do not support; leave out these fields of the outputs"
         )
-    return SensorMemory(timing, start)
+    return start
 
 
 class PredictedLaw:

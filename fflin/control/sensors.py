@@ -174,6 +174,57 @@ class SensorMemory:
         self._sample += 1
 
 
+class SensorLag:
+    r"""Values of sensors with a lag, :math:`\dot y_s = (y - y_s) / T`, integrated with the robot.
+
+    Parameters
+    ----------
+    lags : ndarray (ny,)
+        Time constants T [s]; 0 for a sensor without a lag.
+    start : ndarray (ny,)
+        Values at the start.
+    """
+
+    def __init__(self, lags: Array, start: Array) -> None:
+        self._lagging = lags > 0.0
+        self._rate = np.zeros(len(lags))
+        self._rate[self._lagging] = 1.0 / lags[self._lagging]
+        self._values = start.copy()
+        self._rows = [self._values]
+        self._fresh = True
+
+    def values(self, y: Array) -> Array:
+        """Return the values (ny,) of the sensors at a sample or stage; y (ny,) is measured."""
+        return np.where(self._lagging, self._values, y)
+
+    def require_integrated(self) -> None:
+        """Raise `InputError` if the values were not integrated since the last call."""
+        if not self._fresh:
+            raise InputError(
+                "outputs of the robot have a lag, which only fflin.simulate can integrate, and "
+                "only for a law that is not part of an Allocation; leave out lag of the outputs"
+            )
+        self._fresh = False
+
+    def advance(self, y: Array, weights: Array) -> None:
+        """Add a stage of the integrator, at which y (ny,) is measured.
+
+        `weights` (1 + s, ..) has one row for the values after each stage, see
+        `Integrator.step_weights`.
+        """
+        self._fresh = True
+        self._rows.append(self._rate * (y - self._values))
+        stage = len(self._rows) - 1
+        self._values = weights[stage - 1, : stage + 1] @ np.array(self._rows)
+        if stage == len(weights):
+            self._rows = [self._values]
+
+
+def lags_of_robot(state: StateMap) -> Array:
+    """Return the time constants (ny,) [s] of the outputs of a robot; 0 without a lag."""
+    return np.array([sensor.lag or 0.0 for sensor in sensors_by_signal(state).values()])
+
+
 class _Line(NamedTuple):
     """Indices of the states of a sensor: the past measurements, and the held value or -1."""
 

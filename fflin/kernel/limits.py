@@ -32,7 +32,7 @@ class Task:
     events, callback, disturbance : bool
         Whether the simulation has these.
     lagging : bool
-        Whether an input has a lag.
+        Whether an input or a measured output has a lag.
     python_policy : str
         Kind of the policy if it has no data for the compiled loop, or an empty text.
     own_sample_time : bool
@@ -89,7 +89,9 @@ LIMITS = (
     Limit(lambda task: task.events, "events are computed in Python"),
     Limit(lambda task: task.callback, "callbacks are called in Python"),
     Limit(lambda task: task.disturbance, "disturbances are computed in Python"),
-    Limit(lambda task: task.lagging, "lags of inputs are computed in Python"),
+    Limit(
+        lambda task: task.lagging, "lags of inputs and outputs are computed in Python"
+    ),
     Limit(lambda task: task.python_policy, "a {} is computed in Python"),
     Limit(
         lambda task: task.first(_is_in_orbit),

@@ -24,12 +24,15 @@ class Output:
     - `sample` [s]: the sensor measures at t = 0, `sample`, 2 `sample`, ...; by default at each
       sample of the control law.
     - `delay` [s]: time from a measurement until the law receives it.
+    - `lag` [s]: time constant T of the sensor, whose value y_s follows
+      ``d(y_s)/dt = (y - y_s) / T``.
     - `noise`: standard deviation of the noise of each sample, in the unit of the output, or a
       figure of a data sheet as in `kalman`, such as ``{"angle_random_walk": 0.1}``.
     - `bias`: standard deviation of the change of the bias within 1 s, in the unit of the output, or
       a figure of a data sheet, such as ``{"bias_instability": 1.0}``.
 
-    Simulations contain `sample` and `delay`. `kalman` uses all four.
+    Simulations contain `sample`, `delay` and `lag`. `kalman` uses `sample`, `delay`, `noise` and
+    `bias`. `LinearModel.with_lags` adds the lags to a model.
     """
 
     # Name on the command line.
@@ -41,6 +44,7 @@ class Output:
 
     sample: float | None = field(default=None, kw_only=True, repr=False)
     delay: float = field(default=0.0, kw_only=True, repr=False)
+    lag: float | None = field(default=None, kw_only=True, repr=False)
     # Mappings have no hash.
     noise: SensorError | None = field(
         default=None, kw_only=True, repr=False, hash=False
@@ -48,9 +52,10 @@ class Output:
     bias: SensorError | None = field(default=None, kw_only=True, repr=False, hash=False)
 
     def __post_init__(self) -> None:
-        if self.sample is not None:
-            sample = positive(f"sample of {self.WORD}", self.sample, "s")
-            object.__setattr__(self, "sample", sample)
+        for name in ("sample", "lag"):
+            if (value := getattr(self, name)) is not None:
+                time = positive(f"{name} of {self.WORD}", value, "s")
+                object.__setattr__(self, name, time)
         delay = number(f"delay of {self.WORD}", self.delay)
         if delay < 0.0:
             raise InputError(
@@ -294,6 +299,8 @@ class StarTracker(Output):
         law. The first measurement is at t = 0. These and all following parameters are keyword only.
     delay : float
         Time [s] from a measurement until the law receives it.
+    lag : float, optional
+        Time constant [s] of the sensor.
     noise : float or mapping, optional
         Standard deviation of each measurement, in parts of a quaternion, or
         ``{"noise_equivalent_angle": x}`` with the standard deviation x of an angle in arc seconds.
@@ -325,6 +332,8 @@ class Gyroscope(FrameOutput):
         are keyword only. Every output accepts them.
     delay : float
         Time [s] from a measurement until the law receives it.
+    lag : float, optional
+        Time constant [s] of the sensor.
     noise : float or mapping, optional
         Standard deviation of each measurement [rad/s], or ``{"angle_random_walk": x}`` with x in
         deg/sqrt(h).

@@ -18,7 +18,7 @@ from fflin.base.process import Progress
 from fflin.base.rotation import rotation_matrix
 from fflin.base.validation import Array, Indices, Mask, shaped, vector
 from fflin.control.channel import channel_of
-from fflin.control.loops import Sample, measured_at
+from fflin.control.loops import Loop, Sample, measured_at
 from fflin.control.policy import Form, OutputForm, PathForm, Policy, StateForm
 from fflin.control.tracking import AT_THE_END, TrajectoryFeedback
 from fflin.dynamics.disturbance import Wave, waves_of
@@ -132,6 +132,8 @@ def task_of(plan: Plan) -> Task:
     measurements = ""
     if not form.loop.measures_state:
         measurements = _measurement_error(plant.state)
+    if isinstance(form.loop, Loop) and form.loop.lag:
+        task = replace(task, lagging=True)
     return replace(
         task,
         own_sample_time=dt > 0.0 and abs(times.sample * times.dt - dt) > 1e-6 * dt,

@@ -22,6 +22,7 @@ from fflin.base.errors import InputError
 from fflin.base.process import Progress
 from fflin.base.rotation import skew
 from fflin.base.validation import Array
+from fflin.control.loops import Loop
 from fflin.control.policy import BoundLaw
 from fflin.dynamics.integrals import integrals
 from fflin.dynamics.points import LARGEST_SPEED
@@ -246,14 +247,28 @@ def _follower(plan: Plan) -> Callable[[int], None] | None:
 def _stage_of(
     plan: Plan,
 ) -> Callable[[float, Array, Array, Array], tuple[Array, Array]]:
-    """Return the function `Plant.stage` of a run, whose inputs pass the lag of the actuators."""
+    """Return the function `Plant.stage` of a run, with the lags of actuators and sensors."""
     plant, times = plan.plant, plan.times
-    if not plant.lags.any():
-        return plant.stage
-    held = plan.law is None or times.sample > 0
-    initial = np.clip(plan.initial, plan.limits.low, plan.limits.high)
-    lag = ActuatorLag(plant.lags, initial, plan.method, times.dt, held=held)
-    return lambda t, q, v, u: plant.stage(t, q, v, lag.acting(u))
+    stage = plant.stage
+    if plant.lags.any():
+        held = plan.law is None or times.sample > 0
+        initial = np.clip(plan.initial, plan.limits.low, plan.limits.high)
+        lag = ActuatorLag(plant.lags, initial, plan.method, times.dt, held=held)
+
+        def stage(t: float, q: Array, v: Array, u: Array) -> tuple[Array, Array]:
+            return plant.stage(t, q, v, lag.acting(u))
+
+    command = plan.law.policy if plan.law else None
+    if not (isinstance(command, Loop) and command.lag):
+        return stage
+    weights = plan.method.step_weights(times.dt)[1]
+
+    def observed(t: float, q: Array, v: Array, u: Array) -> tuple[Array, Array]:
+        rate, push = stage(t, q, v, u)
+        command.observe(t, q, v, rate, weights)
+        return rate, push
+
+    return observed
 
 
 class _Rows:

@@ -22,6 +22,7 @@ from fflin.control.tvlqr import GainSchedule
 from fflin.dynamics.coordinates import Frame
 from fflin.dynamics.integrators import held_exponential
 from fflin.dynamics.methods import DEFAULT_METHOD
+from fflin.dynamics.outputs import sensors_by_signal
 from fflin.dynamics.state_rows import state_history
 from fflin.kernel.compiled import is_kept
 from fflin.linear.model import Delay, LinearModel
@@ -502,12 +503,17 @@ def predictor(plan: Plan) -> Predictor | None:
 
 
 def _with_lags_of(plan: Plan, lin: LinearModel) -> LinearModel:
-    """Return the model with the lags of the simulated inputs, in continuous time if it has any."""
+    """Return the model with the lags of the simulated robot, in continuous time if it has any."""
     lags = plan.plant.lags
     source = lin.generator
-    if not lags.any() or source is None:
+    output_lags = {}
+    if plan.policy and plan.policy.senses_outputs:
+        sensors = sensors_by_signal(plan.plant.state)
+        output_lags = {name: sensor.lag or 0.0 for name, sensor in sensors.items()}
+    if source is None or not (lags.any() or any(output_lags.values())):
         return lin
-    return source.with_lags(dict(zip(input_keys(lin), lags.tolist(), strict=True)))
+    by_input = dict(zip(input_keys(lin), lags.tolist(), strict=True))
+    return source.with_lags(by_input, output_lags)
 
 
 # A prediction that overflows is omitted, so NumPy's warnings are suppressed.

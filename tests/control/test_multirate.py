@@ -7,6 +7,7 @@ import pytest
 
 import fflin
 from fflin.control.kalman import _problem
+from fflin.control.loops import Loop
 from fflin.control.multirate import multirate_filter
 from fflin.control.sensors import SensorTiming
 from tests.support.c_code import needs_compiler
@@ -260,6 +261,14 @@ def test_an_ordinary_law_feels_the_sensors():
     assert np.abs(late.x - soon.x)[:, :3].max() > 1e-7
     assert np.abs(late.x - late.prediction)[:, :3].max() < 1e-9
     assert lin.output_names == model.output_names
+
+
+def test_laws_without_a_value_at_the_start_are_refused():
+    robot, _ = satellite()
+    with pytest.raises(
+        fflin.InputError, match="laws along a trajectory do not support"
+    ):
+        Loop(fflin.StateMap(robot), 0.05, (0, 6), lambda _: None)
 
 
 def test_files_keep_the_designs(tmp_path):

@@ -36,7 +36,7 @@ TASKS = {
     "events are computed in Python": Task(robots=(CUBESAT,), events=True),
     "callbacks are called in Python": Task(robots=(CUBESAT,), callback=True),
     "disturbances are computed in Python": Task(robots=(CUBESAT,), disturbance=True),
-    "lags of inputs are computed in Python": Task(robots=(CUBESAT,), lagging=True),
+    "lags of inputs and outputs are": Task(robots=(CUBESAT,), lagging=True),
     "a Mpc is computed in Python": Task(robots=(CUBESAT,), python_policy="Mpc"),
     "'cubesat' is in orbit": Task(robots=(CUBESAT, IN_ORBIT)),
     "a joint of 'composite' does not": Task(robots=(with_displaced_axis(),)),

@@ -148,3 +148,60 @@ def test_models_that_cannot_get_a_lag_are_refused(tmp_path):
     with pytest.raises(fflin.InputError, match="does not contain its robot"):
         read.with_lags()
     assert read.with_lags(0.3).A == pytest.approx(lin.with_lags().A)
+
+
+def test_sensors_with_a_lag_are_states():
+    """The model with the lag is the model in series with first-order filters."""
+    outputs = [fflin.Gyroscope("base", lag=0.2), fflin.StarTracker()]
+    robot = fflin.load("cubesat", inputs=[fflin.BaseTorque(lag=0.1)], outputs=outputs)
+    plain = fflin.linearize(robot)
+    lin = plain.with_lags()
+    assert lin.added[3:] == tuple(f"lag.base.gyroscope.{axis}" for axis in "xyz")
+    assert lin.state_units[-3:] == ("rad/s",) * 3
+    assert lin.output_lag.tolist() == [0.2] * 3 + [0.0] * 3
+    for s in (0.3j, 2.0j, 1.0 + 5.0j):
+        response = lin.C @ np.linalg.solve(s * np.eye(len(lin.A)) - lin.A, lin.B)
+        expected = plain.C @ np.linalg.solve(s * np.eye(12) - plain.A, plain.B)
+        expected = expected / (1.0 + 0.1 * s)
+        expected[:3] /= 1.0 + 0.2 * s
+        assert response == pytest.approx(expected, abs=1e-12)
+    for name in ("A", "B", "C", "D"):
+        assert getattr(lin.undelayed, name) == pytest.approx(getattr(plain, name))
+        sampled = lin.discretize(0.1, delay=0.05).undelayed
+        assert (getattr(sampled, name) == getattr(plain.discretize(0.1), name)).all()
+
+
+def test_a_file_keeps_the_lags_of_outputs(tmp_path):
+    outputs = [fflin.Gyroscope("base", lag=0.2), fflin.Accelerometer("base", lag=0.3)]
+    robot = fflin.load("cubesat", outputs=outputs)
+    plain = fflin.linearize(robot)
+    lin = plain.with_lags()
+    lin.save(tmp_path / "lin.mat")
+    read = fflin.LinearModel.load(tmp_path / "lin.mat")
+    assert (read.output_lag == lin.output_lag).all()
+    assert read.undelayed.C == pytest.approx(plain.C, abs=1e-12)
+    assert read.undelayed.D == pytest.approx(plain.D, abs=1e-12)
+    lin.discretize(0.1).save(tmp_path / "sampled.npz")
+    read = fflin.LinearModel.load(tmp_path / "sampled.npz")
+    with pytest.raises(fflin.InputError, match="lags of its outputs is unknown"):
+        _ = read.undelayed
+
+
+def test_regulators_with_wheels_leave_out_sensors_of_other_states():
+    wheels = [fflin.ReactionWheel(axis, inertia=1e-5) for axis in np.eye(3)]
+    outputs = [fflin.BasePose(lag=0.2), fflin.Gyroscope("base", lag=0.1)]
+    robot = fflin.load("cubesat", inputs=wheels, outputs=outputs)
+    lin = fflin.linearize(robot).with_lags().discretize(0.1)
+    gain = fflin.lqr(lin)
+    assert "lag.q_b.x" in gain.regulated and "lag.r_b.x" not in gain.regulated
+    estimator = fflin.kalman(lin, {"omega_b": 1e-10}, 1e-8)
+    assert not estimator.L[:, 3:6].any()
+    assert estimator.L[:, :3].any()
+
+
+def test_a_disturbance_that_a_lagging_accelerometer_feels_is_refused():
+    outputs = [fflin.BasePose(), fflin.Accelerometer("base", lag=0.1)]
+    robot = fflin.load("cubesat", outputs=outputs)
+    lin = fflin.linearize(robot).with_lags().discretize(0.1)
+    with pytest.raises(fflin.InputError, match="which have a lag"):
+        fflin.kalman(lin, 1e-8, 1e-8, disturbance_noise={"F_b": 1e-8})

@@ -94,7 +94,7 @@ def test_the_compiled_engine_refuses_a_lag(monkeypatch):
     monkeypatch.setattr(limits, "numba_is_there", lambda: True)
     robot, lin = pushed_base()
     law = fflin.StateFeedback(lin, fflin.lqr(lin))
-    with pytest.raises(fflin.InputError, match="lags of inputs are computed in Python"):
+    with pytest.raises(fflin.InputError, match="lags of inputs and outputs are"):
         fflin.simulate(robot, law, duration=1.0, engine="compiled")
 
 
@@ -113,3 +113,56 @@ def test_kalman_and_lqg_contain_the_lag():
     motion = fflin.simulate(robot, law, q0=q0, duration=30.0, dt=0.05)
     assert motion.x == pytest.approx(motion.prediction, abs=1e-7)
     assert np.abs(motion.x[-1, :3]).max() < 1e-6
+
+
+@pytest.mark.parametrize("sample", [0.25, *exhaustive(0.0)])
+def test_sensors_with_a_lag_follow_the_linear_model(sample):
+    """Forces alone move the base, so the motion is exactly linear."""
+    robot = fflin.load(
+        "cubesat",
+        inputs=[fflin.BaseTorque(), fflin.BaseForce(lag=0.3)],
+        outputs=[fflin.BasePose(lag=0.4), fflin.Gyroscope("base")],
+    )
+    lin = fflin.linearize(robot)
+    model = lin.with_lags()
+    if sample:
+        lin, model = lin.discretize(sample), model.discretize(sample)
+    x0 = 0.1 * (np.arange(12) % 6 == 3)
+    motions = []
+    for design in (lin, model):
+        estimator = fflin.kalman(design, 1e-6, 1e-6)
+        law = fflin.lqg(fflin.lqr(design), estimator)
+        policy = fflin.LinearController(law, design)
+        motion = fflin.simulate(robot, policy, x0=x0, duration=3.0)
+        assert motion.x == pytest.approx(motion.prediction, abs=1e-8)
+        motions.append(motion.x)
+    assert np.abs(motions[0] - motions[1]).max() > 1e-5
+
+
+def test_a_sensor_with_lag_delay_and_own_sample_in_one_loop():
+    tracker = fflin.BasePose(lag=0.3, delay=0.1, sample=0.2)
+    robot = fflin.load(
+        "cubesat",
+        inputs=[fflin.BaseTorque(), fflin.BaseForce()],
+        outputs=[tracker, fflin.Gyroscope("base")],
+    )
+    model = fflin.linearize(robot).with_lags().discretize(0.1)
+    estimator = fflin.kalman(model, 1e-6, 1e-6)
+    assert estimator.samples == 2
+    law = fflin.MultirateFeedback(model, fflin.lqg(fflin.lqr(model), estimator))
+    x0 = 0.1 * (np.arange(12) % 6 == 4)
+    motion = fflin.simulate(robot, law, x0=x0, duration=6.0, dt=0.02)
+    assert motion.x == pytest.approx(motion.prediction, abs=1e-7)
+
+
+def test_laws_that_cannot_integrate_sensors_are_refused():
+    robot = fflin.load("cubesat", outputs=[fflin.BasePose(lag=0.3)])
+    lin = fflin.linearize(robot).discretize(0.1)
+    law = fflin.OutputFeedback(
+        lin, fflin.lqg(fflin.lqr(lin), fflin.kalman(lin, 1e-6, 1e-6))
+    )
+    q, v = robot.neutral(), np.zeros(robot.nv)
+    command = law.bind(robot)
+    command(0.0, q, v)
+    with pytest.raises(fflin.InputError, match=r"only fflin\.simulate can integrate"):
+        command(0.1, q, v)

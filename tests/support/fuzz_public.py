@@ -84,7 +84,7 @@ def light(folder):
     filtered_model = fflin.linearize(robot.replace(stiffness=1.0, damping=1.0))
     vector = (0.0, 0.0, 1.0)
     joint = robot.joint_names[0]
-    sensor = {"sample": 0.1, "delay": 0.1, "noise": 1e-5, "bias": 1e-6}
+    sensor = {"sample": 0.1, "delay": 0.1, "lag": 0.1, "noise": 1e-5, "bias": 1e-6}
     outputs = [fflin.BasePose(sample=0.2), fflin.JointPositions()]
     slow = fflin.linearize(robot.replace(outputs=outputs)).discretize(0.1)
     slow_filter = fflin.kalman(slow, 1.0, 1.0)
@@ -336,7 +336,7 @@ def light(folder):
         "Trajectory.resampled": {"self": along, "dt": 0.01},
         "Trajectory.save": {"self": along, "path": folder / "c.npz"},
         "LinearModel.discretize": {"self": lin, "dt": 0.1},
-        "LinearModel.with_lags": {"self": lin, "lag": 0.1},
+        "LinearModel.with_lags": {"self": lin, "lag": 0.1, "output_lag": None},
         "LinearModel.is_equilibrium": {"self": lin, "tol": 1e-9},
         "LinearModel.load": {"path": "nosuch.npz"},
         "LinearModel.save": {"self": lin, "path": folder / "a.npz"},
