@@ -24,7 +24,7 @@ _PUBLIC = {
         "robot.loading": "load_inputs",
     },
     "Outputs": {
-        "robot.outputs": "FullState JointPositions JointVelocities BasePose FramePose "
+        "robot.outputs": "FullState JointPositions JointVelocities BasePose StarTracker FramePose "
         "FrameVelocity RelativePose Gyroscope Accelerometer CenterOfMass Momentum "
         "ConstraintForce",
     },
@@ -63,6 +63,7 @@ _PUBLIC = {
         "control.estimator": "Estimator",
         "control.lqg": "lqg",
         "control.compensator": "Compensator",
+        "control.multirate": "MultirateEstimator MultirateCompensator",
     },
     "Uncertainty": {
         "uncertainty.sensitivity": "sensitivity Sensitivity",
@@ -74,6 +75,7 @@ _PUBLIC = {
         "control.policies": "StateFeedback Allocation",
         "control.tracking": "TrajectoryFeedback TrajectoryOutputFeedback",
         "control.linear_controller": "OutputFeedback LinearController",
+        "control.multirate_feedback": "MultirateFeedback",
         "batch.gains": "ScheduledFeedback",
     },
     "C code": {

@@ -35,6 +35,7 @@ from fflin.robot.outputs import FullState as FullState
 from fflin.robot.outputs import JointPositions as JointPositions
 from fflin.robot.outputs import JointVelocities as JointVelocities
 from fflin.robot.outputs import BasePose as BasePose
+from fflin.robot.outputs import StarTracker as StarTracker
 from fflin.robot.outputs import FramePose as FramePose
 from fflin.robot.outputs import FrameVelocity as FrameVelocity
 from fflin.robot.outputs import RelativePose as RelativePose
@@ -105,6 +106,8 @@ from fflin.control.kalman import kalman as kalman
 from fflin.control.estimator import Estimator as Estimator
 from fflin.control.lqg import lqg as lqg
 from fflin.control.compensator import Compensator as Compensator
+from fflin.control.multirate import MultirateEstimator as MultirateEstimator
+from fflin.control.multirate import MultirateCompensator as MultirateCompensator
 
 # Uncertainty
 from fflin.uncertainty.sensitivity import sensitivity as sensitivity
@@ -121,6 +124,7 @@ from fflin.control.tracking import TrajectoryFeedback as TrajectoryFeedback
 from fflin.control.policies import Allocation as Allocation
 from fflin.control.linear_controller import OutputFeedback as OutputFeedback
 from fflin.control.linear_controller import LinearController as LinearController
+from fflin.control.multirate_feedback import MultirateFeedback as MultirateFeedback
 from fflin.control.tracking import TrajectoryOutputFeedback as TrajectoryOutputFeedback
 from fflin.batch.gains import ScheduledFeedback as ScheduledFeedback
 

@@ -50,6 +50,8 @@ RESULTS = {
     "CampaignPointing",
     "ErrorBudget",
     "Contribution",
+    "MultirateCompensator",
+    "MultirateEstimator",
     "Margins",
     "ChannelMargins",
     *(

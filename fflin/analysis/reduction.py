@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
+from itertools import compress
 from typing import ClassVar, TypeAlias, TypeVar
 
 import numpy as np
@@ -97,14 +98,23 @@ class ReducedModel(LinearModel):
 
         Of a model with delayed inputs, `T` and `S` also map the commands on their way.
         """
-        sampled = super().discretize(dt, delay)
-        count = len(sampled.added)
+        return self._extended(super().discretize(dt, delay))
+
+    def with_lags(
+        self, lag: Delay | None = None, output_lag: Delay | None = None
+    ) -> LinearModel:
+        """Return the model with the lags of its signals, see `LinearModel.with_lags`."""
+        return self._extended(super().with_lags(lag, output_lag))
+
+    def _extended(self, model: LinearModel) -> LinearModel:
+        """Return a model made from this one, whose maps also contain the states that it added."""
+        count = len(model.added) - len(self.added)
         if not count:
-            return sampled
-        assert isinstance(sampled, ReducedModel)
+            return model
+        assert isinstance(model, ReducedModel)
         none = np.zeros((len(self.momenta), count))
         return replace(
-            sampled,
+            model,
             T=block_diag(self.T, np.eye(count)),
             S=block_diag(self.S, np.eye(count)),
             momenta=np.hstack((self.momenta, none)),
@@ -412,9 +422,10 @@ def regulated_part(lin: LinearModel, wheel_speeds: bool | None = None) -> Linear
         part = regulated_part(lin.undelayed, wheel_speeds)
         if part is lin.undelayed:
             return lin
+        names = (*part.state_names, *_added_without(lin, part.state_names))
         return selected(
             lin,
-            (*part.state_names, *lin.added),
+            names,
             part.M,
             partial(regulated_part, wheel_speeds=wheel_speeds),
         )
@@ -433,6 +444,19 @@ def regulated_part(lin: LinearModel, wheel_speeds: bool | None = None) -> Linear
     return selected(
         lin, rest, part.M, partial(regulated_part, wheel_speeds=wheel_speeds)
     )
+
+
+def _added_without(lin: LinearModel, kept: Sequence[str]) -> list[str]:
+    """Return the added states of a model that depend on no other states of the robot than `kept`.
+
+    The value of a sensor with a lag depends on the states that it measures.
+    """
+    source = lin.generator or lin  # the matrix exponential loses exact zeros
+    removed = [i for i, name in enumerate(source.robot_states) if name not in kept]
+    first = len(source.robot_states)
+    depends: Mask = np.any(source.A[first:, removed], axis=1)
+    left_out = {*compress(source.added, depends)}
+    return [name for name in lin.added if name not in left_out]
 
 
 def unpushed_positions(lin: LinearModel) -> Indices:
@@ -528,6 +552,9 @@ def selected(
     values["y0"] = P @ lin.y0
     values["output_names"] = tuple(lin.output_names[i] for i in outputs)
     values["output_units"] = tuple(lin.output_units[i] for i in outputs)
+    values["added"] = tuple(name for name in lin.added if name in names)
+    if lin.output_lag.any():
+        values["_output_lags"] = tuple(lin.output_lag[outputs].tolist())
     return certified(LinearModel(**values), lin, make)
 
 

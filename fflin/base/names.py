@@ -25,8 +25,9 @@ def group_of(name: str) -> str:
     return name.partition(".")[0] if "." in name else ""
 
 
-# Name of a state that is an earlier command of an input, such as past_2.tau_b.x.
-_PAST = re.compile(r"past_[0-9]+\.", re.ASCII)
+# Name of a state that is an earlier command of an input, such as past_2.tau_b.x, or the force that
+# an actuator with a lag exerts, such as lag.tau_b.x.
+_PAST = re.compile(r"(past_[0-9]+|lag)\.", re.ASCII)
 
 
 def past_name(samples: int, name: str) -> str:
@@ -34,8 +35,13 @@ def past_name(samples: int, name: str) -> str:
     return f"past_{samples}.{name}"
 
 
+def lag_name(name: str) -> str:
+    """Return the name of the state that is the force of an input with a lag."""
+    return f"lag.{name}"
+
+
 def without_past(states: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the names of states without those of earlier commands."""
+    """Return the names of states without earlier commands and without forces that lag."""
     return tuple(name for name in states if not _PAST.match(name))
 
 

@@ -205,10 +205,10 @@ ABOUT: dict[str, str] = {
     "inputs": "inputs of the robot: a TOML file of inputs, a bundled name such as cubesat, "
     "`joints` (joint torques only) or `base` (base torque and force only). The default is the "
     "inputs in robot.toml or, if there are none, base torque, base force and all joint torques",
-    "output": "outputs of the model: state (default), base, joints, rates, joints:NAME, rates:NAME "
-    "(a joint or a pattern), com, momentum, frame:NAME (pose and velocity), pose:NAME, "
-    "velocity:NAME, gyroscope:NAME, accelerometer:NAME, relative:NAME:TO (frame NAME relative to "
-    "frame TO), force:NAME (of the constraint NAME)",
+    "output": "outputs of the model: state (default), base, star_tracker, joints, rates, "
+    "joints:NAME, rates:NAME (a joint or a pattern), com, momentum, frame:NAME (pose and "
+    "velocity), pose:NAME, velocity:NAME, gyroscope:NAME, accelerometer:NAME, relative:NAME:TO "
+    "(frame NAME relative to frame TO), force:NAME (of the constraint NAME)",
     "trajectory": f"use the trajectory in FILE: {_SAVED} or .csv; see "
     "fflin.Trajectory.load. --frame states the axes in which FILE gives base velocities and "
     "wrenches. The default of --frame is the frame named in FILE or, if there is none, local",

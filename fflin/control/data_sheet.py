@@ -6,11 +6,13 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import NamedTuple, TypeAlias
 
-from fflin.base.errors import InputError, require_known
+from fflin.base.errors import InputError, listed, require_known
 from fflin.base.names import by_name, stands_for_any
 from fflin.base.validation import instance, quantity
+from fflin.control.sensors import sensors_of_model
 from fflin.control.weights import Weight
 from fflin.linear.model import LinearModel
+from fflin.robot.outputs import SensorError
 
 # An intensity or a covariance, or one figure of a data sheet such as {"angle_random_walk": 0.1}.
 Sheet: TypeAlias = "float | Mapping[str, float]"
@@ -57,14 +59,24 @@ _OF_BIAS = {
 }
 
 
-def measurement_noise(lin: LinearModel, V: Noises) -> Weight:
-    """Return V of `kalman` with covariances or intensities in place of figures of data sheets."""
-    if not isinstance(V, Mapping):
+def measurement_noise(lin: LinearModel, V: Noises | None) -> Weight:
+    """Return V of `kalman` with covariances or intensities in place of figures of data sheets.
+
+    Outputs that V does not name have the noise of the robot's sensors.
+    """
+    if not isinstance(V, Mapping | type(None)):
         return V
-    keys = output_keys(V, lin.output_names)
-    figures = any(isinstance(value, Mapping) for value in V.values())
-    if not figures:
-        return {keys[key]: value for key, value in V.items()}  # type: ignore[misc]
+    sensors = sensors_of_model(lin)
+    known = {
+        name: sensor.noise
+        for name, sensor in sensors.items()
+        if sensor.noise is not None
+    }
+    given = {} if V is None else V
+    keys = output_keys(given, lin.output_names)
+    figures = any(isinstance(value, Mapping) for value in given.values())
+    if not figures and not known and V is not None:
+        return {keys[key]: value for key, value in given.items()}  # type: ignore[misc]
 
     def intensity(key: str, value: Sheet, unit: str) -> float:
         if not isinstance(value, Mapping):
@@ -72,14 +84,37 @@ def measurement_noise(lin: LinearModel, V: Noises) -> Weight:
         figure, square = _squared(f"V of '{key}'", value, unit, _OF_NOISE)
         if not figure.sampled:
             return square / (lin.dt or 1.0)
-        if not lin.dt:
-            raise InputError(
-                f"V of '{key}' is the standard deviation of a sample, but the model is continuous; "
-                "use lin.discretize(dt)"
-            )
-        return square
+        return _of_samples(f"V of '{key}'", lin, square)
 
-    return _by_output(lin, V, keys, intensity)
+    def default(name: str, value: SensorError, unit: str) -> float:
+        what = f"noise of output '{name}'"
+        if not isinstance(value, Mapping):
+            return _of_samples(what, lin, quantity(what, value) ** 2)
+        figure, square = _squared(what, value, unit, _OF_NOISE)
+        if not figure.sampled:
+            return square / (sensors[name].sample or lin.dt or 1.0)
+        return _of_samples(what, lin, square)
+
+    exact = {name: name for name in known}
+    values = _by_output(lin, known, exact, default)
+    values |= _by_output(lin, given, keys, intensity)
+    missing = [name for name in lin.output_names if name not in values]
+    if V is None and missing:
+        raise InputError(
+            f"V is missing, and the outputs {listed(missing)} have no noise; give V, or noise= of "
+            "these outputs"
+        )
+    return values
+
+
+def _of_samples(what: str, lin: LinearModel, square: float) -> float:
+    """Return the variance of a sample, or raise `InputError` for a continuous model."""
+    if not lin.dt:
+        raise InputError(
+            f"{what} is the standard deviation of a sample, but the model is continuous; "
+            "use lin.discretize(dt)"
+        )
+    return square
 
 
 def bias_intensities(
@@ -97,7 +132,20 @@ def bias_intensities(
             return _squared(what, value, unit, _OF_BIAS)[1]
         return quantity(what, value)
 
-    values = _by_output(lin, noise, keys, intensity)
+    known = {
+        name: sensor.bias
+        for name, sensor in sensors_of_model(lin).items()
+        if sensor.bias is not None
+    }
+
+    def default(name: str, value: SensorError, unit: str) -> float:
+        what = f"bias of output '{name}'"
+        if isinstance(value, Mapping):
+            return _squared(what, value, unit, _OF_BIAS)[1]
+        return quantity(what, value) ** 2
+
+    values = _by_output(lin, known, {name: name for name in known}, default)
+    values |= _by_output(lin, noise, keys, intensity)
     at = sorted(lin.output_names.index(name) for name in values)
     return {i: values[lin.output_names[i]] for i in at}
 

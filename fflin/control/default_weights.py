@@ -90,9 +90,11 @@ def pace_of(lin: LinearModel) -> Pace:
     """Return the nominal pace for a model.
 
     On average, an input acts h/2 later than the state from which it is computed, with the sampling
-    time h. A delay tau adds to this time, and so counts like 2 tau of hold time.
+    time h. A delay tau adds to this time, and so counts like 2 tau of hold time. At low
+    frequencies, a lag acts like a delay of its time constant.
     """
-    return Pace(hold=lin.dt + 2.0 * float(lin.delay.max(initial=0.0)))
+    late = float((lin.delay + lin.lag).max(initial=0.0))
+    return Pace(hold=lin.dt + 2.0 * late)
 
 
 class Limit(NamedTuple):

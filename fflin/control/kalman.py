@@ -21,8 +21,11 @@ from fflin.base.validation import Array, ArrayLike, dimension, shaped
 from fflin.control.augmented import AddedStates, added_states
 from fflin.control.data_sheet import Noises, Sheet, measurement_noise
 from fflin.control.estimator import BIAS, Estimator
+from fflin.control.filter_problem import FilterProblem
 from fflin.control.lqr import at_fixed_point
+from fflin.control.multirate import MultirateEstimator, multirate_filter
 from fflin.control.optimal.riccati import Solution, solve
+from fflin.control.sensors import timing_of_model
 from fflin.control.weights import Weight, padded, state_weight, weight
 from fflin.dynamics.state import selection
 from fflin.linear.linear_trajectory import LinearTrajectory
@@ -32,14 +35,14 @@ from fflin.linear.model import LinearModel
 def kalman(
     lin: LinearModel,
     W: Weight,
-    V: Noises,
+    V: Noises | None = None,
     G: ArrayLike | None = None,
     *,
     wheel_speeds: bool | None = None,
     disturbance_noise: Mapping[str, float] | None = None,
     bias_noise: Mapping[str, Sheet] | None = None,
     disturbance_frequency: Mapping[str, float | Sequence[float]] | None = None,
-) -> Estimator:
+) -> Estimator | MultirateEstimator:
     r"""Return the steady-state Kalman filter of a model about a fixed point.
 
     White noise w of intensity W acts on the state, ``dx/dt = ... + w``, and white noise n of
@@ -67,13 +70,24 @@ def kalman(
     robot. For a sampled model, these equations are sampled exactly. `lqg` cancels the estimated
     disturbances, and does not feed back the biases.
 
+    If outputs have their own `sample` or `delay`, see `StarTracker`, the filter uses each
+    measurement when it arrives. Its gain is then periodic over the common multiple of the sampling
+    times:
+
+    .. math:: P_{j+1} = A (I - K_j C_j) P_j A^T + W,\\qquad
+              K_j = P_j C_j^T (C_j P_j C_j^T + V_j)^{-1},\\qquad P_{j+N} = P_j
+
+    C_j contains the outputs that arrive at the sample j. Earlier values of a delayed output are
+    further states. The model must be sampled, and its sampling time must divide the sampling times
+    and delays of all outputs.
+
     Parameters
     ----------
     lin : LinearModel
     W : array_like (nx, nx) or (nx,), float, or mapping
         Intensity of the disturbance, positive semidefinite: a matrix, its diagonal, or
         {name: intensity} with names of states or of their groups.
-    V : array_like (ny, ny) or (ny,), float, or mapping
+    V : array_like (ny, ny) or (ny,), float, or mapping, optional
         Intensity of the measurement noise, positive definite, in the same forms as W, but with
         names of outputs. In a mapping, the name of a measured quantity, such as ``gyroscope``,
         selects its components, and a value can be a figure of a data sheet:
@@ -82,6 +96,9 @@ def kalman(
         - {"velocity_random_walk": x} in m/s/sqrt(h), for outputs in m/s^2;
         - {"noise_equivalent_angle": x} in arc seconds (one standard deviation of a sample), for
           attitudes: outputs in rad, or parts of a quaternion such as ``q_b``.
+
+        Outputs that V does not name, or all outputs without V, have the field `noise` of the
+        robot's outputs.
     G : array_like (nx, nw), optional
         Input matrix of the disturbance; W is then (nw, nw). With ``G=lin.B``, the disturbance
         acts at the inputs, and the keys of a mapping W are names of inputs. Delays of the inputs do
@@ -100,6 +117,8 @@ def kalman(
         - {"bias_instability": x} in deg/h, for outputs in rad/s: the standard deviation of the
           change of the bias within one hour;
         - {"rate_random_walk": x} in deg/h/sqrt(h), for outputs in rad/s.
+
+        Outputs that are not named have the field `bias` of the robot's outputs, or no bias.
     disturbance_frequency : mapping, optional
         Frequencies [Hz] of the sinusoids that a disturbance contains in addition to its slowly
         varying part, as {name: frequency or list of frequencies}. The random walk of the two states
@@ -107,7 +126,8 @@ def kalman(
 
     Returns
     -------
-    Estimator
+    Estimator or MultirateEstimator
+        A `MultirateEstimator` if an output has its own `sample` or `delay`.
 
     Raises
     ------
@@ -120,7 +140,8 @@ def kalman(
     InputError
         If a size or value is wrong, or if no disturbance reaches a mode that does not decay by
         itself. Without a disturbance, the filter would in time stop correcting the estimate of this
-        mode.
+        mode. Also if the sampling times and delays of the outputs have no common grid with the
+        sampling time of the model; the message states the nearest times that have one.
     UnknownNameError
         If a name does not exist.
     ModelError
@@ -157,14 +178,54 @@ def kalman(
     >>> estimator.disturbances[0], estimator.biases[0]
     ('disturbance.tau_b.x', 'bias.base.gyroscope.x')
     """
+    slow = disturbance_noise, bias_noise, disturbance_frequency
+    try:
+        problem = _problem(lin, W, V, G, wheel_speeds, slow)
+        timing = timing_of_model(problem.model)
+        if timing.is_plain:
+            return _stationary(problem)
+        return multirate_filter(problem, timing)
+    except np.linalg.LinAlgError as error:
+        raise _no_filter(error) from None
+
+
+def stationary_kalman(lin: LinearModel, W: Weight, V: Noises) -> Estimator:
+    """Return the filter of `kalman` for outputs that are measured at each sample."""
+    try:
+        return _stationary(_problem(lin, W, V, None, None, (None, None, None)))
+    except np.linalg.LinAlgError as error:
+        raise _no_filter(error) from None
+
+
+def _no_filter(error: np.linalg.LinAlgError) -> DetectabilityError:
+    return DetectabilityError(
+        f"no stable filter was found ({error}); scale W and V, or add outputs"
+    )
+
+
+def _problem(
+    lin: LinearModel,
+    W: Weight,
+    V: Noises | None,
+    G: ArrayLike | None,
+    wheel_speeds: bool | None,
+    slow: tuple[
+        Mapping[str, float] | None,
+        Mapping[str, Sheet] | None,
+        Mapping[str, float | Sequence[float]] | None,
+    ],
+) -> FilterProblem:
+    """Return the data of a filter with the arguments of `kalman`.
+
+    `slow` contains `disturbance_noise`, `bias_noise` and `disturbance_frequency`.
+    """
     whole = at_fixed_point(lin)
     noise, through = disturbance(whole, W, G)
     sensed = measurement_noise(whole, V)
     covariance = weight("V", sensed, whole.output_names, definite=True)
     # Disturbances are not delayed, so they do not act on the commands that are on their way.
-    added = added_states(
-        whole.undelayed, disturbance_noise, bias_noise, disturbance_frequency
-    ).padded(len(whole.added))
+    added = added_states(whole.undelayed, *slow).padded(len(whole.added))
+    _require_not_felt(whole, added)
     part = _estimated_part(whole, through @ noise, wheel_speeds)
     in_part = selection(part.state_names, whole.state_names)
     seen = outputs_of(whole, in_part)
@@ -177,39 +238,44 @@ def kalman(
         require_distinguished(names, A, C, count, added.poles)
     # S selects the estimated states from the states of the model and the added states.
     S = block_diag(in_part, np.eye(count))
-    try:
-        # NumPy's warnings are not needed, because no filter is found if W or V overflows.
-        with np.errstate(over="ignore", invalid="ignore"):
-            on_states = in_part @ through @ noise @ through.T @ in_part.T
-            driving = block_diag(on_states, np.zeros((count, count)))
-            driving = driving + S @ added.W @ S.T
-            driving = 0.5 * driving + 0.5 * driving.T
-            measured = seen @ covariance @ seen.T
-            require_disturbed(names, part.dt, A, driving)
-            solution = _solved(A, C, driving, measured, part.dt, added.size)
-    except np.linalg.LinAlgError as error:
-        raise DetectabilityError(
-            f"no stable filter was found ({error}); scale W and V, or add outputs"
-        ) from None
+    # NumPy's warnings are not needed, because no filter is found if W or V overflows.
+    with np.errstate(over="ignore", invalid="ignore"):
+        on_states = in_part @ through @ noise @ through.T @ in_part.T
+        driving = block_diag(on_states, np.zeros((count, count)))
+        driving = driving + S @ added.W @ S.T
+        driving = 0.5 * driving + 0.5 * driving.T
+        measured = seen @ covariance @ seen.T
+        require_disturbed(names, part.dt, A, driving)
+    return FilterProblem(
+        whole, added, names, A, C, driving, measured, covariance, seen, S
+    )
+
+
+def _stationary(problem: FilterProblem) -> Estimator:
+    """Return the filter of outputs that are measured at each sample."""
+    whole, added = problem.model, problem.added
+    A, C, S, seen = problem.A, problem.C, problem.S, problem.seen
+    with np.errstate(over="ignore", invalid="ignore"):
+        solution = _solved(A, C, problem.W, problem.V, whole.dt, added.size)
     L = L_update = solution.K.T
-    if part.dt:
-        innovation = C @ solution.P @ C.T + measured
+    if whole.dt:
+        innovation = C @ solution.P @ C.T + problem.V
         L_update = np.linalg.solve(innovation, C @ solution.P).T
-    A, C = added.extend(whole.A, whole.C, np.eye(len(whole.A)), np.eye(len(whole.C)))
+    A, B, C = problem.whole()
     return Estimator._of(
         solution,
         whole,
         A=A,
-        B=np.vstack((whole.B, np.zeros((count, whole.B.shape[1])))),
+        B=B,
         C=C,
-        x0=np.concatenate((whole.x0, np.zeros(count))),
-        state_names=(*whole.state_names, *added.names),
+        x0=np.concatenate((whole.x0, np.zeros(len(added.names)))),
+        state_names=problem.state_names,
         L=S.T @ L @ seen,
         L_update=S.T @ L_update @ seen,
         P=S.T @ solution.P @ S,
-        W=S.T @ driving @ S,
-        V=covariance,
-        estimated=names,
+        W=S.T @ problem.W @ S,
+        V=problem.covariance,
+        estimated=problem.names,
     )
 
 
@@ -229,6 +295,18 @@ def _solved(A: Array, C: Array, W: Array, V: Array, dt: float, size: Array) -> S
     return solution._replace(
         P=solution.P * np.outer(scale, scale), K=solution.K * scale
     )
+
+
+def _require_not_felt(lin: LinearModel, added: AddedStates) -> None:
+    """Raise `InputError` if a disturbance acts directly on an output that has a lag."""
+    disturbing = [not name.startswith(BIAS) for name in added.names]
+    felt = added.C[:, disturbing].any(axis=1) & (lin.output_lag > 0.0)
+    if felt.any():
+        names = [lin.output_names[i] for i in np.flatnonzero(felt)]
+        raise InputError(
+            f"disturbances act directly on {listed(names)}, which have a lag; leave out the lag or "
+            "disturbance_noise"
+        )
 
 
 def _require_used(lin: LinearModel, added: AddedStates, seen: Array) -> None:

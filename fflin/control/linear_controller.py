@@ -149,7 +149,12 @@ class LinearController(OutputSensing, LinearLaw):
         B[:, columns] = controller.B
         C[rows] = self.sign * controller.C
         D[np.ix_(rows, columns)] = self.sign * controller.D
-        if lin.added and lin.C[:, len(lin.robot_states) :].any():
+        late = [
+            index
+            for index, name in enumerate(lin.state_names)
+            if name in lin.added and name.partition(".")[2] in lin.input_names
+        ]
+        if lin.C[:, late].any():
             raise InputError(
                 "an output of the model feels delayed inputs directly, such as an accelerometer, "
                 "which a law with delayed inputs cannot measure; leave out this output"

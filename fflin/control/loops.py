@@ -1,6 +1,6 @@
 """Commands with memory: controllers that measure outputs or states, and advance their state z."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -8,6 +8,12 @@ import numpy as np
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, vector
 from fflin.control.policy import BoundLaw, Noise
+from fflin.control.sensors import (
+    SensorLag,
+    SensorMemory,
+    lags_of_robot,
+    timing_of_robot,
+)
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.outputs import KINDS, Measuring, state_indices
 from fflin.dynamics.state import StateMap
@@ -111,7 +117,9 @@ class Loop(BoundLaw):
 
     The state z of the law advances at each sample, or at each stage of the integrator if dt is 0.
     `sizes` contains the lengths of z and of the measured values y. The function `windup` returns
-    the anti-windup gain E at a time [s]; see `Sample`.
+    the anti-windup gain E at a time [s]; see `Sample`. If outputs of the robot have their own
+    sampling times or delays, the law receives the values `start` (ny,) before the first measurement
+    arrives.
     """
 
     def __init__(
@@ -124,6 +132,7 @@ class Loop(BoundLaw):
         *,
         measures_state: bool = False,
         windup: Callable[[float], Array] | None = None,
+        start: Array | None = None,
     ) -> None:
         self.at, self.dt, self._noise, (nz, self._ny) = at, dt, noise, sizes
         self.measures_state = measures_state
@@ -137,6 +146,15 @@ class Loop(BoundLaw):
         if any(output.FEELS_ACCELERATION for output in outputs):
             self._aba = Aba(state)
         self._time = 0.0
+        # Memory of sensors with their own sampling times or delays, or None.
+        self.sensors: SensorMemory | None = None
+        # Values of sensors with a lag, or None.
+        self.lag: SensorLag | None = None
+        if not measures_state:
+            self.sensors = _sensor_memory(state, dt, start)
+            lags = lags_of_robot(state)
+            if lags.any():
+                self.lag = SensorLag(lags, _start_of(state, start))
         if windup is not None and nz:
             self._windup = windup
             self.correct = self._correct
@@ -155,25 +173,48 @@ class Loop(BoundLaw):
         step, measure, near = self.at(t)
         state = measure.state
         x = measure.state.read(q, v, near=near)
+        if self.lag:
+            self.lag.require_integrated()
         noise: Array | float = 0.0
         if self._noise is not None:
             noise = vector(
                 "noise(t)", self._noise(t), self._ny, "one value for each output"
             )
 
+        seen: Array = self._at_rest
+
         def measured(u: Array) -> Array:
+            nonlocal seen
             a = self._at_rest
             if aba := self._aba:
                 in_base = aba.actuation.in_base_axes(state.unchecked_chart(q), u)
                 a = aba.acceleration(q, v, in_base)
-            return np.asarray(measure(x, q, v, a) + noise)
+            values = measure(x, q, v, a)
+            if self.lag:
+                values = self.lag.values(values)
+            seen = np.asarray(values + noise)
+            if self.sensors:
+                return self.sensors.received(seen)
+            return seen
 
         u, after = step(self.estimate, measured)
+        if self.sensors:
+            self.sensors.advance(seen)
         if self.dt:
             self.estimate = after
         elif len(self.estimate):
             self.rates.append(after)
         return u
+
+    def observe(self, t: float, q: Array, v: Array, a: Array, weights: Array) -> None:
+        """Advance the sensors with a lag by a stage of the integrator with the acceleration a.
+
+        `weights` are those of `SensorLag.advance`.
+        """
+        assert self.lag is not None
+        _, measure, near = self.at(t)
+        x = measure.state.read(q, v, near=near)
+        self.lag.advance(measure(x, q, v, a), weights)
 
     def _correct(self, difference: Array) -> None:
         """Add E (applied - commanded) to the next z, or to dz/dt at the latest stage."""
@@ -197,20 +238,52 @@ class Loop(BoundLaw):
                 self.stages = 0
 
 
-class PredictedLaw:
-    """Command of a sampled law with a state z, computed from the deviations of a linear model."""
+def _sensor_memory(
+    state: StateMap, dt: float, start: Array | None
+) -> SensorMemory | None:
+    """Return the memory of sensors with their own sampling times or delays, or None."""
+    timing = timing_of_robot(state, dt)
+    if timing.is_plain:
+        return None
+    return SensorMemory(timing, _start_of(state, start))
 
-    def __init__(self, terms: Sample, measure: Callable[[Array, Array], Array]) -> None:
+
+def _start_of(state: StateMap, start: Array | None) -> Array:
+    """Return the values at the start, or raise `InputError` if they are unknown."""
+    if start is None:
+        raise InputError(
+            f"outputs of '{state.robot.name}' have their own sample, delay or lag, which laws "
+            "along a trajectory do not support; leave out these fields of the outputs"
+        )
+    return start
+
+
+class PredictedLaw:
+    """Command of a sampled law with a state z, computed from the deviations of a linear model.
+
+    `terms` contains the law at each sample of its period.
+    """
+
+    def __init__(
+        self, terms: Sequence[Sample], measure: Callable[[Array, Array], Array]
+    ) -> None:
         self._terms = terms
         self._measure = measure
-        self._z: Array = np.zeros(len(terms.A))
+        self._z: Array = np.zeros(len(terms[0].A))
+        self._sample = -1
 
     def __call__(self, e: Array) -> Array:
         """Return the command at a sample for the deviation e (nx,), and advance z."""
-        u, self._z = self._terms.step(self._z, lambda u: self._measure(e, u))
+        self._sample += 1
+        u, self._z = self._now.step(self._z, lambda u: self._measure(e, u))
         return u
+
+    @property
+    def _now(self) -> Sample:
+        """The law at the latest sample."""
+        return self._terms[self._sample % len(self._terms)]
 
     def correct(self, difference: Array) -> None:
         """Correct z by the difference of limited and commanded inputs; see `Sample`."""
-        if self._terms.E.size:
-            self._z = self._z + self._terms.E @ difference
+        if self._now.E.size:
+            self._z = self._z + self._now.E @ difference

@@ -13,16 +13,17 @@ from fflin.base.validation import Array, instance
 from fflin.control.compensator import Compensator
 from fflin.control.estimator import DISTURBANCE, Estimator
 from fflin.control.gain import Gain
+from fflin.control.multirate import MultirateCompensator, MultirateEstimator
 from fflin.control.rejection import rejection
 from fflin.dynamics.state import selection
 
 
 def lqg(
     gain: Gain,
-    estimator: Estimator,
+    estimator: Estimator | MultirateEstimator,
     *,
     zero_error: Sequence[str] | None = None,
-) -> Compensator:
+) -> Compensator | MultirateCompensator:
     r"""Return the LQG compensator, which feeds back the state estimate: u - u0 = -K xh.
 
     .. math:: \dot z = (A - B K - L C + L D K) z + L (y - y_0),\qquad u - u_0 = -K z
@@ -49,10 +50,13 @@ def lqg(
     delayed inputs, the filter uses the limited inputs, and the integrals are corrected as in
     `StateFeedback`.
 
+    The compensator of a `MultirateEstimator` has matrices for each sample of the period. It uses
+    the measurements of every sensor when they arrive, and is flown by `MultirateFeedback`.
+
     Parameters
     ----------
     gain : Gain
-    estimator : Estimator
+    estimator : Estimator or MultirateEstimator
         Estimator for the same model.
     zero_error : sequence of str, optional
         Names or groups of regulated states that disturbances must not displace in the steady state.
@@ -61,7 +65,7 @@ def lqg(
 
     Returns
     -------
-    Compensator
+    Compensator or MultirateCompensator
 
     Raises
     ------
@@ -70,7 +74,8 @@ def lqg(
         estimator does not estimate. Also if no input can reject a disturbance, that is, if it
         displaces states in `zero_error`; the message names the disturbance and these states. Also
         if the gain has integral action and the estimator estimates disturbances, or an integrated
-        signal is not measured.
+        signal is not measured, or the gain has integral action and the outputs have their own
+        sampling times or delays.
     UnknownNameError
         If `zero_error` contains an unknown name.
 
@@ -83,17 +88,15 @@ def lqg(
     0.1
     """
     instance("gain", gain, Gain, "a Gain, as fflin.lqr returns it")
+    if isinstance(estimator, MultirateEstimator):
+        return _multirate(gain, estimator, zero_error)
     e = instance(
         "estimator", estimator, Estimator, "an Estimator, as fflin.kalman returns it"
     )
     names = require_estimated(gain, e)
     require_one_integrator(gain.integrals, e.disturbances)
-    nx = len(gain.model_states)
     S = selection(names, e.state_names)
-    feedback = np.hstack((-gain.K_x, np.zeros((len(gain.K), len(e.A) - nx))))
-    if e.disturbances or zero_error is not None:
-        Pi, Gamma = steady_rejection(gain, e, zero_error)
-        feedback[:, nx : nx + len(e.disturbances)] = gain.K_x @ Pi + Gamma
+    feedback = _feedback(gain, e, zero_error)
     A: Array = S @ (e.A + e.B @ feedback - e.L @ (e.C + e.D @ feedback)) @ S.T
     B: Array = S @ e.L
     C: Array = feedback @ S.T
@@ -115,6 +118,47 @@ def lqg(
         E=E,
         poles=np.concatenate((gain.poles, e.poles)),
         state_names=(*names, *gain.integrals),
+        input_names=e.output_names,
+        output_names=e.input_names,
+        verified=gain.verified and e.verified,
+    )
+
+
+def _feedback(
+    gain: Gain, e: Estimator | MultirateEstimator, zero_error: Sequence[str] | None
+) -> Array:
+    """Return the feedback F (nu, nz) of the estimate, u - u0 = F z, without integrals."""
+    nx = len(gain.model_states)
+    feedback = np.hstack((-gain.K_x, np.zeros((len(gain.K), len(e.A) - nx))))
+    if e.disturbances or zero_error is not None:
+        Pi, Gamma = steady_rejection(gain, e, zero_error)
+        feedback[:, nx : nx + len(e.disturbances)] = gain.K_x @ Pi + Gamma
+    return feedback
+
+
+def _multirate(
+    gain: Gain, e: MultirateEstimator, zero_error: Sequence[str] | None
+) -> MultirateCompensator:
+    """Return the periodic compensator of outputs that are measured at different rates."""
+    names = require_estimated(gain, e)
+    feedback = _feedback(gain, e, zero_error)
+    if gain.integrals:
+        raise InputError(
+            f"the gain has integral action ({listed(gain.integrals)}), but outputs have their own "
+            "sample or delay; use disturbance_noise= of kalman instead of integral_action"
+        )
+    S = selection(names, e.state_names)
+    driven = [S @ (e.B - L @ e.D) for L in e.L]
+    corrected = bool(e.disturbances) or without_past(names) != names
+    loops = [S @ (e.A + e.B @ feedback - L @ (e.C + e.D @ feedback)) @ S.T for L in e.L]
+    return MultirateCompensator._of(
+        e,
+        A=np.array(loops),
+        B=np.array([S @ L for L in e.L]),
+        C=feedback @ S.T,
+        E=np.array(driven) * corrected,
+        poles=np.concatenate((gain.poles**e.samples, e.poles)),
+        state_names=names,
         input_names=e.output_names,
         output_names=e.input_names,
         verified=gain.verified and e.verified,
@@ -166,7 +210,7 @@ def require_one_integrator(
         )
 
 
-def require_estimated(gain: Gain, e: Estimator) -> tuple[str, ...]:
+def require_estimated(gain: Gain, e: Estimator | MultirateEstimator) -> tuple[str, ...]:
     """Return the names of the estimated states, or raise `InputError` if they do not fit a gain."""
     nx = len(gain.model_states)
     if gain.dt != e.dt or not (
@@ -187,7 +231,9 @@ def require_estimated(gain: Gain, e: Estimator) -> tuple[str, ...]:
 
 
 def steady_rejection(
-    gain: Gain, e: Estimator, zero_error: Sequence[str] | None = None
+    gain: Gain,
+    e: Estimator | MultirateEstimator,
+    zero_error: Sequence[str] | None = None,
 ) -> tuple[Array, Array]:
     """Return Pi (nx, nw) and Gamma (nu, nw), the steady state and inputs under disturbances."""
     names = gain.model_states

@@ -43,6 +43,7 @@ from fflin.control.optimal.disk import (
 from fflin.control.optimal.largest_gain import largest_gain
 from fflin.control.policy import Policy, System, as_policy
 from fflin.dynamics.delays import HeldSystem, split
+from fflin.linear.holding import lags_by_name
 from fflin.linear.model import LinearModel
 
 Place = Literal["inputs", "outputs"]
@@ -288,7 +289,7 @@ def delayed_model(
             raise InputError(f"delay is {delay:g} s, expected at least 0")
         return lin, delay
     known = policy._lin if isinstance(policy, Gain) else as_policy(policy).model
-    if lin.delay.any():
+    if lin.added:
         return lin, 0.0
     if known is None:
         if isinstance(policy, Gain) and is_delayed(policy.state_names):
@@ -299,7 +300,7 @@ def delayed_model(
         return lin, 0.0
     source = lin.generator if lin.dt else lin
     if (
-        not known.delay.any()
+        not known.added
         or known.input_names != lin.input_names
         or (lin.dt and not math.isclose(lin.dt, known.dt))
     ):
@@ -309,6 +310,10 @@ def delayed_model(
             "the law was designed for delayed inputs, but lin is sampled without a delay and its "
             "continuous model is unknown; give the continuous model, or delay=0"
         )
+    if known.lag.any() or known.output_lag.any():
+        source = source.with_lags(*lags_by_name(known))
+    if not known.dt:
+        return source, 0.0
     delays = dict(zip(input_keys(lin), known.delay.tolist(), strict=True))
     return source.discretize(known.dt, delay=delays), 0.0
 

@@ -359,6 +359,7 @@ class _Estimating(Loop):
             sizes,
             lambda t: (partial(self._step, t), *measuring),
             policy.noise,
+            start=lin.y0,
         )
         self.policy = policy
         self.receding = Receding(policy.horizon, policy.deviation(state.robot))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
@@ -40,6 +40,8 @@ from fflin.control.policy import (
     states_of_gain,
     unstable_note,
 )
+from fflin.control.sensed_laws import sensed
+from fflin.control.sensors import timing_of_robot
 from fflin.dynamics.coordinates import Chart, Frame
 from fflin.dynamics.integrators import held_exponential
 from fflin.dynamics.outputs import Measuring
@@ -113,6 +115,11 @@ class OutputSensing(Policy):
         return noisy
 
 
+def at_samples(terms: Sequence[Sample], dt: float) -> Callable[[float], Sample]:
+    """Return a function of time [s] that returns the law at a sample; the samples repeat."""
+    return lambda t: terms[round(t / dt) % len(terms)]
+
+
 class LinearLaw(Feedback):
     r"""Linear law with a state z, from measured outputs or states to the inputs.
 
@@ -153,8 +160,20 @@ class LinearLaw(Feedback):
             return StateForm(offset[None], K[None], x0, {})
         if self.noise is not None and not self.senses_outputs:
             return None
-        terms = self._terms_of(self.state_map(robot))
-        return OutputForm(self._loop(robot), lambda _: terms, None)
+        state = self.state_map(robot)
+        terms = self._periodic_terms(state)
+        if len(terms) == 1:
+            return OutputForm(self._loop(robot), lambda _: terms[0], None)
+        return OutputForm(
+            self._loop(robot), at_samples(terms, self.sample_time), len(terms), True
+        )
+
+    def _periodic_terms(self, state: StateMap) -> list[Sample]:
+        """Return the law in series with the sensors of a robot, for each sample of a period."""
+        terms = [self._terms_of(state)]
+        if not self.senses_outputs:
+            return terms
+        return sensed(terms, timing_of_robot(state, self.sample_time))
 
     def _gain_terms(self, state: StateMap) -> tuple[Array, Array, Array]:
         """Return K and offset of the law u = offset - K x for a robot's full state x, and x0."""
@@ -188,6 +207,7 @@ class LinearLaw(Feedback):
             noise,
             measures_state=not self.senses_outputs,
             windup=windup,
+            start=terms.y0,
         )
 
     def _state_noise(self, state: StateMap) -> Noise | None:
@@ -238,15 +258,17 @@ class LinearLaw(Feedback):
         """Return the predictor of the closed loop with the model `lin`."""
         if self.is_gain:
             K, constant, _ = self._gain_terms(state)
-            at_point = constant - K @ lin.x0
-            return lin, lambda e: at_point - K @ e
+            nx = K.shape[1]
+            at_point = constant - K @ lin.x0[:nx]
+            return lin, lambda e: at_point - K @ e[:nx]
         if not self.sample_time:
             both, gains, offset = self.around(lin)
             return both, lambda e: offset + gains @ e
         C, D, y0 = self._measured(lin)
-        return lin, PredictedLaw(
-            self.terms(), lambda e, u: y0 + C @ e + D @ (u - lin.u0)
-        )
+        terms = [self.terms()]
+        if self.senses_outputs:
+            terms = sensed(terms, timing_of_robot(state, self.sample_time))
+        return lin, PredictedLaw(terms, lambda e, u: y0 + C @ e + D @ (u - lin.u0))
 
     def _measured(self, lin: LinearModel) -> tuple[Array, Array, Array]:
         """Return C, D and y0 of the values that the law measures of a model."""

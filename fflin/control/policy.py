@@ -136,6 +136,8 @@ class OutputForm(NamedTuple):
     terms: Callable[[float], Any]  # `policies.Sample` at a time [s]
     # number of different samples from t = 0 on; None if all are the same
     samples: int | None
+    # whether the samples repeat; otherwise, the last one applies from then on
+    cyclic: bool = False
 
 
 class PathForm(NamedTuple):

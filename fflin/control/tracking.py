@@ -11,7 +11,7 @@ import pinocchio as pin
 from fflin.base.errors import EquilibriumError, InputError
 from fflin.base.names import by_name
 from fflin.base.validation import Array, instance
-from fflin.control.kalman import kalman
+from fflin.control.kalman import stationary_kalman
 from fflin.control.loops import Loop, Sample, Step
 from fflin.control.policies import (
     Allocation,
@@ -392,7 +392,7 @@ class TrajectoryOutputFeedback(OutputSensing, TrajectoryFeedback):
         """Model of the robot at rest after the trajectory, and gain of the steady-state filter."""
         lin = self.end.discretize(self.filter.dt)
         seen = self.filter
-        return lin, kalman(lin, seen.W[-1], seen.V).L
+        return lin, stationary_kalman(lin, seen.W[-1], seen.V).L
 
     def terms(self, t: float) -> Sample:
         """Return the matrices and offsets of the sample at time t."""

@@ -8,7 +8,7 @@ from scipy.linalg import block_diag
 from fflin.base.errors import located
 from fflin.base.process import in_one_thread
 from fflin.base.validation import Array, ArrayLike
-from fflin.control.kalman import disturbance, kalman
+from fflin.control.kalman import disturbance, stationary_kalman
 from fflin.control.optimal import differential_riccati as riccati
 from fflin.control.trajectory_end import steady_end
 from fflin.control.tvlqr import FilterSchedule, asks_steady, sample_time
@@ -103,7 +103,8 @@ def tvkalman(
         with located(
             "give P0, because no steady filter exists at the start of the trajectory"
         ):
-            P = kalman(lin.discretize(dt), held_cost(lin.A.T, early, dt), V).P
+            noise = held_cost(lin.A.T, early, dt)
+            P = stationary_kalman(lin.discretize(dt), noise, V).P
     else:
         P = weight("P0", P0, traj.state_names)
     held = list(transitions(traj, dt))

@@ -411,7 +411,8 @@ def rule_weights(
     # If a sampled model has a known continuous model, the rule gives a cost for the continuous
     # model. This cost is then converted to a sampled cost with held inputs. If neither `given` nor
     # the robot names a rule, the rule is "urdf".
-    source = lin.generator or lin.undelayed
+    whole = lin.generator or lin.undelayed
+    source = whole.undelayed
     if not isinstance(given, Mapping):
         given = {"rule": given}
     require_known("part of weights", given, ("rule", "q", "r", "bryson", "integral"))
@@ -453,7 +454,7 @@ def rule_weights(
     if source.dt == lin.dt:
         return state_weight("Q", Q, lin), R, None, rule
     delays = dict(zip(input_keys(lin), lin.delay.tolist(), strict=True))
-    return (*sampled_cost(source, lin.dt, Q, R, delay=delays), rule)
+    return (*sampled_cost(whole, lin.dt, Q, R, delay=delays), rule)
 
 
 def integrated(lin: LinearModel, given: Rule | None) -> Any:

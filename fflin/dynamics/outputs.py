@@ -15,7 +15,14 @@ from fflin.base.validation import Array
 from fflin.dynamics.coordinates import PIN_ANGULAR, PIN_LINEAR
 from fflin.dynamics.state import StateMap
 from fflin.robot.joints import ROOT, Carried, by_joint, find_frame
-from fflin.robot.outputs import BasePose, FullState, JointOutput, JointPositions, Output
+from fflin.robot.outputs import (
+    BasePose,
+    FullState,
+    JointOutput,
+    JointPositions,
+    Output,
+    StarTracker,
+)
 from fflin.robot.robot import Robot
 
 _LOCAL = pin.ReferenceFrame.LOCAL
@@ -435,6 +442,18 @@ def _components(robot: Robot, output: kinds.ConstraintForce) -> Array:
     return wrench[[list(kinds.FORCES).index(name) for name in output.chosen]]
 
 
+def sensors_by_signal(state: StateMap) -> dict[str, Output]:
+    """Return {name of an entry of y: its output} for the outputs of a robot, in the order of y."""
+    sensors = dict[str, Output]()
+    for output in state.robot.outputs:
+        if type(output) in KINDS:
+            names = [name for name, _ in output.signals]
+        else:
+            names = [state.names[index] for index in state_indices(state, output)]
+        sensors |= dict.fromkeys(names, output)
+    return sensors
+
+
 def state_indices(state: StateMap, output: Output) -> list[int]:
     """Return the indices of the states that make up an output."""
     robot, groups = state.robot, state.groups
@@ -442,6 +461,8 @@ def state_indices(state: StateMap, output: Output) -> list[int]:
         return list(range(state.nx))
     if isinstance(output, BasePose):
         return list(range(groups.q_b.start, groups.r_b.stop))
+    if isinstance(output, StarTracker):
+        return list(range(groups.q_b.start, groups.q_b.stop))
     if not isinstance(output, JointOutput):
         raise InputError(
             f"{output!r} is not an output; expected one such as FramePose('tool')"

@@ -67,12 +67,14 @@ def write_c(
     - For an output feedback, the arguments are the outputs y, and the controller memory, which the
       caller allocates. A state feedback with integral action also has this memory. If the inputs
       saturate at `limits`, the integrals are corrected as in `simulate`.
-    - For gains along a trajectory, the sample number is an additional argument.
+    - For gains along a trajectory, and for outputs that are measured at different rates, the sample
+      number is an additional argument.
 
     Parameters
     ----------
     law : Gain, StateFeedback, ScheduledFeedback, OutputFeedback, LinearController or GainSchedule
-        Control law; a `Compensator` or `TrajectoryFeedback` is also accepted. Controllers and gains
+        Control law; a `MultirateFeedback`, `Compensator` or `TrajectoryFeedback` is also accepted.
+        Controllers and gains
         along a trajectory must be in discrete time.
     folder : path
         Folder for the files; created if it does not exist. Existing files with the same names are
@@ -322,6 +324,7 @@ class CLaw(Policy):
                 self.dt,
                 sizes,
                 lambda t: (partial(self._output_step, t), measuring, x),
+                start=np.array(self._about["y0"]) if "y0" in self._about else None,
             )
         world = StateMap(robot, frame=state.frame)
         n = robot.n
@@ -352,11 +355,14 @@ class CLaw(Policy):
         for the second call are measured under the command from the first call.
         """
         u = np.array(self._about["u0"])
+        sample: tuple[object, ...] = ()
+        if self._about.get("period", 1) > 1:
+            sample = (ctypes.c_ulong(round(t / self.dt)),)
         for _ in range(2):
             memory = np.append(z, 0.0).astype(self._real)
             out = np.zeros(len(u), self._real)
             y = measure(u).astype(self._real)
-            self._call(t, memory.ctypes, y.ctypes, out.ctypes)
+            self._call(t, memory.ctypes, *sample, y.ctypes, out.ctypes)
             u = out.astype(float)
         return u, memory[:-1].astype(float)
 
@@ -472,6 +478,7 @@ def _texts(law: Law, name: str, real: str) -> tuple[str, dict[str, str]]:
         "out_names": ",\n".join(f'    "{out_name}"' for out_name in outs),
     }
     words |= dict.fromkeys(("windup", "windup_next", "windup_comment"), "")
+    words |= _period_words(law.period)
     if tables["E"].size:
         words["windup"] = _filled("windup.c", words)
         words["windup_next"] = _filled("windup_next.c", words)
@@ -483,7 +490,7 @@ def _texts(law: Law, name: str, real: str) -> tuple[str, dict[str, str]]:
         )
         words |= _memory_words(words, law.memory, str(words["sample_given"]))
     else:
-        nz = len(tables["A"])
+        nz = law.memory
         words |= {"states": nz, "states_max": max(nz, 1), "outputs": len(tables["y0"])}
     words["interface"] = _filled(f"{kind}_interface.h", words)
     words["limiting"] = _filled("limiting.c", words).rstrip()
@@ -508,9 +515,30 @@ def _texts(law: Law, name: str, real: str) -> tuple[str, dict[str, str]]:
         about["point"] = [lin.q.tolist(), lin.v.tolist()]
         if lin.delay.any():
             about["delay"] = lin.delay.tolist()
+    if not state:
+        about |= {"period": law.period, "y0": tables["y0"].tolist()}
     about["sha256"] = digest_of(about, header.encode(), source.encode())
     code = {".h": header, ".c": source, "_test.c": _filled("test.c", words)}
     return title, {**code, ".json": json.dumps(about, indent=1) + "\n"}
+
+
+def _period_words(period: int) -> dict[str, object]:
+    """Return {placeholder: text} for an output law with a table for each sample of a period."""
+    words: dict[str, object] = dict.fromkeys(
+        ("sample_argument", "sample_given", "sample_comment"), ""
+    )
+    words |= dict.fromkeys(("tables", "table", "table_row", "table_comment"), "")
+    if period > 1:
+        words |= {
+            "sample_argument": "unsigned long sample, ",
+            "sample_given": "given->sample, ",
+            "sample_comment": f"\n * sample counts from 0. A and B repeat after {period} samples.",
+            "tables": f"[{period}]",
+            "table": "[table]",
+            "table_row": f"    const unsigned long table = sample % {period}UL;\n",
+            "table_comment": "One table for each sample of a period. ",
+        }
+    return words
 
 
 def _vector(case: Case, law: Law, error: float, array: Callable[[Array], str]) -> str:
@@ -521,9 +549,12 @@ def _vector(case: Case, law: Law, error: float, array: Callable[[Array], str]) -
     out[:nu] = np.clip(out[:nu], tables["low"], tables["high"])
     cut = (out - case.out)[:nu]
     scale = case.scale.copy()
-    if tables["E"].size:
-        out[nu:] += tables["E"] @ cut
-        scale[nu:] += np.abs(tables["E"]) @ scale[:nu]
+    E = tables["E"]
+    if E.ndim > 2:  # one matrix for each sample of a period
+        E = E[case.sample % len(E)]
+    if E.size:
+        out[nu:] += E @ cut
+        scale[nu:] += np.abs(E) @ scale[:nu]
     numbers = map(array, (case.given, out, error * scale))
     return f"{{{case.sample}UL, {', '.join(numbers)}, {int(cut.any())}}}"
 

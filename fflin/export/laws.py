@@ -15,7 +15,8 @@ from fflin.base.validation import Array, Indices, instance
 from fflin.control.compensator import Compensator
 from fflin.control.gain import Gain, model_of
 from fflin.control.loops import NOT_CORRECTED, Sample
-from fflin.control.policies import StateFeedback
+from fflin.control.multirate_feedback import MultirateFeedback
+from fflin.control.policies import LinearLaw, StateFeedback
 from fflin.control.policy import Command, OutputForm, PathForm, Policy, StateForm, bound
 from fflin.control.tracking import TrajectoryFeedback
 from fflin.control.tvlqr import GainSchedule
@@ -71,6 +72,7 @@ class Law:
     # bound on the number of rounded operations between an argument and a result
     operations: float
     cases: list[Case]
+    period: int = 1  # number of samples after which the tables A, B and E repeat
 
 
 def measured(world: StateMap, q: Array, v: Array) -> Array:
@@ -182,10 +184,16 @@ def _law_of(given: Design, robot: Robot) -> Law:
     lin = policy.model
     if isinstance(form, OutputForm) and form.loop.measures_state and lin:
         return _memory_law(title, policy, form.terms(0.0), robot)
-    if isinstance(form, OutputForm) and not form.samples and lin:
+    # The form also contains the sensors of the robot, which are no part of the code.
+    terms = None
+    if isinstance(policy, MultirateFeedback):
+        terms = policy.terms()
+    elif isinstance(policy, LinearLaw):
+        terms = [policy.terms()]
+    if terms and lin:
         return _output_law(
             title,
-            form.terms(0.0),
+            terms,
             inputs=(lin.input_names, lin.input_units),
             signals=(lin.output_names, lin.output_units),
             dt=policy.sample_time,
@@ -423,7 +431,7 @@ def _compensator_law(given: Compensator, robot: Robot) -> Law:
     known = dict(zip(sensed[0] + asked[0], sensed[1] + asked[1], strict=True))
     return _output_law(
         type(given).__name__,
-        Sample(given.A, given.B, given.C, none, given.u0, given.y0, E=E),
+        [Sample(given.A, given.B, given.C, none, given.u0, given.y0, E=E)],
         inputs=(
             given.output_names,
             tuple(known.get(x, "unknown") for x in given.output_names),
@@ -449,7 +457,7 @@ def _require_sampled(dt: float) -> None:
 
 def _output_law(
     title: str,
-    terms: Sample,
+    terms: list[Sample],
     *,
     inputs: Signals,
     signals: Signals,
@@ -457,13 +465,17 @@ def _output_law(
     robot: Robot,
     lin: LinearModel | None,
 ) -> Law:
-    """Return the law of a controller with constant matrices."""
-    if len(terms.A):
+    """Return the law of a controller, with `terms` for each sample of a period."""
+    first = terms[0]
+    if len(first.A):
         _require_sampled(dt)
     angles = {f"q_m.{joint.name}" for joint in robot.joints if joint.unbounded}
     continuous = np.array([name in angles for name in signals[0]])
-    tables = {key: getattr(terms, key) for key in ("A", "B", "C", "D", "E", "y0")}
-    tables |= {"u0": terms.u0[None], "continuous": continuous}
+    tables = {key: getattr(first, key) for key in ("A", "B", "C", "D", "E", "y0")}
+    if len(terms) > 1:
+        for key in ("A", "B", "E"):
+            tables[key] = np.array([getattr(term, key) for term in terms])
+    tables |= {"u0": first.u0[None], "continuous": continuous}
     return Law(
         title=title,
         state=None,
@@ -473,19 +485,21 @@ def _output_law(
         robot=robot,
         lin=lin,
         tables=tables,
-        operations=float(len(terms.A) + len(signals[0]) + 16),
-        memory=len(terms.A),
+        operations=float(len(first.A) + len(signals[0]) + 16),
+        memory=len(first.A),
         cases=list(_output_cases(terms, np.flatnonzero(continuous))),
+        period=len(terms),
     )
 
 
-def _output_cases(sample: Sample, turning: Indices) -> Iterator[Case]:
+def _output_cases(terms: list[Sample], turning: Indices) -> Iterator[Case]:
     """Yield test cases at random controller states z and outputs y of the robot.
 
-    The results of a case are u and the next z.
+    The results of a case are u and the next z. `terms` contains the law at each sample of a period.
     """
-    random, (nz, ny) = np.random.default_rng(0), sample.B.shape
-    for _ in range(CASES):
+    random, (nz, ny) = np.random.default_rng(0), terms[0].B.shape
+    for number in range(CASES):
+        sample = terms[number % len(terms)]
         size = 10.0 ** random.uniform(-4, 0)
         z, dy = random.normal(scale=size, size=nz), random.normal(scale=size, size=ny)
         turns = np.zeros(ny)
@@ -501,5 +515,8 @@ def _output_cases(sample: Sample, turning: Indices) -> Iterator[Case]:
         scale = np.abs(sample.u0) + np.abs(sample.C) @ of_z + np.abs(sample.D) @ of_y
         after = np.abs(sample.A) @ of_z + np.abs(sample.B) @ of_y
         yield Case(
-            0, np.append(z, y + turns), np.append(u, next_z), np.append(scale, after)
+            number if len(terms) > 1 else 0,
+            np.append(z, y + turns),
+            np.append(u, next_z),
+            np.append(scale, after),
         )

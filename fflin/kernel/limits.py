@@ -31,6 +31,8 @@ class Task:
         Whether outputs other than the state are computed.
     events, callback, disturbance : bool
         Whether the simulation has these.
+    lagging : bool
+        Whether an input or a measured output has a lag.
     python_policy : str
         Kind of the policy if it has no data for the compiled loop, or an empty text.
     own_sample_time : bool
@@ -47,6 +49,7 @@ class Task:
     events: bool = False
     callback: bool = False
     disturbance: bool = False
+    lagging: bool = False
     python_policy: str = ""
     own_sample_time: bool = False
     noise_at_stages: bool = False
@@ -90,6 +93,9 @@ LIMITS = (
     Limit(lambda task: task.events, "events are computed in Python"),
     Limit(lambda task: task.callback, "callbacks are called in Python"),
     Limit(lambda task: task.disturbance, "disturbances are computed in Python"),
+    Limit(
+        lambda task: task.lagging, "lags of inputs and outputs are computed in Python"
+    ),
     Limit(lambda task: task.python_policy, "a {} is computed in Python"),
     Limit(
         lambda task: task.first(_has_other_joint),

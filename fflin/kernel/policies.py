@@ -188,7 +188,8 @@ NOTHING, LINEAR, TRACK = range(3)
 class Law(
     namedtuple(
         "Law",
-        "kind turned origin near grid filter measured gyros gyro_axes x y added u path allocation",
+        "kind turned origin near cyclic grid filter measured gyros gyro_axes x y added u path "
+        "allocation",
     )
 ):
     """A policy. In compiled code, `x`, `y`, `added` and `u` have one column per lane.
@@ -207,7 +208,8 @@ class Law(
       pose of the base at which q_b and r_b are 0.
     - `near` (rows, n): joint positions for unwrapping. The unwrapped angle of a continuous joint
       differs from the position of the joint in `near` by at most pi.
-    - `origin` and `near` have one row per sample. The last row also applies to all later samples.
+    - `origin` and `near` have one row per sample. If `cyclic` is true, the rows repeat. Otherwise,
+      the last row also applies to all later samples.
     - `u`: the command. If `allocation.problem` has inputs, `allocate` distributes the command to
       the inputs of `allocation.giving`.
     """
@@ -238,6 +240,7 @@ GRID = Struct(Grid, REALS, {INDICES: "joint first stride"}, at=LANED)
 FILTER = Struct(Filter, z=LANED, rates=LANED)
 _OF_LAW = {
     WHOLE: "kind",
+    FLAG: "cyclic",
     FLAGS: "turned",
     INDICES: "measured gyros",
     LANED: "x y added u",
@@ -279,6 +282,14 @@ def read_state(robot, law, point, row):
     vec.copy(nu, 6, x, 12 + n, n)
 
 
+def _row(law, count):
+    """Return the row of the arrays with one row per sample at the sample `count`."""
+    rows = len(law.origin) // 7
+    if law.cyclic:
+        return count % rows
+    return min(count, rows - 1)
+
+
 def _times(matrix, row, x):
     """Return the scalar product of a row of a matrix and a vector."""
     total = 0.0
@@ -298,7 +309,7 @@ def command(work, robot, orbit, law, point, t, count, stage):
     if law.kind == TRACK:
         track(robot, law.path, point, law.u, t)
         return
-    row = min(count, len(law.origin) // 7 - 1)
+    row = _row(law, count)
     read_state(robot, law, point, row)
     # Compute the outputs y, with the noise of the sample.
     outputs = len(law.measured)
@@ -423,7 +434,7 @@ def correct(law, count, stage):
     """
     controller = law.filter
     size = len(controller.z)
-    row = min(count, len(law.origin) // 7 - 1)
+    row = _row(law, count)
     along = len(controller.rates) > size
     for index in range(size):
         change = _times(controller.E, row * size + index, law.u)

@@ -23,7 +23,7 @@ from fflin.linear.aba_route import (
 )
 from fflin.linear.constrained_check import ConstrainedReferences
 from fflin.linear.fit import require_fit
-from fflin.linear.model import Certificate, LinearModel, refuse_sampled
+from fflin.linear.model import Certificate, LinearModel, refuse_delayed, refuse_sampled
 from fflin.linear.nonlinear import Nonlinear, jacobians
 from fflin.linear.output_reference import OutputReference
 from fflin.linear.scales import (
@@ -197,6 +197,7 @@ def check(robot: Robot, lin: LinearModel, *, tolerance: float | None = None) -> 
     """
     instance("lin", lin, LinearModel, "a fflin.LinearModel")
     refuse_sampled(lin.dt, "check")
+    refuse_delayed(lin, "check")
     return check_all(robot, [lin], tolerance=tolerance)
 
 

@@ -67,11 +67,13 @@ _ARRAYS: dict[str, tuple[str, ...]] = {
     "drift": ("drift",),
     "limits": ("limit",),
     "delay": ("late",),
+    "lag": ("late",),
+    "output_lag": ("sensed",),
 }
 _NAMES = [f"{signal}_{field}" for field in ("names", "units") for signal in _SIGNALS]
 _LISTS = (*_NAMES, "locked", "ignorable", "wheels", "limit_names", "added", "dependent")
 # Lists and arrays that files of earlier versions lack.
-_OPTIONAL = ("wheels", "added", "dependent", "delay")
+_OPTIONAL = ("wheels", "added", "dependent", "delay", "lag", "output_lag")
 _TEXTS = (
     "frame",
     "robot",
@@ -162,6 +164,7 @@ def read_model(
         sizes |= {"velocity": velocities, "coordinate": -1, "placement": 7}
         sizes["drift"] = sizes["state"] if np.size(entries["drift"]) else 0
         sizes["late"] = sizes["input"]
+        sizes["sensed"] = sizes["output"]
         sizes["limit"] = len(limit_names := fields.pop("limit_names"))
         for key, dimensions in _ARRAYS.items():
             if key in _OPTIONAL and key not in entries:
@@ -181,6 +184,12 @@ def read_model(
         delays = fields.pop("delay", np.zeros(0))
         if delays.any():
             fields["_delays"] = tuple(delays.tolist())
+        lags = fields.pop("lag", np.zeros(0))
+        if lags.any():
+            fields["_lags"] = tuple(lags.tolist())
+        output_lags = fields.pop("output_lag", np.zeros(0))
+        if output_lags.any():
+            fields["_output_lags"] = tuple(output_lags.tolist())
         fields |= {
             "moving": bool(fields["moving"]),
             "verified": verified,

@@ -49,7 +49,7 @@ def held(lin: LinearModel, *, tilt: bool = True) -> LinearModel:
     robot = lin._robot
     if is_held(lin) or lin.moving or robot is None or lin.u0.any():
         return lin
-    source = lin.generator or lin
+    source = (lin.generator or lin).undelayed
     if len(source.A) != 2 * robot.nv:
         return lin
     frame = frame_of(robot, source.frame)
@@ -62,10 +62,19 @@ def held(lin: LinearModel, *, tilt: bool = True) -> LinearModel:
     model = linearize(
         robot, balanced.q, source.v, balanced.u, frame=frame, reference=reference
     )
+    if lin.lag.any() or lin.output_lag.any():
+        model = model.with_lags(*lags_by_name(lin))
     if lin.dt:
         delays = dict(zip(input_keys(lin), lin.delay.tolist(), strict=True))
         return model.discretize(lin.dt, delays)
     return model
+
+
+def lags_by_name(lin: LinearModel) -> tuple[dict[str, float], dict[str, float]]:
+    """Return the time constants of inputs and outputs by name, as arguments of `with_lags`."""
+    lags = dict(zip(input_keys(lin), lin.lag.tolist(), strict=True))
+    output_lags = dict(zip(lin.output_names, lin.output_lag.tolist(), strict=True))
+    return lags, output_lags
 
 
 def held_if_possible(lin: LinearModel) -> LinearModel:

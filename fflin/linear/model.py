@@ -14,7 +14,7 @@ import pinocchio as pin
 
 from fflin.base import html, svg
 from fflin.base.errors import InputError, optional_package
-from fflin.base.names import by_name, input_keys, past_name, undotted
+from fflin.base.names import by_name, input_keys, lag_name, past_name, undotted
 from fflin.base.validation import (
     Array,
     ArrayLike,
@@ -28,6 +28,9 @@ from fflin.base.validation import (
 from fflin.base.writing import as_path
 from fflin.dynamics.delays import HeldSystem, split
 from fflin.dynamics.integrators import held_exponential
+from fflin.dynamics.outputs import sensors_by_signal
+from fflin.dynamics.state import StateMap
+from fflin.robot.inputs import lags_of
 
 if TYPE_CHECKING:
     import control
@@ -249,13 +252,18 @@ class LinearModel(ModelHeader, StateSpace):
     mean_motion : float
         Mean motion of the robot's orbit [rad/s]; 0 without an orbit.
     added : tuple of str
-        Names of the last states, which are not states of the robot: the earlier commands of a
-        model with delayed inputs, see `discretize`.
+        Names of the last states, which are not states of the robot: the forces of inputs with a
+        lag, see `with_lags`, and the earlier commands of a model with delayed inputs, see
+        `discretize`.
     delay : ndarray (nu,)
         Delay of each input [s].
     dependent : tuple of str
         States of the robot that the model does not contain, because the constraints determine them
         from the states of the model.
+    lag : ndarray (nu,)
+        Time constant of the lag of each input [s] in the model; 0 if the model has no lag.
+    output_lag : ndarray (ny,)
+        Time constant of the lag of each output [s] in the model; 0 if the model has no lag.
 
     Examples
     --------
@@ -293,6 +301,8 @@ class LinearModel(ModelHeader, StateSpace):
     # Map (12 + 2 n, nx) from the states to all states of a robot with constraints.
     _all_states: Array | None = None
     _delays: tuple[float, ...] = ()  # empty if no input is delayed
+    _lags: tuple[float, ...] = ()  # empty if no input has a lag
+    _output_lags: tuple[float, ...] = ()  # empty if no output has a lag
 
     def __init__(
         self, shared: Mapping[str, object] | None = None, /, **fields: object
@@ -362,7 +372,7 @@ class LinearModel(ModelHeader, StateSpace):
         source = self.generator
         if source is None:
             return self.f0 / self.dt
-        return np.append(source.f0, np.zeros(len(self.added)))
+        return np.append(source.f0, np.zeros(len(self.x0) - len(source.x0)))
 
     @property
     def rank(self) -> int:
@@ -388,34 +398,51 @@ class LinearModel(ModelHeader, StateSpace):
         return np.array(self._delays)
 
     @property
+    def lag(self) -> Array:
+        """Time constant (nu,) of the lag of each input in the model [s]; 0 without a lag."""
+        if not self._lags:
+            return np.zeros(len(self.input_names))
+        return np.array(self._lags)
+
+    @property
+    def output_lag(self) -> Array:
+        """Time constant (ny,) of the lag of each output in the model [s]; 0 without a lag."""
+        if not self._output_lags:
+            return np.zeros(len(self.output_names))
+        return np.array(self._output_lags)
+
+    @property
     def robot_states(self) -> tuple[str, ...]:
         """Names of the states without those in `added`."""
         return self.state_names[: len(self.state_names) - len(self.added)]
 
     @cached_property
     def undelayed(self) -> LinearModel:
-        """The sampled model without delays of its inputs; the model itself if it has none.
+        """The model without delays and lags of its inputs; the model itself if it has none.
 
         Its states are the states of the robot. Its inputs, which are constant in time, have the
-        same effect as equal commands in all samples of the delayed model.
+        same effect as constant commands of the model with delays and lags.
         """
         if not self.added:
             return self
-        if (source := self.generator) is not None:
-            return source.discretize(self.dt)
+        source = self.generator
+        if self.dt and source is not None:
+            return source.undelayed.discretize(self.dt)
+        C, D = self._without_output_lags()
         count = len(self.robot_states)
         B = self.B[:count].copy()
-        D = self.D.copy()
         for at, name in enumerate(self.added, count):
-            index = self.input_names.index(name.partition(".")[2])
-            B[:, index] += self.A[:count, at]
-            D[:, index] += self.C[:, at]
+            signal = name.partition(".")[2]
+            if signal in self.input_names:
+                index = self.input_names.index(signal)
+                B[:, index] += self.A[:count, at]
+                D[:, index] += C[:, at]
         drift = self.drift
         plain = replace(
             self,
             A=self.A[:count, :count],
             B=B,
-            C=self.C[:, :count],
+            C=C[:, :count],
             D=D,
             f0=self.f0[:count],
             x0=self.x0[:count],
@@ -424,8 +451,25 @@ class LinearModel(ModelHeader, StateSpace):
             drift=None if drift is None else drift[:count],
             added=(),
             _delays=(),
+            _lags=(),
+            _output_lags=(),
         )
         return replace(plain, _source=(plain.fingerprint, self))
+
+    def _without_output_lags(self) -> tuple[Array, Array]:
+        """Return C and D of the outputs without lags: y = y_s + T d(y_s)/dt."""
+        C, D = self.C.copy(), self.D.copy()
+        lags = self.output_lag
+        if lags.any() and self.dt:
+            raise InputError(
+                "the model without the lags of its outputs is unknown, because the sampled model "
+                "was read from a file or changed; linearise the robot again"
+            )
+        for row in np.flatnonzero(lags):
+            at = self.state_names.index(lag_name(self.output_names[row]))
+            C[row] += lags[row] * self.A[at]
+            D[row] = lags[row] * self.B[at]
+        return C, D
 
     @cached_property
     def certificate(self) -> Certificate:
@@ -514,6 +558,67 @@ class LinearModel(ModelHeader, StateSpace):
     def bound(self, tol: float) -> float:
         """Return the largest rate at an equilibrium: `tol`, or `tol` times mean motion in orbit."""
         return tol * min(1.0, self.mean_motion or 1.0)
+
+    def with_lags(
+        self, lag: Delay | None = None, output_lag: Delay | None = None
+    ) -> LinearModel:
+        r"""Return the model with the lags of its inputs and outputs.
+
+        The force :math:`u_a` of an input with the time constant T is a further state:
+
+        .. math:: \dot u_a = (u - u_a) / T,\qquad \dot x = A x + B u_a
+
+        The state ``lag.tau_b.x`` is the torque that acts for the command ``tau_b.x``. Likewise, the
+        value :math:`y_s` of a sensor with the time constant T is a state,
+        :math:`\dot y_s = (y - y_s) / T`. Designs for this model contain the lags. A `StateFeedback`
+        computes the forces from its own commands, so they need no sensor. Simulations contain the
+        lags of the robot's inputs and outputs, whatever the law.
+
+        Parameters
+        ----------
+        lag : float or mapping, optional
+            Time constant T [s]: one for all inputs, or {name, group or pattern: T} with names of
+            inputs.
+        output_lag : float or mapping, optional
+            Time constant T [s] of outputs, in the same forms with names of outputs. If both
+            arguments are omitted, the lags are the fields `lag` of the robot's inputs and outputs.
+
+        Returns
+        -------
+        LinearModel
+            Continuous model, whose `added` states are the forces and the values of the sensors. Its
+            `undelayed` is the model without lags.
+
+        Raises
+        ------
+        InputError
+            If the model is sampled or already has lags, or a time constant is negative. Also if no
+            input and no output has a lag, or the model was read from a file and both arguments are
+            missing.
+        UnknownNameError
+            If there is no such input or output.
+
+        Examples
+        --------
+        >>> robot = fflin.load("cubesat", inputs=[fflin.BaseTorque(lag=0.1)])
+        >>> lin = fflin.linearize(robot).with_lags()
+        >>> lin.added
+        ('lag.tau_b.x', 'lag.tau_b.y', 'lag.tau_b.z')
+        >>> sampled = lin.discretize(0.25, delay=0.1)
+        >>> fflin.lqr(sampled).K.shape
+        (3, 18)
+        """
+        if self.dt:
+            raise InputError(
+                f"the model is sampled at dt = {self.dt:g} s, expected a continuous model; add the "
+                "lags first: lin.with_lags().discretize(dt)"
+            )
+        if self.added:
+            raise InputError("the model already has lags; give lin.undelayed")
+        lags, output_lags = _chosen_lags(self, lag, output_lag)
+        model = _lagging_inputs(self, lags)
+        model = _lagging_outputs(model, output_lags)
+        return replace(model, _source=(model.fingerprint, self))
 
     def discretize(self, dt: float, delay: Delay = 0.0) -> LinearModel:
         r"""Return the discrete-time model, with the input held constant between samples.
@@ -752,8 +857,113 @@ def _delayed(
         drift=None if lin.drift is None else np.append(lin.drift, nothing),
         state_names=(*lin.state_names, *added),
         state_units=(*lin.state_units, *(lin.input_units[index] for index in inputs)),
-        added=added,
+        added=(*lin.added, *added),
         _delays=tuple(delays),
+    )
+
+
+def _chosen_lags(
+    lin: LinearModel, lag: Delay | None, output_lag: Delay | None
+) -> tuple[list[float], list[float]]:
+    """Return the time constants [s] of all inputs and outputs; at least one is positive."""
+    if lag is None and output_lag is None:
+        if lin._robot is None:
+            raise InputError(
+                "the model does not contain its robot, so the lags of its inputs are unknown; give "
+                "lag="
+            )
+        state = StateMap(lin._robot, reference=lin.reference, frame=lin.frame)
+        sensors = sensors_by_signal(state)
+        lag = dict(zip(input_keys(lin), lags_of(lin._robot.named_inputs), strict=True))
+        output_lag = {name: sensors[name].lag or 0.0 for name in lin.output_names}
+    lags = _lags_by_name("input", lag, input_keys(lin))
+    output_lags = _lags_by_name("output", output_lag, lin.output_names)
+    if not any((*lags, *output_lags)):
+        raise InputError(
+            "no input has a lag; set the field lag of an input or output, such as "
+            "fflin.BaseTorque(lag=0.1), or give lag="
+        )
+    return lags, output_lags
+
+
+def _lags_by_name(kind: str, lag: Delay | None, names: Sequence[str]) -> list[float]:
+    """Return the time constant [s] of each input or output with the given names."""
+    if isinstance(lag, Mapping):
+        values = numbers("lag", lag, kind, "lag of")
+        value_at = by_name(kind, values, names)
+        lags = [value_at.get(index, 0.0) for index in range(len(names))]
+    else:
+        lags = [0.0 if lag is None else number("lag", lag)] * len(names)
+    for name, value in zip(names, lags, strict=True):
+        if value < 0.0:
+            raise InputError(f"lag of {name} is {value:g} s, expected at least 0")
+    return lags
+
+
+def _lagging_inputs(lin: LinearModel, lags: list[float]) -> LinearModel:
+    """Return a continuous model with the forces of inputs with a lag as further states."""
+    late = np.flatnonzero(lags)
+    if not len(late):
+        return lin
+    rates = 1.0 / np.array(lags)[late]
+    count = len(late)
+    nx, nu = lin.B.shape
+    direct = np.ones(nu)
+    direct[late] = 0.0
+    driven: Array = np.zeros((count, nu))
+    driven[np.arange(count), late] = rates
+    nothing = np.zeros(count)
+    return replace(
+        lin,
+        A=np.block([[lin.A, lin.B[:, late]], [np.zeros((count, nx)), -np.diag(rates)]]),
+        B=np.vstack((lin.B * direct, driven)),
+        C=np.hstack((lin.C, lin.D[:, late])),
+        D=lin.D * direct,
+        f0=np.append(lin.f0, nothing),
+        x0=np.append(lin.x0, lin.u0[late]),
+        drift=None if lin.drift is None else np.append(lin.drift, nothing),
+        state_names=(
+            *lin.state_names,
+            *(lag_name(lin.input_names[index]) for index in late),
+        ),
+        state_units=(*lin.state_units, *(lin.input_units[index] for index in late)),
+        added=tuple(lag_name(lin.input_names[index]) for index in late),
+        _lags=tuple(lags),
+    )
+
+
+def _lagging_outputs(lin: LinearModel, lags: list[float]) -> LinearModel:
+    """Return a continuous model with the values of sensors with a lag as further states."""
+    late = np.flatnonzero(lags)
+    if not len(late):
+        return lin
+    rates = 1.0 / np.array(lags)[late]
+    count = len(late)
+    ny, nx = lin.C.shape
+    direct: Array = np.ones((ny, 1))
+    direct[late] = 0.0
+    selected = np.zeros((ny, count))
+    selected[late, np.arange(count)] = 1.0
+    nothing = np.zeros(count)
+    names = tuple(lag_name(lin.output_names[index]) for index in late)
+    return replace(
+        lin,
+        A=np.block(
+            [
+                [lin.A, np.zeros((nx, count))],
+                [rates[:, None] * lin.C[late], -np.diag(rates)],
+            ]
+        ),
+        B=np.vstack((lin.B, rates[:, None] * lin.D[late])),
+        C=np.hstack((direct * lin.C, selected)),
+        D=direct * lin.D,
+        f0=np.append(lin.f0, nothing),
+        x0=np.append(lin.x0, lin.y0[late]),
+        drift=None if lin.drift is None else np.append(lin.drift, nothing),
+        state_names=(*lin.state_names, *names),
+        state_units=(*lin.state_units, *(lin.output_units[index] for index in late)),
+        added=(*lin.added, *names),
+        _output_lags=tuple(lags),
     )
 
 

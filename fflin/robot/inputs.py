@@ -33,6 +33,8 @@ class Input:
     max: float | Vector3 | None = field(default=None, kw_only=True, repr=False)
     # Lower limit in UNIT; by default -max, or 0 for a thruster.
     min: float | Vector3 | None = field(default=None, kw_only=True, repr=False)
+    # Time constant T [s] of the actuator: the force u_a that acts follows u_a' = (u - u_a) / T.
+    lag: float | None = field(default=None, kw_only=True, repr=False)
 
     def __post_init__(self) -> None:
         for name in ("frame", "joint", "name"):
@@ -48,6 +50,8 @@ class Input:
                 self._set(name, three_numbers(label, value))
             else:
                 self._set(name, number(label, value))
+        if self.lag is not None:
+            self._set("lag", positive(f"{self.KEY} lag", self.lag, "s"))
         for least, largest in self.ranges:
             if not least <= largest or largest <= 0.0:
                 raise InputError(
@@ -80,8 +84,11 @@ class BaseTorque(Input):
     Parameters
     ----------
     max, min : float or sequence of float (3,), optional
-        Upper and lower limits [N m] of each entry; keyword only. Every type of input accepts these
-        two parameters.
+        Upper and lower limits [N m] of each entry; keyword only.
+    lag : float, optional
+        Time constant T [s] of the actuator, keyword only: the torque that acts follows the command
+        u by ``d(u_a)/dt = (u - u_a) / T``. Every type of input accepts `max`, `min` and `lag`.
+        Simulations contain the lag. `LinearModel.with_lags` adds it to a linear model.
 
     Examples
     --------
@@ -356,6 +363,14 @@ def named_inputs(inputs: Sequence[Input]) -> list[tuple[Input, tuple[str, ...]]]
             names = [f"{item.GROUP}.{entry}" for entry in entries]
         named.append((item, tuple(names)))
     return named
+
+
+def lags_of(named: Iterable[tuple[Input, tuple[str, ...]]]) -> tuple[float, ...]:
+    """Return the time constant [s] of each entry of u; 0 for an input without a lag.
+
+    `named` contains each input with the names of its entries, as `named_inputs` returns them.
+    """
+    return tuple(item.lag or 0.0 for item, names in named for _ in names)
 
 
 def named_wheels(inputs: Sequence[Input]) -> list[tuple[str, ReactionWheel]]:

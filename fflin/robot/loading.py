@@ -33,6 +33,8 @@ from fflin.robot.fields import FIELDS
 from fflin.robot.inputs import KINDS, Input
 from fflin.robot.joints import ROOT, Follower, joint_of, require_room
 from fflin.robot.mass_properties import given_body, massless_note
+from fflin.robot.outputs import KINDS as OUTPUTS
+from fflin.robot.outputs import Output
 from fflin.robot.robot import Robot
 from fflin.robot.robot_data import LinkMass
 from fflin.robot.urdf.description import Mimic, is_impossible
@@ -49,6 +51,7 @@ _SKEWED = 1e-12
 # tables [[input]] give the field `inputs`.
 _TABLES = {
     "inputs": ("input",),
+    "outputs": ("outputs", "output"),  # texts, or tables with the properties of sensors
     "appendages": ("flexible", "slosh"),
     "constraints": ("constraint",),
 }
@@ -64,6 +67,7 @@ KEYS = (
 )
 
 _TYPES = {kind.KEY: kind for kind in KINDS}
+_OUTPUT_TYPES = {kind.WORD: kind for kind in OUTPUTS}
 
 
 def load(
@@ -391,7 +395,8 @@ def load_inputs(path: str | Path) -> tuple[Input, ...]:
 
     Every type also accepts ``max`` and ``min`` [N m | N], the largest and the smallest value of the
     input. For base inputs, each limit is one number, or three numbers. If ``min`` is omitted, it is
-    -max, or 0 for a thruster. With ``on_off = true``, a thruster fires in pulses of ``max``.
+    -max, or 0 for a thruster. With ``on_off = true``, a thruster fires in pulses of ``max``. Every
+    type accepts ``lag`` [s], the time constant of the actuator.
 
     Parameters
     ----------
@@ -476,6 +481,13 @@ def _read_robot_file(file: RobotFile) -> tuple[TomlFile, RobotFile, dict[str, ob
             values[key] = {part: flat(value) for part, value in table.items()}
     if "input" in record:
         values["inputs"] = _read_inputs(document)
+    if "output" in record:
+        if "outputs" in record:
+            raise document.error(
+                "the file has both outputs and [[output]]; write all outputs as [[output]]",
+                "output",
+            )
+        values["outputs"] = _built(document, "output", _output_type)
     of_nastran, of_tank = FlexibleAppendage.from_nastran, Slosh.cylinder
     appendages = _built(
         document, "flexible", partial(_maker, FlexibleAppendage, of_nastran)
@@ -536,6 +548,19 @@ def _constraint_type(values: dict[str, object]) -> Callable[..., Constraint]:
 def _input_type(values: dict[str, object]) -> type[Input]:
     """Remove the key `type` from the values of an input, and return the class of this type."""
     return _type_of(values, _TYPES)
+
+
+def _output_type(values: dict[str, object]) -> type[Output]:
+    """Remove the key `type` from the values of an output, and return the class of this type."""
+    if "type" not in values:
+        raise InputError(
+            f"the key 'type' is missing; set 'type' to one of {', '.join(_OUTPUT_TYPES)}"
+        )
+    kind = str(values.pop("type"))
+    require_known("valid 'type'", [kind], _OUTPUT_TYPES)
+    if isinstance(joints := values.get("joints"), list):
+        values["joints"] = tuple(joints)
+    return _OUTPUT_TYPES[kind]
 
 
 def _maker(

@@ -4,15 +4,36 @@ Reference axes are the axes of the reference placement. The state is relative to
 module `fflin.dynamics.outputs` computes the outputs and their derivatives.
 """
 
-from dataclasses import dataclass, fields
-from typing import ClassVar
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import ClassVar, TypeAlias
 
 from fflin.base.errors import InputError, require_known
+from fflin.base.validation import number, positive
+
+# Standard deviation, or one figure of a data sheet such as {"angle_random_walk": 0.1}.
+SensorError: TypeAlias = float | Mapping[str, float]
 
 
 @dataclass(frozen=True)
 class Output:
-    """Base class of outputs, with their names and units."""
+    """Base class of outputs, with their names, units and properties of the sensor.
+
+    Every output accepts these arguments, keyword only:
+
+    - `sample` [s]: the sensor measures at t = 0, `sample`, 2 `sample`, ...; by default at each
+      sample of the control law.
+    - `delay` [s]: time from a measurement until the law receives it.
+    - `lag` [s]: time constant T of the sensor, whose value y_s follows
+      ``d(y_s)/dt = (y - y_s) / T``.
+    - `noise`: standard deviation of the noise of each sample, in the unit of the output, or a
+      figure of a data sheet as in `kalman`, such as ``{"angle_random_walk": 0.1}``.
+    - `bias`: standard deviation of the change of the bias within 1 s, in the unit of the output, or
+      a figure of a data sheet, such as ``{"bias_instability": 1.0}``.
+
+    Simulations contain `sample`, `delay` and `lag`. `kalman` uses `sample`, `delay`, `noise` and
+    `bias`. `LinearModel.with_lags` adds the lags to a model.
+    """
 
     # Name on the command line.
     WORD: ClassVar[str]
@@ -20,6 +41,36 @@ class Output:
     VECTORS: ClassVar[tuple[tuple[str, str], ...]] = ()
     # Whether the output depends on accelerations, and therefore on the inputs.
     FEELS_ACCELERATION: ClassVar[bool] = False
+
+    sample: float | None = field(default=None, kw_only=True, repr=False)
+    delay: float = field(default=0.0, kw_only=True, repr=False)
+    lag: float | None = field(default=None, kw_only=True, repr=False)
+    # Mappings have no hash.
+    noise: SensorError | None = field(
+        default=None, kw_only=True, repr=False, hash=False
+    )
+    bias: SensorError | None = field(default=None, kw_only=True, repr=False, hash=False)
+
+    def __post_init__(self) -> None:
+        for name in ("sample", "lag"):
+            if (value := getattr(self, name)) is not None:
+                time = positive(f"{name} of {self.WORD}", value, "s")
+                object.__setattr__(self, name, time)
+        delay = number(f"delay of {self.WORD}", self.delay)
+        if delay < 0.0:
+            raise InputError(
+                f"delay of {self.WORD} is {delay:g} s, expected at least 0"
+            )
+        object.__setattr__(self, "delay", delay)
+        for name in ("noise", "bias"):
+            value = getattr(self, name)
+            if value is None:
+                continue
+            if isinstance(value, Mapping):
+                object.__setattr__(self, name, dict(value))
+            else:
+                given = positive(f"{name} of {self.WORD}", value)
+                object.__setattr__(self, name, given)
 
     @property
     def frames(self) -> tuple[str, ...]:
@@ -83,6 +134,7 @@ class JointOutput(Output):
     joints: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         # Refuse a string, because it would be read as a sequence of names with one letter each.
         if isinstance(self.joints, str):
             given = repr(self.joints)
@@ -237,6 +289,37 @@ class Momentum(Output):
     VECTORS = (("momentum.angular", "N m s"), ("momentum.linear", "N s"))
 
 
+class StarTracker(Output):
+    """Output of a star tracker: attitude q_b (3,) [1] of the base, as in the state.
+
+    Parameters
+    ----------
+    sample : float, optional
+        Time [s] between two measurements; by default, the sensor measures at each sample of the
+        law. The first measurement is at t = 0. These and all following parameters are keyword only.
+    delay : float
+        Time [s] from a measurement until the law receives it.
+    lag : float, optional
+        Time constant [s] of the sensor.
+    noise : float or mapping, optional
+        Standard deviation of each measurement, in parts of a quaternion, or
+        ``{"noise_equivalent_angle": x}`` with the standard deviation x of an angle in arc seconds.
+    bias : float, optional
+        Standard deviation of the change of the bias within 1 s.
+
+    Examples
+    --------
+    >>> tracker = fflin.StarTracker(
+    ...     sample=0.25, delay=0.2, noise={"noise_equivalent_angle": 10.0}
+    ... )
+    >>> robot = fflin.load("cubesat", outputs=[tracker])
+    >>> fflin.linearize(robot).output_names
+    ('q_b.x', 'q_b.y', 'q_b.z')
+    """
+
+    WORD = "star_tracker"
+
+
 class Gyroscope(FrameOutput):
     """Output of a gyroscope: angular velocity (3,) [rad/s] of a frame, in the frame's own axes.
 
@@ -244,6 +327,20 @@ class Gyroscope(FrameOutput):
     ----------
     frame : str
         Frame in which the sensor is mounted.
+    sample : float, optional
+        Time [s] between two measurements, as for `StarTracker`. These and all following parameters
+        are keyword only. Every output accepts them.
+    delay : float
+        Time [s] from a measurement until the law receives it.
+    lag : float, optional
+        Time constant [s] of the sensor.
+    noise : float or mapping, optional
+        Standard deviation of each measurement [rad/s], or ``{"angle_random_walk": x}`` with x in
+        deg/sqrt(h).
+    bias : float or mapping, optional
+        Standard deviation of the change of the bias within 1 s [rad/s], or
+        ``{"bias_instability": x}`` with x in deg/h, or ``{"rate_random_walk": x}`` with x in
+        deg/h/sqrt(h). `kalman` then estimates the bias.
 
     Examples
     --------
@@ -344,7 +441,8 @@ class ConstraintForce(Output):
 
 # The command line lists the outputs in this order.
 KINDS: tuple[type[Output], ...] = (
-    *(FullState, BasePose, JointPositions, JointVelocities, CenterOfMass, Momentum),
+    *(FullState, BasePose, StarTracker, JointPositions, JointVelocities),
+    *(CenterOfMass, Momentum),
     *(FramePose, FrameVelocity, RelativePose, Gyroscope, Accelerometer),
     ConstraintForce,
 )
@@ -364,7 +462,9 @@ def parse_output(text: str) -> tuple[Output, ...]:
     if rest and issubclass(kind, JointOutput):
         return (kind((rest,)),)
     wanted = (
-        [item.name for item in fields(kind)] if issubclass(kind, FrameOutput) else []
+        [item.name for item in fields(kind) if not item.kw_only]
+        if issubclass(kind, FrameOutput)
+        else []
     )
     if kind is ConstraintForce:
         wanted = ["name"]

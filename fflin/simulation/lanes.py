@@ -18,7 +18,7 @@ from fflin.base.process import Progress
 from fflin.base.rotation import rotation_matrix
 from fflin.base.validation import Array, Indices, Mask, shaped, vector
 from fflin.control.channel import channel_of
-from fflin.control.loops import Sample, measured_at
+from fflin.control.loops import Loop, Sample, measured_at
 from fflin.control.policy import Form, OutputForm, PathForm, Policy, StateForm
 from fflin.control.tracking import AT_THE_END, TrajectoryFeedback
 from fflin.dynamics.disturbance import Wave, waves_of
@@ -123,6 +123,7 @@ def task_of(plan: Plan) -> Task:
         events=bool(plan.events),
         callback=bool(plan.options.callback),
         disturbance=bool(plant.disturbance),
+        lagging=bool(plant.lags.any()),
     )
     if plan.policy is None:
         return task
@@ -140,6 +141,8 @@ def task_of(plan: Plan) -> Task:
     measurements = ""
     if not form.loop.measures_state:
         measurements = _measurement_error(plant.state)
+    if isinstance(form.loop, Loop) and form.loop.lag:
+        task = replace(task, lagging=True)
     return replace(
         task,
         own_sample_time=dt > 0.0 and abs(times.sample * times.dt - dt) > 1e-6 * dt,
@@ -743,7 +746,7 @@ def _filtered(
         rows = min(form.samples, -(-times.steps // times.sample))
     starts = [k * times.sample * times.dt for k in range(rows)]
     _, measures, near = zip(*map(loop.at, starts), strict=True)
-    nz = len(loop.estimate)
+    nz = len(form.terms(0.0).A)
     stages = 1 if times.sample else 1 + len(plan.method.nodes)
     terms = [
         term._replace(jump=np.broadcast_to(term.jump, nz))
@@ -761,6 +764,7 @@ def _filtered(
     turns = [axes[f.joint - ROOT].T @ f.placement.rotation for f in frames]
     return law._replace(
         kind=policies.LINEAR,
+        cyclic=form.cyclic,
         origin=np.concatenate(
             [pin.SE3ToXYZQUAT(measure.state.origin) for measure in measures]
         ),

@@ -26,6 +26,7 @@ from fflin.base.names import group_of
 from fflin.base.validation import Array, Values
 from fflin.control.channel import Law
 from fflin.control.policy import BoundLaw, Command, Policy
+from fflin.control.sensors import lags_of_robot
 from fflin.dynamics.delays import HeldSystem, Hold
 from fflin.dynamics.integrators import Integrator
 from fflin.linear.linearization import Linearizer
@@ -38,6 +39,7 @@ from fflin.simulation.plant import ROUNDED_DOWN, ROUNDED_UP, Plant
 ROBOT = "robot"
 CLOSED_LOOP = "closed loop"
 ROTATION = "rotation of the base or of a joint"
+LAG = "lag of the inputs and outputs"
 LONGEST_STEP = 0.01  # [s] default time step, if no pole requires a shorter step
 _DAMPING, _AMPLITUDE = 0.05, 0.01  # tolerances in (11.4)
 _SHORTEST_STEP = 1e-12  # [s] at which the search for a step ends
@@ -368,6 +370,12 @@ def limits_of_step(
     if commands is None:
         return limits
     assert policy is not None
+    lags = plant.lags
+    if policy.senses_outputs:
+        lags = np.append(lags, lags_of_robot(plant.state))
+    if lags.any():
+        rates = 1.0 / lags[lags > 0.0]
+        limits.append(Poles(LAG, -rates.astype(complex)))
     trajectory = policy.followed_trajectory
     if trajectory is not None:
         poles = np.zeros(0) if sample else policy.poles_along()

@@ -17,6 +17,7 @@ from fflin.dynamics.coordinates import ANGULAR, LINEAR, forces_of
 from fflin.dynamics.disturbance import BaseDisturbance
 from fflin.dynamics.state import StateMap
 from fflin.kernel.forward import ActuatorFaults, apply_faults
+from fflin.robot.inputs import lags_of
 from fflin.simulation.constrained import Constrained
 
 # Generalised forces {name or group: value}, such as {"tau_b": (0, 0, 1e-3), "tau_m.joint_1": 0.2}.
@@ -65,6 +66,8 @@ class Plant(Aba):
         # Whether the warning about a disturbance given as an array was already issued.
         self._warned = False
         nu = len(self.actuation.names)
+        # Time constants (nu,) of the actuators [s].
+        self.lags: Array = np.array(lags_of(robot.named_inputs))
         groups = self.actuation.groups
         # Indices in u at which the base torque and the base force begin, if they are inputs.
         self.triads = sorted(

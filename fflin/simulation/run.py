@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import pinocchio as pin
@@ -22,11 +22,13 @@ from fflin.base.errors import InputError
 from fflin.base.process import Progress
 from fflin.base.rotation import skew
 from fflin.base.validation import Array
+from fflin.control.loops import Loop
 from fflin.control.policy import BoundLaw
 from fflin.dynamics.integrals import integrals
 from fflin.dynamics.points import LARGEST_SPEED
 from fflin.kernel.loop import StopConditions, goes_on
 from fflin.robot.joints import ROOT
+from fflin.simulation.lag import ActuatorLag
 from fflin.simulation.plan import Plan
 from fflin.simulation.plant import LARGEST_TURN, Plant
 
@@ -34,6 +36,9 @@ STOPS = ("", "diverged", "left the chart", "stopped")
 
 _LOOK = 16  # steps between checks of the clock
 _LARGEST_SHOWN = 1e3  # [rad] largest rotation per step that a message states
+
+# Function of (t, q, v, u) for the accelerations and the external wrench.
+Stage: TypeAlias = Callable[[float, Array, Array, Array], tuple[Array, Array]]
 
 _crba, _placement = pin.crba, pin.XYZQUATToSE3
 
@@ -292,8 +297,8 @@ class _Rows:
         )
 
 
-def _stage_of(plant: Plant, rows: _Rows) -> Callable[..., tuple[Array, Array]]:
-    """Return the function of (t, q, v, u) for the accelerations and the external wrench."""
+def _robot_stage(plant: Plant, rows: _Rows) -> Stage:
+    """Return the function for the accelerations of the robot, with its constraints."""
     constrained = plant.constrained
     if constrained is None:
         return plant.stage
@@ -304,6 +309,31 @@ def _stage_of(plant: Plant, rows: _Rows) -> Callable[..., tuple[Array, Array]]:
         return result
 
     return stage
+
+
+def _lagged(plan: Plan, stage: Stage) -> Stage:
+    """Return the function `stage` of a run, with the lags of actuators and sensors."""
+    plant, times = plan.plant, plan.times
+    acting = stage
+    if plant.lags.any():
+        held = plan.law is None or times.sample > 0
+        initial = np.clip(plan.initial, plan.limits.low, plan.limits.high)
+        lag = ActuatorLag(plant.lags, initial, plan.method, times.dt, held=held)
+
+        def acting(t: float, q: Array, v: Array, u: Array) -> tuple[Array, Array]:
+            return stage(t, q, v, lag.acting(u))
+
+    command = plan.law.policy if plan.law else None
+    if not (isinstance(command, Loop) and command.lag):
+        return acting
+    weights = plan.method.step_weights(times.dt)[1]
+
+    def observed(t: float, q: Array, v: Array, u: Array) -> tuple[Array, Array]:
+        rate, push = acting(t, q, v, u)
+        command.observe(t, q, v, rate, weights)
+        return rate, push
+
+    return observed
 
 
 def _corrected(
@@ -331,7 +361,7 @@ def go(plan: Plan, hint: str = "") -> Recording:
     follow = _follower(plan)
     pushed = not plant.isolated(driven=law is not None)
     rows = _Rows(plan, kept)
-    stage = _stage_of(plant, rows)
+    stage = _lagged(plan, _robot_stage(plant, rows))
     t, stages = 0.0, 0
 
     def acceleration(t: float, q: Array, v: Array) -> Array:

@@ -13,7 +13,7 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError
-from fflin.base.names import group_of
+from fflin.base.names import group_of, input_keys
 from fflin.base.process import LONG_RUN
 from fflin.base.rotation import conjugate
 from fflin.base.validation import Array, ArrayLike, instance
@@ -23,6 +23,7 @@ from fflin.control.tvlqr import GainSchedule
 from fflin.dynamics.coordinates import Frame
 from fflin.dynamics.integrators import held_exponential
 from fflin.dynamics.methods import DEFAULT_METHOD
+from fflin.dynamics.outputs import sensors_by_signal
 from fflin.dynamics.state_rows import state_history
 from fflin.kernel.compiled import is_kept
 from fflin.linear.model import Delay, LinearModel
@@ -498,6 +499,7 @@ def predictor(plan: Plan) -> Predictor | None:
     elif linear is not None and not linear:
         return None
     if lin is not None and lin.state_names == state.names:
+        lin = _with_lags_of(plan, lin)
         if policy is None:
             none = np.zeros(len(lin.u0))
             return lin, lambda _: none
@@ -512,6 +514,20 @@ def predictor(plan: Plan) -> Predictor | None:
         f"{kind}; leave linear= out, or give the full model of a "
         "StateFeedback, an OutputFeedback, a LinearController or no policy"
     )
+
+
+def _with_lags_of(plan: Plan, lin: LinearModel) -> LinearModel:
+    """Return the model with the lags of the simulated robot, in continuous time if it has any."""
+    lags = plan.plant.lags
+    source = lin.generator
+    output_lags = {}
+    if plan.policy and plan.policy.senses_outputs:
+        sensors = sensors_by_signal(plan.plant.state)
+        output_lags = {name: sensor.lag or 0.0 for name, sensor in sensors.items()}
+    if source is None or not (lags.any() or any(output_lags.values())):
+        return lin
+    by_input = dict(zip(input_keys(lin), lags.tolist(), strict=True))
+    return source.with_lags(by_input, output_lags)
 
 
 # A prediction that overflows is omitted, so NumPy's warnings are suppressed.
@@ -531,7 +547,8 @@ def predict(plan: Plan, foresees: Predictor, x: Array, steps: int) -> Array:
     correct = law.correct if isinstance(law, PredictedLaw) else None
     applied = plan.applied(law, lambda e: (x0 + e)[wheel_rows], correct)
     rows: list[Array] = []
-    e: Array = np.concatenate((x[0], np.zeros(len(x0) - x.shape[1]))) - x0
+    nx = x.shape[1]
+    e: Array = np.concatenate((x[0] - x0[:nx], np.zeros(len(x0) - nx)))
 
     def rate(e: Array) -> Array:
         """Return de/dt under a continuous command."""

@@ -37,6 +37,7 @@ TASKS = {
     "events are computed in Python": Task(robots=(CUBESAT,), events=True),
     "callbacks are called in Python": Task(robots=(CUBESAT,), callback=True),
     "disturbances are computed in Python": Task(robots=(CUBESAT,), disturbance=True),
+    "lags of inputs and outputs are": Task(robots=(CUBESAT,), lagging=True),
     "a Mpc is computed in Python": Task(robots=(CUBESAT,), python_policy="Mpc"),
     "a joint of 'composite' does not": Task(robots=(with_displaced_axis(),)),
     "the root joint of 'displaced'": Task(

@@ -84,14 +84,19 @@ def light(folder):
     filtered_model = fflin.linearize(robot.replace(stiffness=1.0, damping=1.0))
     vector = (0.0, 0.0, 1.0)
     joint = robot.joint_names[0]
+    sensor = {"sample": 0.1, "delay": 0.1, "lag": 0.1, "noise": 1e-5, "bias": 1e-6}
+    outputs = [fflin.BasePose(sample=0.2), fflin.JointPositions()]
+    slow = fflin.linearize(robot.replace(outputs=outputs)).discretize(0.1)
+    slow_filter = fflin.kalman(slow, 1.0, 1.0)
+    slow_law = fflin.lqg(fflin.lqr(slow), slow_filter)
     return {
-        "Accelerometer": {"frame": "base"},
+        "Accelerometer": {"frame": "base"} | sensor,
         "Allocation": {"policy": fflin.StateFeedback(lin, gain.K), "design": robot},
-        "BaseForce": {"max": 1.0, "min": (-1.0, -1.0, 0.0)},
-        "BasePose": {},
-        "BaseTorque": {"max": (1.0, 1.0, 1.0), "min": None},
+        "BaseForce": {"max": 1.0, "min": (-1.0, -1.0, 0.0), "lag": 0.1},
+        "BasePose": {} | sensor,
+        "BaseTorque": {"max": (1.0, 1.0, 1.0), "min": None, "lag": 0.1},
         "bryson": {"lin": lin, "largest": {"q_b": 1.0}},
-        "CenterOfMass": {},
+        "CenterOfMass": {} | sensor,
         "capture": {
             **{
                 "robot": robot,
@@ -127,15 +132,15 @@ def light(folder):
             "tilt": True,
             "disturbed": False,
         },
-        "FramePose": {"frame": "base"},
-        "FrameVelocity": {"frame": "base"},
+        "FramePose": {"frame": "base"} | sensor,
+        "FrameVelocity": {"frame": "base"} | sensor,
         "from_model": {
             "model": robot.model,
             "name": "x",
             "lock": None,
             "gravity": vector,
         },
-        "FullState": {},
+        "FullState": {} | sensor,
         "generalized_inertia": {"lin": lin},
         "generalized_jacobian": {"robot": robot, "q": q, "frame": "base"},
         "margins": {
@@ -160,11 +165,11 @@ def light(folder):
         },
         "gramians": {"lin": filtered_model, "duration": 1.0},
         "grid": {"robot": robot, "axes": {joint: [0.0, 1.0]}, "base": None},
-        "Gyroscope": {"frame": "base"},
+        "Gyroscope": {"frame": "base"} | sensor,
         "jam": {"robot": robot, "joints": [joint], "q": q, "v": v},
-        "JointPositions": {"joints": (joint,)},
-        "JointTorque": {"joint": joint, "max": 1.0, "min": -0.5},
-        "JointVelocities": {"joints": (joint,)},
+        "JointPositions": {"joints": (joint,)} | sensor,
+        "JointTorque": {"joint": joint, "max": 1.0, "min": -0.5, "lag": 0.1},
+        "JointVelocities": {"joints": (joint,)} | sensor,
         "kalman": {
             "lin": lin,
             "W": 1.0,
@@ -202,7 +207,8 @@ def light(folder):
         "line_up": {"gain": gain, "lin": lin},
         "lqg": {"gain": gain, "estimator": filtered, "zero_error": ["q_b"]},
         "lqr": {"lin": lin} | weights | {"N": None},
-        "Momentum": {},
+        "Momentum": {} | sensor,
+        "MultirateFeedback": {"lin": slow, "compensator": slow_law, "noise": None},
         "from_tool": {
             **{
                 "robot": robot,
@@ -244,7 +250,7 @@ def light(folder):
             "ranges": None,
             "base": None,
         },
-        "RelativePose": {"frame": "base", "to": "base"},
+        "RelativePose": {"frame": "base", "to": "base"} | sensor,
         "ConstraintForce": {"name": "held", "components": ("force.x",)},
         "ReactionWheel": {
             "axis": vector,
@@ -252,6 +258,7 @@ def light(folder):
             "inertia": 0.1,
             "name": "w",
             "momentum": 0,
+            "lag": 0.1,
             "max": 1.0,
             "max_speed": 10.0,
         },
@@ -299,11 +306,13 @@ def light(folder):
             **{"frame": "base", "to": None, "axis": (0, 0, 1)},
             **{"placement": None, "name": "held"},
         },
+        "StarTracker": {} | sensor,
         "StateFeedback": {"lin": lin, "K": gain.K},
         "StateMap": {"robot": robot, "reference": None, "frame": "hybrid"},
         "Thruster": {
             **{"frame": "base", "position": vector, "direction": vector, "name": "t"},
             **{
+                "lag": 0.1,
                 "max": 1.0,
                 "min": None,
                 "on_off": True,
@@ -337,6 +346,7 @@ def light(folder):
         "Trajectory.resampled": {"self": along, "dt": 0.01},
         "Trajectory.save": {"self": along, "path": folder / "c.npz"},
         "LinearModel.discretize": {"self": lin, "dt": 0.1},
+        "LinearModel.with_lags": {"self": lin, "lag": 0.1, "output_lag": None},
         "LinearModel.is_equilibrium": {"self": lin, "tol": 1e-9},
         "LinearModel.load": {"path": "nosuch.npz"},
         "LinearModel.save": {"self": lin, "path": folder / "a.npz"},
@@ -374,6 +384,8 @@ def light(folder):
         "CircularOrbit.from_json": {"text": "{}"},
         "Compensator.load": {"path": "nosuch.npz"},
         "Estimator.load": {"path": "nosuch.npz"},
+        "MultirateEstimator.load": {"path": "nosuch.npz"},
+        "MultirateCompensator.load": {"path": "nosuch.npz"},
         "FilterSchedule.load": {"path": "nosuch.npz"},
         "Funnel.load": {"path": "nosuch.npz", "robot": robot},
         "Gain.load": {"path": "nosuch.npz"},

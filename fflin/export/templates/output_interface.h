@@ -11,7 +11,7 @@ typedef struct {
 void ${name}_start(${name}_memory *memory);
 
 /* Write the inputs u of this sample and advance the memory to the next sample:
- * u = u0 + C z + D (y - y0), then z = A z + B (y - y0)$windup_comment. If the status is INVALID, u
+ * u = u0 + C z + D (y - y0), then z = A z + B (y - y0)$windup_comment.$sample_comment If the status is INVALID, u
  * is u0 within the limits, and z is unchanged.
  * Call once every sample time with the measured outputs y. The attitude in an output q_b is the
  * vector part of the quaternion relative to the reference, with scalar part >= 0.
@@ -19,5 +19,5 @@ void ${name}_start(${name}_memory *memory);
 $output_list
 $input_list
  */
-int ${name}_step(${name}_memory *memory, const ${name}_real y[${NAME}_OUTPUTS],
+int ${name}_step(${name}_memory *memory, ${sample_argument}const ${name}_real y[${NAME}_OUTPUTS],
                  ${name}_real u[${NAME}_INPUTS]);

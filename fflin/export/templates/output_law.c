@@ -6,9 +6,9 @@
 #define NO_LIMIT $largest
 #define TWO_PI $two_pi
 
-/* One row per entry of z; A: one column per entry of z, B: one column per output. */
-static const ${name}_real A[${NAME}_MEMORY_MAX][${NAME}_MEMORY_MAX] = $A;
-static const ${name}_real B[${NAME}_MEMORY_MAX][${NAME}_OUTPUTS] = $B;
+/* ${table_comment}One row per entry of z; A: one column per entry of z, B: one column per output. */
+static const ${name}_real A$tables[${NAME}_MEMORY_MAX][${NAME}_MEMORY_MAX] = $A;
+static const ${name}_real B$tables[${NAME}_MEMORY_MAX][${NAME}_OUTPUTS] = $B;
 
 /* One row per input:
 $input_list
@@ -39,11 +39,11 @@ void ${name}_start(${name}_memory *memory)
     }
 }
 
-int ${name}_step(${name}_memory *memory, const ${name}_real y[${NAME}_OUTPUTS],
+int ${name}_step(${name}_memory *memory, ${sample_argument}const ${name}_real y[${NAME}_OUTPUTS],
                  ${name}_real u[${NAME}_INPUTS])
 {
     ${name}_real dy[${NAME}_OUTPUTS], next[${NAME}_MEMORY_MAX];
-    int i, j, status = ${NAME}_OK;
+${table_row}    int i, j, status = ${NAME}_OK;
 
     for (i = 0; i < ${NAME}_OUTPUTS; i++) {
         dy[i] = y[i] - y0[i];
@@ -71,10 +71,10 @@ int ${name}_step(${name}_memory *memory, const ${name}_real y[${NAME}_OUTPUTS],
     for (i = 0; i < ${NAME}_MEMORY; i++) {
         next[i] = 0;
         for (j = 0; j < ${NAME}_MEMORY; j++) {
-            next[i] += A[i][j] * memory->z[j];
+            next[i] += A$table[i][j] * memory->z[j];
         }
         for (j = 0; j < ${NAME}_OUTPUTS; j++) {
-            next[i] += B[i][j] * dy[j];
+            next[i] += B$table[i][j] * dy[j];
         }
 $windup_next        if (!is_finite(next[i])) {
             status = ${NAME}_INVALID;
