@@ -12,7 +12,7 @@ _PUBLIC = {
         "robot.loading": "load from_model",
         "robot.catalog": "list_robots",
         "robot.robot": "Robot",
-        "robot.orbit": "CircularOrbit",
+        "robot.orbit": "CircularOrbit EllipticOrbit",
         "robot.equipment.appendages": "FlexibleAppendage Slosh",
         "dynamics.points": "configuration velocity effort",
         "dynamics.impact": "capture Capture jam Impact",

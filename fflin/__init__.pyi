@@ -8,6 +8,7 @@ from fflin.robot.loading import from_model as from_model
 from fflin.robot.catalog import list_robots as list_robots
 from fflin.robot.robot import Robot as Robot
 from fflin.robot.orbit import CircularOrbit as CircularOrbit
+from fflin.robot.orbit import EllipticOrbit as EllipticOrbit
 from fflin.robot.equipment.appendages import FlexibleAppendage as FlexibleAppendage
 from fflin.robot.equipment.appendages import Slosh as Slosh
 from fflin.dynamics.points import configuration as configuration

@@ -193,6 +193,14 @@ def inertia_bounds(model: pin.Model) -> Array | None:
     return bounds
 
 
+class Turning(NamedTuple):
+    """Rotation and field of the orbital frame, in base axes (.., 3) and (.., 3, 3)."""
+
+    spin: Array  # Omega [rad/s]
+    spin_change: Array  # its derivative [rad/s^2]
+    pull: Array  # K of (14.2) or (14.9) [1/s^2]
+
+
 class AccelerationDerivatives(NamedTuple):
     """Accelerations c of the base and the joints (3.1), and their derivatives, in base axes.
 
@@ -205,6 +213,7 @@ class AccelerationDerivatives(NamedTuple):
     slopes: Array
     by_u: Array  # D_u (.., 6 + n, nu) of (3.3), for u in base axes
     gravity: Array  # (.., 3) [m/s^2] in base axes; `GravityGradient.fall` in orbit
+    orbit: Turning | None = None  # None without an orbit
 
     @property
     def by_turn(self) -> Array:
@@ -324,8 +333,10 @@ class Accelerations:
         np.negative(inverse, self._minus_inverse).dot(self._force_slopes, slopes)
         if not actuation.default:
             inverse.dot(columns, by_u)
-        gravity = tide.fall if tide else state.gravity(q)
-        return AccelerationDerivatives(c, slopes, by_u, gravity)
+        if not tide:
+            return AccelerationDerivatives(c, slopes, by_u, state.gravity(q))
+        orbit = Turning(tide.spin, tide.spin_change, tide.pull)
+        return AccelerationDerivatives(c, slopes, by_u, tide.fall, orbit)
 
     def _gyroscopic(
         self, q: Array, v: Array, wrenches: pin.StdVec_Force | None

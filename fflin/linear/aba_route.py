@@ -44,9 +44,10 @@ def _dynamics(
     state = aba.state
     # Pinocchio differentiates about the world's origin, and loses accuracy if the base is distant.
     # So place the base at the world's origin. This is allowed, because A and B do not depend on the
-    # position of the base, even in orbit.
+    # position of the base, even in orbit. But the linear acceleration in base axes does.
     q, slow = q.copy(), v.copy()
-    q[:3] = 0.0
+    if not state.field or state.axes[1]:
+        q[:3] = 0.0
     if not state.field:
         # Without an orbit, the dynamics do not depend on the linear velocity of the base, except
         # for the rotation of the base axes, which adds -omega x v to the rate of this velocity.
@@ -106,7 +107,9 @@ class Route:
     """
 
     def __init__(self, robot: Robot, lin: LinearModel) -> None:
-        self.state = state = StateMap(robot, reference=lin.reference, frame=lin.frame)
+        self.state = state = StateMap(
+            robot, reference=lin.reference, frame=lin.frame, t=lin.time
+        )
         self.aba = Aba(state)
         self.q = robot.checked_configuration(lin.q)
         self.v = robot.checked_velocity(lin.v)

@@ -11,10 +11,10 @@ import pinocchio as pin
 
 from fflin.base import __version__
 from fflin.base.errors import InputError
-from fflin.base.validation import Array, frozen, truth, vector
-from fflin.dynamics.coordinates import Chart, Frame, ReferenceChart, refuse_orbit
+from fflin.base.validation import Array, frozen, number, truth, vector
+from fflin.dynamics.coordinates import Chart, Frame, ReferenceChart
 from fflin.dynamics.outputs import Sensing
-from fflin.dynamics.rnea import AccelerationDerivatives, Accelerations
+from fflin.dynamics.rnea import AccelerationDerivatives, Accelerations, Turning
 from fflin.dynamics.state import Actuation, StateMap
 from fflin.linear.aba_route import inertia_matrix
 from fflin.linear.check import certify
@@ -66,8 +66,6 @@ class Prepared:
     ) -> None:
         self.robot = robot
         self.moving = truth("moving", moving)
-        if moving:
-            refuse_orbit(robot, "models with moving=True")
         if moving and frame is None:
             frame = "local"
         self.map = state = StateMap(robot, reference=reference, frame=frame)
@@ -77,8 +75,8 @@ class Prepared:
                 "and no frame other than 'local' can be given; leave out reference and frame"
             )
         # If no reference is given, the reference is the base placement at the operating point. In
-        # orbit, it is the orbital frame instead.
-        self.own_reference = reference is None and robot.orbit is None
+        # orbit, it is the orbital frame instead, unless the reference moves.
+        self.own_reference = reference is None and (moving or robot.orbit is None)
         robot.require_inertia()
         self.actuation = Actuation(state)
         self.sensing: Sensing | None = None
@@ -289,10 +287,16 @@ class Linearizer:
         self._known = ready.free and ready.own_reference and ready.actuation.default
 
     def __call__(
-        self, q: Array | None = None, v: Array | None = None, u: Array | None = None
+        self,
+        q: Array | None = None,
+        v: Array | None = None,
+        u: Array | None = None,
+        *,
+        t: float = 0.0,
     ) -> LinearModel:
         """Linearise about a point; see `linearize` for the arguments and errors."""
         robot = self.robot
+        t = number("t", t)
         q = robot.neutral() if q is None else robot.checked_configuration(q).copy()
         known = v is None and u is None and self._known
         still_v, still_u = self._still
@@ -311,7 +315,7 @@ class Linearizer:
                 return LinearModel(self._fields, B=B, q=q)
             # Suppress NumPy's overflow warnings, because `_require_finite` reports an overflow.
             with np.errstate(over="ignore", invalid="ignore"):
-                return self._anywhere(q, v, u)
+                return self._anywhere(q, v, u, t)
 
     def write_by_u(self, q: Array, out: Array) -> None:
         """Write the lower half of B (6 + n, nu) about a valid q at rest; see `Prepared.free`."""
@@ -337,9 +341,10 @@ class Linearizer:
         )
         return make, (self.robot,)
 
-    def _anywhere(self, q: Array, v: Array, u: Array) -> LinearModel:
+    def _anywhere(self, q: Array, v: Array, u: Array, t: float) -> LinearModel:
         ready, lower = self.prepared, self._lower
         state, actuation = ready.map, ready.actuation
+        state.move_to(t)
         chart = _REFERENCE_CHART if ready.own_reference else state.chart(q)
         nu = state.velocities(v)
         u_base = actuation.in_base_axes(chart, u)
@@ -363,12 +368,14 @@ class Linearizer:
         made = {"A": A, "B": B, "q": q, "v": v, "u0": u, self._rate: rate} | seen
         for array in made.values():
             array.setflags(write=False)
+        if state.elliptic:
+            return LinearModel(self._fields | made, t=t)
         return LinearModel(self._fields | made)
 
-    def along(self, q: Array, v: Array, u: Array) -> dict[str, Array]:
+    def along(self, q: Array, v: Array, u: Array, t: Array) -> dict[str, Array]:
         """Return A, B, C, D and y (N, ..) about N valid points, with the inputs u in base axes.
 
-        Each model must be relative to the base placement at its point.
+        Each model must be relative to the base placement at its point. t (N,) are the times [s].
         """
         ready = self.prepared
         lower = self._lower
@@ -381,10 +388,14 @@ class Linearizer:
         c = np.empty_like(nu)
         gravity = np.empty((count, 3))
         seen = []
+        turnings = list[Turning]()
         with self._lock:
             for k, point in enumerate(zip(q, v, nu, u, strict=True)):
+                state.move_to(float(t[k]))
                 rates = self._accelerations.rates(*point, A[k, lower], B[k, lower])
                 c[k], gravity[k] = rates.c, rates.gravity
+                if rates.orbit is not None:
+                    turnings.append(rates.orbit)
                 if sensing is not None:
                     measured_point = _REFERENCE_CHART, rates, x0[k], point
                     seen.append(
@@ -392,7 +403,10 @@ class Linearizer:
                             sensing, actuation, self._data, *measured_point
                         )
                     )
-        all_rates = AccelerationDerivatives(c, A[:, lower], B[:, lower], gravity)
+        orbit = None
+        if turnings:
+            orbit = Turning(*map(np.array, zip(*turnings, strict=True)))
+        all_rates = AccelerationDerivatives(c, A[:, lower], B[:, lower], gravity, orbit)
         f0 = assemble(actuation, chart, nu, u, all_rates, A, moving=ready.moving)
         if sensing is None:
             C, D = (np.tile(ready.common[key], (count, 1, 1)) for key in "CD")
@@ -425,6 +439,7 @@ def linearize(
     frame: Frame | None = None,
     reference: pin.SE3 | None = None,
     moving: bool = False,
+    t: float = 0.0,
 ) -> LinearModel:
     """Linearise a robot about an operating point, by default at rest with neutral joints.
 
@@ -439,7 +454,8 @@ def linearize(
         Inputs of the robot, see `effort`; zero by default.
     frame : {"hybrid", "local", "world", "lvlh", "hill"}, optional
         Axes of the base's velocities and wrenches, see `StateMap`; by default
-        "hybrid", or "lvlh" if the robot is in orbit.
+        "hybrid", or "lvlh" if the robot is in orbit. In orbit, "local" has the axes of
+        "lvlh" for the position, and base axes for the velocities and wrenches.
     reference : pin.SE3, optional
         Pose relative to which the attitude and position of the base are measured. The
         default is the base pose at the operating point, or the orbital frame if the
@@ -447,6 +463,10 @@ def linearize(
     moving : bool
         Whether to return the error dynamics about a reference that moves through the
         operating point; see `Linearizer`.
+    t : float
+        Time [s] for which the model holds, if the robot is in an elliptic orbit. In all other
+        cases, the model does not depend on time. See `EllipticOrbit` for the position of the robot
+        at t = 0.
 
     Returns
     -------
@@ -474,4 +494,5 @@ def linearize(
     >>> lin.is_equilibrium(1e-9)
     True
     """
-    return Linearizer(robot, frame=frame, reference=reference, moving=moving)(q, v, u)
+    linearizer = Linearizer(robot, frame=frame, reference=reference, moving=moving)
+    return linearizer(q, v, u, t=t)

@@ -12,7 +12,7 @@ from fflin.base.rotation import product, skew
 from fflin.base.validation import Array
 from fflin.dynamics.coordinates import ANGULAR, LINEAR, Chart, times
 from fflin.dynamics.outputs import Sensing
-from fflin.dynamics.rnea import AccelerationDerivatives
+from fflin.dynamics.rnea import AccelerationDerivatives, Turning
 from fflin.dynamics.state import Actuation, StateMap
 
 
@@ -44,7 +44,7 @@ def assemble(
     # (4.8)
     f0 = np.concatenate((chart.rate(w), position_rate, nu[..., 6:], rates.c), -1)
 
-    D_theta = _rotation_derivative(actuation, chart, u, rates, W)
+    D_theta = _rotation_derivative(actuation, chart, nu, u, rates, W)
     lower[..., g.q_b] = chart.over_q_b(D_theta)
 
     # Write the rows of attitude and position. If the base is at the reference, do not write the
@@ -77,13 +77,13 @@ def assemble(
     if state.falls:
         f0[..., g.v_b] += rates.gravity
     if state.orbit:  # (14.2), (14.5), (14.6)
-        turn, pull = state.orbit
-        spin = chart.R.mT @ turn
-        A[..., g.v_b, g.r_b] = pull
-        A[..., g.v_b, g.v_b] = 0.0 - 2.0 * skew(turn)
-        A[..., g.omega_b, g.omega_b] -= skew(spin)
+        _add_orbit(state, chart, rates, A)
+        assert rates.orbit is not None
+        spin = _spin(state, chart, rates.orbit)
         f0[..., g.omega_b] += times(W, spin)
         f0[..., g.v_b] -= 2.0 * times(skew(spin), v)
+        if state.elliptic:  # (14.9)
+            f0[..., g.omega_b] -= rates.orbit.spin_change
     if not v_in_reference:
         V = skew(v)
         A[..., g.r_b, g.q_b] = -chart.over_q_b(chart.turned(V))  # (4.3)
@@ -95,16 +95,47 @@ def assemble(
     return f0
 
 
+def _spin(state: StateMap, chart: Chart, orbit: Turning) -> Array:
+    """Return the angular velocity (.., 3) of the orbital frame in base axes."""
+    if state.axes[1] and state.orbit:
+        spin: Array = chart.R.mT @ state.orbit[0]
+        return spin
+    return orbit.spin
+
+
+def _add_orbit(
+    state: StateMap, chart: Chart, rates: AccelerationDerivatives, A: Array
+) -> None:
+    """Add the terms of an orbit to the blocks of A for the velocities of the base (14.6)."""
+    g = state.groups
+    assert state.orbit is not None
+    assert rates.orbit is not None
+    spin = _spin(state, chart, rates.orbit)
+    A[..., g.omega_b, g.omega_b] -= skew(spin)
+    if state.axes[1]:
+        turn, pull = state.orbit
+        A[..., g.v_b, g.r_b] = pull
+        A[..., g.v_b, g.v_b] = 0.0 - 2.0 * skew(turn)
+        return
+    # The rows of the linear acceleration are in base axes. With `moving`, the position is too.
+    pull = rates.orbit.pull
+    if not chart.at_reference:
+        pull = product(pull, chart.R.mT)
+    A[..., g.v_b, g.r_b] = pull
+    A[..., g.v_b, g.v_b] -= 2.0 * skew(spin)
+
+
 def _rotation_derivative(
     actuation: Actuation,
     chart: Chart,
+    nu: Array,
     u: Array,
     rates: AccelerationDerivatives,
     W: Array,
 ) -> Array:
     """Return D_theta (.., 6 + n, 3): the derivative of the accelerations by base rotations (4.4).
 
-    The result may be the array `rates.by_turn`, changed in place.
+    `nu` and `u` are in base axes. The result may be the array `rates.by_turn`, changed in place.
     """
     state = actuation.state
     c = rates.c
@@ -128,8 +159,13 @@ def _rotation_derivative(
         linear_rows -= skew(c[..., LINEAR])
     elif state.falls:
         linear_rows += skew(rates.gravity)
-    if state.orbit:  # (14.5)
-        angular_rows += W @ skew(chart.R.mT @ state.orbit[0])
+    if rates.orbit is not None:  # (14.5)
+        spin_cross = skew(_spin(state, chart, rates.orbit))
+        angular_rows += product(W, spin_cross)
+        if state.elliptic:  # (14.9)
+            angular_rows -= skew(rates.orbit.spin_change)
+        if not v_in_reference:
+            linear_rows += 2.0 * product(skew(nu[..., LINEAR]), spin_cross)
     return D_theta
 
 
@@ -139,7 +175,7 @@ def drift(state: StateMap, f0: Array, gravity: Array) -> Array:
     f0 is the state derivative of the robot. Under gravity, the result is f0 without the rotation
     about the vertical, because a rotation about the vertical does not affect the dynamics.
     """
-    if not state.falls:
+    if not state.falls or state.orbit:
         return f0
     weight = (gravity * gravity).sum(axis=-1, keepdims=True)
     if not np.count_nonzero(weight):

@@ -12,6 +12,7 @@ from fflin.robot.joints import ROOT
 
 CUBESAT = fflin.load("cubesat")
 IN_ORBIT = CUBESAT.replace(orbit=500e3)
+IN_ELLIPSE = CUBESAT.replace(orbit={"perigee": 500e3, "eccentricity": 0.1})
 
 
 def with_displaced_root():
@@ -37,6 +38,7 @@ TASKS = {
     "callbacks are called in Python": Task(robots=(CUBESAT,), callback=True),
     "disturbances are computed in Python": Task(robots=(CUBESAT,), disturbance=True),
     "a Mpc is computed in Python": Task(robots=(CUBESAT,), python_policy="Mpc"),
+    "'cubesat' is in an elliptic orbit": Task(robots=(CUBESAT, IN_ELLIPSE)),
     "'cubesat' is in orbit": Task(robots=(CUBESAT, IN_ORBIT)),
     "a joint of 'composite' does not": Task(robots=(with_displaced_axis(),)),
     "the root joint of 'displaced'": Task(
