@@ -33,6 +33,7 @@ _PUBLIC = {
         "linear.equilibrium": "equilibrium Equilibrium",
         "linear.trajectory": "Trajectory",
         "linear.linear_trajectory": "linearize_trajectory LinearTrajectory",
+        "linear.orbit_motion": "linearize_orbit",
         "linear.exchange": "transform from_tool ToolModel ToolGain",
         "linear.tool_trajectory": "ToolTrajectory ToolSchedule",
         "linear.check": "check Check",

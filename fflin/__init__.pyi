@@ -51,6 +51,7 @@ from fflin.linear.equilibrium import equilibrium as equilibrium
 from fflin.linear.equilibrium import Equilibrium as Equilibrium
 from fflin.linear.trajectory import Trajectory as Trajectory
 from fflin.linear.linear_trajectory import linearize_trajectory as linearize_trajectory
+from fflin.linear.orbit_motion import linearize_orbit as linearize_orbit
 from fflin.linear.linear_trajectory import LinearTrajectory as LinearTrajectory
 from fflin.linear.exchange import transform as transform
 from fflin.linear.exchange import from_tool as from_tool

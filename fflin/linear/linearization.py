@@ -372,14 +372,18 @@ class Linearizer:
             return LinearModel(self._fields | made, t=t)
         return LinearModel(self._fields | made)
 
-    def along(self, q: Array, v: Array, u: Array, t: Array) -> dict[str, Array]:
+    def along(
+        self, q: Array, v: Array, u: Array, t: Array | None = None
+    ) -> dict[str, Array]:
         """Return A, B, C, D and y (N, ..) about N valid points, with the inputs u in base axes.
 
-        Each model must be relative to the base placement at its point. t (N,) are the times [s].
+        Each model must be relative to the base placement at its point. t (N,) are the times [s],
+        which matter only in an elliptic orbit.
         """
         ready = self.prepared
         lower = self._lower
         count = len(q)
+        times = np.zeros(count) if t is None else t
         state, actuation, sensing = ready.map, ready.actuation, ready.sensing
         chart, nu = ReferenceChart(count), state.velocities(v)
         x0 = state.compose(chart, chart.q_b, state.joint_positions(q), nu)
@@ -391,7 +395,7 @@ class Linearizer:
         turnings = list[Turning]()
         with self._lock:
             for k, point in enumerate(zip(q, v, nu, u, strict=True)):
-                state.move_to(float(t[k]))
+                state.move_to(float(times[k]))
                 rates = self._accelerations.rates(*point, A[k, lower], B[k, lower])
                 c[k], gravity[k] = rates.c, rates.gravity
                 if rates.orbit is not None:
