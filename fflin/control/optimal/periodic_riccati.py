@@ -1,0 +1,128 @@
+"""Periodic Riccati equations: stabilising solutions by doubling of the period (20.3)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+
+import numpy as np
+
+from fflin.base.errors import StabilizabilityError
+from fflin.base.validation import Array
+from fflin.control.optimal import differential_riccati as riccati
+from fflin.dynamics.integrators import GAUSS
+
+# The period is doubled until the cost matrix changes by at most this, relative to its norm. After
+# 2^60 periods, a cost that still grows belongs to a mode that the inputs cannot stabilise.
+_STANDS, _MOST_DOUBLINGS = 1e-15, 60
+
+# Largest accepted relative difference between P at both ends of a period.
+_CLOSED = 1e-9
+
+# Largest number of sweeps that reduce rounding errors after the doubling.
+_SWEEPS = 4
+
+
+def sample_transition(weights: Array, whole: Array) -> Array:
+    """Return the transition (3, nx, nx) of a sample: T, G and W, see `transitions` of the room.
+
+    `weights` (nx + nu, nx + nu) is the cost matrix of the sample for the error and the input, and
+    `whole` (nx, nx + nu) maps both to the next error. The cross term of the cost is removed first.
+    """
+    nx = len(whole)
+    A, B = whole[:, :nx], whole[:, nx:]
+    N, R = weights[:nx, nx:], weights[nx:, nx:]
+    gain = np.linalg.solve(R, np.column_stack((N.T, B.T)))
+    of_cross, of_input = gain[:, :nx], gain[:, nx:]
+    G = B @ of_input
+    W = weights[:nx, :nx] - N @ of_cross
+    return np.array((A - B @ of_cross, 0.5 * (G + G.T), 0.5 * (W + W.T)))
+
+
+def over_period(maps: Iterable[Array]) -> Array:
+    """Return the transition over all given intervals, the latest interval first."""
+    total: Array | None = None
+    for one in maps:
+        total = one if total is None else riccati.joined(one, total)
+    assert total is not None
+    return total
+
+
+def periodic_cost(period: Array) -> Array:
+    """Return the stabilising solution P (nx, nx) at the end of a period.
+
+    `period` contains T, G and W of the whole period. The transition over 2, 4, 8 .. periods is
+    formed until W no longer changes. Then it is the cost over infinitely many periods.
+    """
+    scale = _balance(period)
+    T, G, W = period
+    maps = np.array(
+        (T * scale / scale[:, None], G / np.outer(scale, scale), W * np.outer(scale, scale))
+    )
+    with np.errstate(over="ignore", invalid="ignore"):
+        for _ in range(_MOST_DOUBLINGS):
+            before = maps[2]
+            maps = riccati.joined(maps, maps)
+            change = np.linalg.norm(maps[2] - before)
+            if not np.isfinite(change):
+                break
+            if change <= _STANDS * np.linalg.norm(maps[2]):
+                P: Array = maps[2] / np.outer(scale, scale)
+                return P
+    raise np.linalg.LinAlgError("the cost grows from period to period")
+
+
+def _balance(period: Array) -> Array:
+    """Return units (nx,) of the states in which T, G and W have entries of similar size."""
+    _, G, W = period
+    costs = np.sqrt(np.maximum(np.abs(W.diagonal()), 1e-300))
+    reach = np.sqrt(np.maximum(np.abs(G.diagonal()), 1e-300))
+    known = (np.abs(W.diagonal()) > 0.0) & (np.abs(G.diagonal()) > 0.0)
+    return np.where(known, np.sqrt(reach / costs), 1.0)
+
+
+def repeated(sweep: Callable[[Array], Array], P: Array, remedy: str) -> Array:
+    """Return P at the end of a period, after sweeps over the period that reduce its errors.
+
+    `sweep` returns P at the start of the period for P at its end. A sweep of a stable loop
+    contracts errors. The sweeps end if P repeats after the period to machine precision.
+    """
+    apart = np.inf
+    for _ in range(_SWEEPS):
+        start = sweep(P)
+        size = max(float(np.linalg.norm(P)), 1e-300)
+        distance = float(np.linalg.norm(start - P)) / size
+        if distance >= apart:
+            break
+        apart = distance
+        P = start
+        if apart <= _STANDS:
+            break
+    if not apart <= _CLOSED:
+        raise StabilizabilityError(
+            f"P differs by {apart:.1e} after one period, expected at most {_CLOSED:g}; {remedy}"
+        )
+    return P
+
+
+def interval_maps(at: Callable[[Array], Array], times: Array) -> Array:
+    """Return T, G and W (k, 3, nx, nx) between successive times, as `solve_back` computes them."""
+    maps = list[Array]()
+    for first in range(0, len(times) - 1, _BATCH):
+        knots = times[first : first + _BATCH + 1]
+        h = np.diff(knots)
+        nodes = [at(knots[:-1] + node * h) for node in GAUSS]
+        maps.append(riccati.transitions(nodes[0], nodes[1], h).swapaxes(0, 1))
+    return np.concatenate(maps)
+
+
+_BATCH = 64
+
+
+def loop_factors(maps: Array, P: Array) -> Array:
+    """Return the transition matrices (k, nx, nx) of the closed loop over the intervals.
+
+    `maps` (k, 3, nx, nx) are T, G and W, and `P` (k + 1, nx, nx) the costs at the times.
+    """
+    T, G = maps[:, 0], maps[:, 1]
+    factors: Array = np.linalg.solve(np.eye(T.shape[-1]) + G @ P[1:], T)
+    return factors
