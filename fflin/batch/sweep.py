@@ -23,7 +23,12 @@ from fflin.batch.configurations import Configurations, checked_points, checked_r
 from fflin.batch.files import FileStore, MemoryStore, is_constant, output_path
 from fflin.batch.linear_batch import AT_ROOT, TEXTS, LinearBatch
 from fflin.batch.run import Execution, Progress, Rows, run_chunks
-from fflin.dynamics.coordinates import SMALLEST_Q0, Chart, ReferenceChart
+from fflin.dynamics.coordinates import (
+    SMALLEST_Q0,
+    Chart,
+    ReferenceChart,
+    refuse_elliptic,
+)
 from fflin.dynamics.rnea import AccelerationDerivatives
 from fflin.kernel.compiled import compiles
 from fflin.kernel.limits import Task, reason_against
@@ -159,6 +164,7 @@ def sweep(
     """
     how = Execution(executor, workers, threads, chunk, progress)
     path = None if out is None else output_path(out)
+    refuse_elliptic(robot, "sweeps", "use fflin.linearize(robot, q, t=...)")
     linearizer = Linearizer(robot, frame=frame, reference=reference, moving=moving)
     job = ChunkJob(linearizer, at_rest=v is None and u is None, engine=engine)
     task = SweepTask(job, q, v, u)
@@ -204,6 +210,8 @@ def kernel_of(prepared: Prepared, engine: str | None) -> RowAccelerations | None
 
 def _reason(prepared: Prepared) -> str:
     """Return why the compiled kernel cannot be used, or an empty text if it can."""
+    if prepared.robot.orbit and not prepared.map.axes[1]:
+        return f"in orbit, models in base axes (of '{prepared.robot.name}') need Python"
     task = Task(robots=(prepared.robot,), outputs=prepared.sensing is not None)
     return reason_against(task)
 

@@ -107,7 +107,7 @@ def tvkalman(
         return 0.5 * (spread + spread.T)
 
     periodic = asks_periodic(P0, traj, "P0")
-    P = np.zeros((len(traj.state_names), len(traj.state_names)))
+    P: Array = np.zeros((len(traj.state_names), len(traj.state_names)))
     if asks_steady(P0, "P0", "a covariance"):
         start, early = steady_end(traj, 0), intensity(float(traj.t[0]))
         lin = start.of_trajectory(traj.robot)

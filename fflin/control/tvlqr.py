@@ -53,6 +53,9 @@ class Schedule(ModelDesign):
     P: Array
     residual: float
     period: float = field(default=0.0, kw_only=True)
+    orbit: str = field(
+        default_factory=str, kw_only=True
+    )  # of a periodic motion, as JSON text
 
     @cached_property
     def starts(self) -> list[float]:
@@ -165,6 +168,10 @@ class GainSchedule(Schedule):
         made = f"the gain schedule was made for '{self.robot}'"
         require_same(made, state, "state", self.state_names, None)
         require_same(made, state, "input", self.input_names, None)
+        if self.period and self.orbit != orbit_text(robot):
+            raise InputError(
+                f"{made} in another orbit than that of '{robot.name}'; use the same orbit for both"
+            )
         parts = self.knots, self.q, self.v, self.u
         return Trajectory(
             robot, *parts, hold=self.hold, frame=self.frame, period=self.period
@@ -427,7 +434,7 @@ def tvlqr(
 
     residual = 0.0
     remedy = "smaller weights or a larger R"
-    multipliers = np.zeros(0)
+    multipliers: Array = np.zeros(0)
     with riccati.bounded_by(remedy):
         if sample is not None:
             stages = list(held_stages(traj, dt, Q, R))
@@ -467,11 +474,17 @@ def tvlqr(
         weights=rule,
         knots=traj.t,
         multipliers=multipliers,
+        orbit=orbit_text(traj.robot),
     )
     if dt:
         return schedule
     with riccati.bounded_by(remedy):
         return replace(schedule, residual=schedule.defect(at))
+
+
+def orbit_text(robot: Robot) -> str:
+    """Return the orbit of a robot as JSON text; empty without an orbit."""
+    return robot.orbit.to_json() if robot.orbit else ""
 
 
 def asks_steady(value: object, name: str = "Qf", kind: str = "a weight") -> bool:
@@ -488,8 +501,8 @@ def asks_periodic(value: object, traj: LinearTrajectory, name: str = "Qf") -> bo
     periodic = isinstance(value, str) and value == "periodic"
     if periodic and not traj.period:
         raise InputError(
-            f"{name} is 'periodic', but the trajectory has no period; fflin.linearize_orbit returns "
-            "a periodic trajectory"
+            f"{name} is 'periodic', but the trajectory has no period; fflin.linearize_orbit "
+            "returns a periodic trajectory"
         )
     if traj.period and not periodic:
         raise InputError(
@@ -539,7 +552,8 @@ def stabilised(traj: LinearTrajectory) -> Iterator[None]:
         largest = float(np.abs(traj.multipliers).max())
         raise StabilizabilityError(
             f"no periodic solution of the Riccati equation exists for '{traj.robot.name}', whose "
-            f"largest multiplier is {largest:.6g}: the cost grows from period to period; {_UNSTABLE}"
+            f"largest multiplier is {largest:.6g}: the cost grows from period to period; "
+            f"{_UNSTABLE}"
         ) from None
 
 
@@ -561,7 +575,8 @@ def _periodic_back(
         )
 
         def sweep(end: Array) -> Array:
-            return _swept(maps, end)[0]
+            start: Array = _swept(maps, end)[0]
+            return start
 
         P = periodic_riccati.repeated(sweep, P, _UNSTABLE)
         return times, _swept(maps, P), maps
@@ -577,7 +592,8 @@ def _swept(maps: Array, P: Array) -> Array:
 
 def loop_multipliers(factors: Array) -> Array:
     """Return the magnitudes (nx,) of the multipliers of a closed loop, the largest first."""
-    return np.sort(np.abs(multipliers_of(factors)))[::-1]
+    size: Array = np.sort(np.abs(multipliers_of(factors)))[::-1]
+    return size
 
 
 def held_stages(

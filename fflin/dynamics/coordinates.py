@@ -51,7 +51,9 @@ def frame_of(robot: Robot, frame: object) -> Frame:
         raise InputError(
             f"frame is {frame!r}, expected one of {', '.join(get_args(Frame))}"
         )
-    if (frame in ORBITAL) != bool(robot.orbit) and not (robot.orbit and frame == "local"):
+    if (frame in ORBITAL) != bool(robot.orbit) and not (
+        robot.orbit and frame == "local"
+    ):
         where = "in no orbit"
         remedy = (
             "use hybrid, local or world, or give the robot an orbit (orbit=, --orbit)"

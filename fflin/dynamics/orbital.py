@@ -93,10 +93,12 @@ class OrbitField:
 
     def turned(self, t: float) -> Array:
         """Return the rotation (3, 3) of the orbital axes from t = 0 to time t [s]."""
+        rotation = t * self.rate
         if self.elliptic:
             angle = _state_at(self.robot.orbit, t).angle - self._start.angle
-            return pin.exp3(angle * self._normal)
-        return pin.exp3(t * self.rate)
+            rotation = angle * self._normal
+        axes: Array = pin.exp3(rotation)
+        return axes
 
     def base(self, q: Array) -> tuple[Array, Array]:
         """Return the attitude (3, 3) and position (3,) of the base in the orbital frame."""

@@ -213,7 +213,6 @@ class AccelerationDerivatives(NamedTuple):
     slopes: Array
     by_u: Array  # D_u (.., 6 + n, nu) of (3.3), for u in base axes
     gravity: Array  # (.., 3) [m/s^2] in base axes; `GravityGradient.fall` in orbit
-    orbit: Turning | None = None  # None without an orbit
 
     @property
     def by_turn(self) -> Array:
@@ -265,6 +264,8 @@ class Accelerations:
         ]
         self._field = state.field
         self._still = np.zeros(robot.nv)
+        # Rotation of the orbital frame at the last point of `rates`; None without an orbit.
+        self.turning: Turning | None = None
 
     def rates(
         self, q: Array, v: Array, nu: Array, u: Array, slopes: Array, by_u: Array
@@ -333,10 +334,10 @@ class Accelerations:
         np.negative(inverse, self._minus_inverse).dot(self._force_slopes, slopes)
         if not actuation.default:
             inverse.dot(columns, by_u)
-        if not tide:
-            return AccelerationDerivatives(c, slopes, by_u, state.gravity(q))
-        orbit = Turning(tide.spin, tide.spin_change, tide.pull)
-        return AccelerationDerivatives(c, slopes, by_u, tide.fall, orbit)
+        gravity = tide.fall if tide else state.gravity(q)
+        if tide:
+            self.turning = Turning(tide.spin, tide.spin_change, tide.pull)
+        return AccelerationDerivatives(c, slopes, by_u, gravity)
 
     def _gyroscopic(
         self, q: Array, v: Array, wrenches: pin.StdVec_Force | None

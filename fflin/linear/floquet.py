@@ -4,17 +4,17 @@ import math
 
 import numpy as np
 
-from fflin.base.validation import Array
+from fflin.base.validation import Array, Complex
 
-# Multipliers are the powers of the eigenvalues of a cyclic matrix with this many blocks. Over one
-# block, small and large solutions of a stable loop differ by less than the machine precision allows.
+# Multipliers are the powers of the eigenvalues of a cyclic matrix with this many blocks. Within one
+# block, small and large solutions differ much less than over a whole period.
 _BLOCKS = 16
 
 # Multipliers below this fraction of the largest one are reported as "below".
 NEGLIGIBLE = 1e-16
 
 
-def multipliers(factors: Array) -> Array:
+def multipliers(factors: Array) -> Complex:
     r"""Return the eigenvalues (nx,) of :math:`\Phi_N \cdots \Phi_1`, the largest first.
 
     The product itself is not formed, because its small eigenvalues would be lost beside the large
@@ -33,7 +33,7 @@ def multipliers(factors: Array) -> Array:
     for k, block in enumerate(blocks):
         rows = (k + 1) % count * nx
         cyclic[rows : rows + nx, k * nx : (k + 1) * nx] = block
-    roots = np.linalg.eigvals(cyclic)
+    roots: Complex = np.linalg.eigvals(cyclic).astype(complex)
     return _powers(roots, count)
 
 
@@ -49,7 +49,7 @@ def _grouped(factors: Array) -> list[Array]:
     return blocks
 
 
-def _powers(roots: Array, count: int) -> Array:
+def _powers(roots: Complex, count: int) -> Complex:
     """Return the multipliers for the eigenvalues of a cyclic matrix with `count` blocks.
 
     Each multiplier has `count` roots, which differ by rotations of 2 pi / count. They are found by
@@ -68,16 +68,17 @@ def _powers(roots: Array, count: int) -> Array:
     return _paired(np.array(values))
 
 
-def _paired(values: Array) -> Array:
+def _paired(values: Complex) -> Complex:
     """Return multipliers of a real matrix: sorted, with exact zeros for rounded imaginary parts."""
     size = np.abs(values)
     real = np.abs(values.imag) <= 1e-12 * size
     values = np.where(real, values.real, values)
     order = np.lexsort((-values.imag, -np.round(np.log10(size + 1e-300), 6)))
-    return values[order]
+    ordered: Complex = values[order]
+    return ordered
 
 
-def multiplier_text(values: Array) -> str:
+def multiplier_text(values: Array | Complex) -> str:
     """Return a line about multipliers: the largest magnitude, and how many are negligible."""
     size = np.abs(values)
     largest = float(size.max())

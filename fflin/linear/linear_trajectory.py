@@ -13,7 +13,7 @@ import numpy as np
 
 from fflin.base.errors import InputError
 from fflin.base.process import in_one_thread
-from fflin.base.validation import Array, ArrayLike, frozen
+from fflin.base.validation import Array, ArrayLike, Complex
 from fflin.dynamics.integrators import GAUSS, HEAVY, LIGHT, held_exponential
 from fflin.linear.check import Check, check_all
 from fflin.linear.fit import require_same
@@ -165,7 +165,7 @@ class LinearTrajectory(Trajectory):
         return check_all(self.robot, self, title, tolerance=tolerance)
 
     @cached_property
-    def multipliers(self) -> Array:
+    def multipliers(self) -> Complex:
         """Characteristic multipliers of a periodic motion, complex, the largest first.
 
         They are the eigenvalues of the transition matrix over one period. The motion is stable if
@@ -180,7 +180,9 @@ class LinearTrajectory(Trajectory):
         """
         from fflin.linear.floquet import multipliers
 
-        return frozen(multipliers(self.monodromy_factors()))
+        values = multipliers(self.monodromy_factors())
+        values.setflags(write=False)
+        return values
 
     def monodromy_factors(self) -> Array:
         """Return the transition matrices (k, nx, nx) from knot to knot of a periodic motion."""

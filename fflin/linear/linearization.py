@@ -361,7 +361,16 @@ class Linearizer:
                 ready.sensing, actuation, self._data, chart, rates, x0, point
             )
             _require_finite(*seen.values())
-        rate = assemble(actuation, chart, nu, u_base, rates, A, moving=ready.moving)
+        rate = assemble(
+            actuation,
+            chart,
+            nu,
+            u_base,
+            rates,
+            A,
+            moving=ready.moving,
+            turning=self._accelerations.turning,
+        )
         _require_finite(A, B, rate)
         if ready.moving:
             rate = drift(state, rate, rates.gravity)
@@ -398,8 +407,8 @@ class Linearizer:
                 state.move_to(float(times[k]))
                 rates = self._accelerations.rates(*point, A[k, lower], B[k, lower])
                 c[k], gravity[k] = rates.c, rates.gravity
-                if rates.orbit is not None:
-                    turnings.append(rates.orbit)
+                if self._accelerations.turning is not None:
+                    turnings.append(self._accelerations.turning)
                 if sensing is not None:
                     measured_point = _REFERENCE_CHART, rates, x0[k], point
                     seen.append(
@@ -407,11 +416,20 @@ class Linearizer:
                             sensing, actuation, self._data, *measured_point
                         )
                     )
-        orbit = None
+        turning = None
         if turnings:
-            orbit = Turning(*map(np.array, zip(*turnings, strict=True)))
-        all_rates = AccelerationDerivatives(c, A[:, lower], B[:, lower], gravity, orbit)
-        f0 = assemble(actuation, chart, nu, u, all_rates, A, moving=ready.moving)
+            turning = Turning(*map(np.array, zip(*turnings, strict=True)))
+        all_rates = AccelerationDerivatives(c, A[:, lower], B[:, lower], gravity)
+        f0 = assemble(
+            actuation,
+            chart,
+            nu,
+            u,
+            all_rates,
+            A,
+            moving=ready.moving,
+            turning=turning,
+        )
         if sensing is None:
             C, D = (np.tile(ready.common[key], (count, 1, 1)) for key in "CD")
             y = x0

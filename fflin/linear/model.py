@@ -593,6 +593,7 @@ class LinearModel(ModelHeader, StateSpace):
         from scipy.signal import StateSpace
 
         self.require_unchanged()
+        refuse_frozen(self, "to_scipy")
         matrices = (self.A, self.B, self.C, self.D)
         if self.dt:
             return StateSpace(*matrices, dt=self.dt)
@@ -615,6 +616,7 @@ class LinearModel(ModelHeader, StateSpace):
             created.
         """
         self.require_unchanged()
+        refuse_frozen(self, "to_control")
         matrices = (self.A, self.B, self.C, self.D)
         return state_space(
             matrices, self.dt, self.state_names, self.input_names, self.output_names

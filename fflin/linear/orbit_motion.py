@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -110,9 +111,9 @@ def linearize_orbit(
     if not q0[:3].any() and not problem.pushes:
         q0 = problem.centred(q0)
     path = problem.held(q0, times) if motion == "held" else problem.free(q0, times)
-    return along(
-        Trajectory(robot, times, path.q, path.v, path.u, period=robot.orbit.period)
-    )
+    period = robot.orbit.period
+    knots = times, path.q, path.v, path.u
+    return along(Trajectory(robot, *knots, hold="smooth", period=period))
 
 
 class _Path(NamedTuple):
@@ -130,9 +131,7 @@ class _Problem:
         assert robot.orbit is not None
         self.robot = robot
         self.period = robot.orbit.period
-        self.linearizer = Linearizer(
-            robot.replace(outputs=[FullState()]), moving=True
-        )
+        self.linearizer = Linearizer(robot.replace(outputs=[FullState()]), moving=True)
         self.state = StateMap(robot, frame="local")
         self.actuation = self.linearizer.prepared.actuation
         columns = self.actuation.columns(robot.create_data(), robot.neutral())
@@ -148,7 +147,7 @@ class _Problem:
         return q
 
     def held(self, q: Array, times: Array) -> _Path:
-        """Return the motion at rest at q, held by the inputs, with accelerating wheels if needed."""
+        """Return the motion at rest at q, held by the inputs. If needed, wheels accelerate."""
         robot = self.robot
         still = np.zeros(robot.nv)
         knots = [self._balance(q, still, t, ()) for t in times.tolist()]
@@ -195,9 +194,7 @@ class _Problem:
         rate = acceleration + lin.B[nv:] @ u
         return _Balance(u, missing, rate[index])
 
-    def _held_by_wheels(
-        self, q: Array, times: Array, wheels: tuple[int, ...]
-    ) -> _Path:
+    def _held_by_wheels(self, q: Array, times: Array, wheels: tuple[int, ...]) -> _Path:
         """Return the motion at rest at q, held by wheels whose speeds are periodic."""
         robot = self.robot
         index = list(wheels)
@@ -215,8 +212,8 @@ class _Problem:
 
         def flow(speeds: Array) -> Array:
             rows = [speeds]
-            for start, end in zip(times[:-1], times[1:], strict=True):
-                rows.append(_runge_kutta(rate, float(start), float(end), rows[-1]))
+            for start, end in pairwise(times.tolist()):
+                rows.append(_runge_kutta(rate, start, end, rows[-1]))
             return np.array(rows)
 
         # The torques are linear in the speeds of the wheels, so one step of Newton's method finds
@@ -259,7 +256,7 @@ class _Problem:
     def free(self, q: Array, times: Array) -> _Path:
         """Return the periodic motion without inputs nearest to q at rest."""
         robot = self.robot
-        start = q, np.zeros(robot.nv)
+        start: tuple[Array, Array] = (q, np.zeros(robot.nv))
         lin = self.linearizer(*start)
         fastest = float(np.abs(np.linalg.eigvals(lin.A)).max())
         h = float(times[1] - times[0])

@@ -25,13 +25,15 @@ def assemble(
     A: Array,
     *,
     moving: bool,
+    turning: Turning | None = None,
 ) -> Array:
     """Complete A (.., nx, nx) and the lower half of B for one or many points; return f0 (.., nx).
 
     On entry, the upper half of A must be [0, N], as at rest (2.1). `rates.slopes` must be a view of
     the lower half of A. `rates.by_u` is the lower half of B. On entry, both arrays must contain
     derivatives in base axes. The function converts both in place to the chart and the frame. `nu`
-    and `u` are in base axes.
+    and `u` are in base axes. `turning` is required in an elliptic orbit, and in orbit if v_b is in
+    base axes.
     """
     state = actuation.state
     g = state.groups
@@ -44,7 +46,7 @@ def assemble(
     # (4.8)
     f0 = np.concatenate((chart.rate(w), position_rate, nu[..., 6:], rates.c), -1)
 
-    D_theta = _rotation_derivative(actuation, chart, nu, u, rates, W)
+    D_theta = _rotation_derivative(actuation, chart, nu, u, rates, W, turning)
     lower[..., g.q_b] = chart.over_q_b(D_theta)
 
     # Write the rows of attitude and position. If the base is at the reference, do not write the
@@ -77,13 +79,13 @@ def assemble(
     if state.falls:
         f0[..., g.v_b] += rates.gravity
     if state.orbit:  # (14.2), (14.5), (14.6)
-        _add_orbit(state, chart, rates, A)
-        assert rates.orbit is not None
-        spin = _spin(state, chart, rates.orbit)
+        _add_orbit(state, chart, turning, A)
+        spin = _spin(state, chart, turning)
         f0[..., g.omega_b] += times(W, spin)
         f0[..., g.v_b] -= 2.0 * times(skew(spin), v)
         if state.elliptic:  # (14.9)
-            f0[..., g.omega_b] -= rates.orbit.spin_change
+            assert turning is not None
+            f0[..., g.omega_b] -= turning.spin_change
     if not v_in_reference:
         V = skew(v)
         A[..., g.r_b, g.q_b] = -chart.over_q_b(chart.turned(V))  # (4.3)
@@ -95,22 +97,22 @@ def assemble(
     return f0
 
 
-def _spin(state: StateMap, chart: Chart, orbit: Turning) -> Array:
+def _spin(state: StateMap, chart: Chart, turning: Turning | None) -> Array:
     """Return the angular velocity (.., 3) of the orbital frame in base axes."""
     if state.axes[1] and state.orbit:
         spin: Array = chart.R.mT @ state.orbit[0]
         return spin
-    return orbit.spin
+    assert turning is not None
+    return turning.spin
 
 
 def _add_orbit(
-    state: StateMap, chart: Chart, rates: AccelerationDerivatives, A: Array
+    state: StateMap, chart: Chart, turning: Turning | None, A: Array
 ) -> None:
     """Add the terms of an orbit to the blocks of A for the velocities of the base (14.6)."""
     g = state.groups
     assert state.orbit is not None
-    assert rates.orbit is not None
-    spin = _spin(state, chart, rates.orbit)
+    spin = _spin(state, chart, turning)
     A[..., g.omega_b, g.omega_b] -= skew(spin)
     if state.axes[1]:
         turn, pull = state.orbit
@@ -118,7 +120,8 @@ def _add_orbit(
         A[..., g.v_b, g.v_b] = 0.0 - 2.0 * skew(turn)
         return
     # The rows of the linear acceleration are in base axes. With `moving`, the position is too.
-    pull = rates.orbit.pull
+    assert turning is not None
+    pull = turning.pull
     if not chart.at_reference:
         pull = product(pull, chart.R.mT)
     A[..., g.v_b, g.r_b] = pull
@@ -132,6 +135,7 @@ def _rotation_derivative(
     u: Array,
     rates: AccelerationDerivatives,
     W: Array,
+    turning: Turning | None,
 ) -> Array:
     """Return D_theta (.., 6 + n, 3): the derivative of the accelerations by base rotations (4.4).
 
@@ -159,11 +163,12 @@ def _rotation_derivative(
         linear_rows -= skew(c[..., LINEAR])
     elif state.falls:
         linear_rows += skew(rates.gravity)
-    if rates.orbit is not None:  # (14.5)
-        spin_cross = skew(_spin(state, chart, rates.orbit))
+    if state.orbit:  # (14.5)
+        spin_cross = skew(_spin(state, chart, turning))
         angular_rows += product(W, spin_cross)
         if state.elliptic:  # (14.9)
-            angular_rows -= skew(rates.orbit.spin_change)
+            assert turning is not None
+            angular_rows -= skew(turning.spin_change)
         if not v_in_reference:
             linear_rows += 2.0 * product(skew(nu[..., LINEAR]), spin_cross)
     return D_theta

@@ -25,10 +25,12 @@ from fflin.dynamics.integrators import DEFAULT_INTEGRATOR, integrate_rows
 from fflin.dynamics.points import require_slow
 from fflin.dynamics.state import Actuation, StateMap
 from fflin.linear.optimality import Optimality
+from fflin.robot.orbit import is_elliptic
 from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:
     from pandas import DataFrame
+    from scipy.interpolate import CubicSpline
 
     from fflin.base.validation import Array, Indices, Vector
 
@@ -85,9 +87,10 @@ class Trajectory(Design):
         Velocities in Pinocchio's order.
     u : array_like (N, nu) or (N - 1, nu)
         Inputs at the knots. If u has N - 1 rows, each row applies to one interval between knots.
-    hold : {"linear", "previous"}, optional
+    hold : {"linear", "previous", "smooth"}, optional
         Inputs between the knots: "linear" interpolates, and "previous" holds the value of the
-        previous knot, like a digital controller. The default is "linear", or "previous" if u has
+        previous knot, like a digital controller. "smooth" interpolates the inputs of a periodic
+        motion by periodic cubic splines. The default is "linear", or "previous" if u has
         N - 1 rows.
     frame : {"local", "hybrid", "world"}
         Axes of the force and torque on the base:
@@ -100,8 +103,8 @@ class Trajectory(Design):
     period : float
         Time [s] after which the motion repeats: the time from the first knot to the last, or 0 for
         a motion that ends. The states at both knots must be equal. In orbit, only periodic motions
-        are accepted, as `linearize_orbit` makes them. Their configurations and velocities are
-        relative to the orbital frame with the axes ``lvlh``, and their times are times in the orbit.
+        are accepted, as `linearize_orbit` makes them. Their q and v are relative to the orbital
+        frame with the axes ``lvlh``, and t = 0 is defined by the orbit.
     verified : bool
         False for data from a file without a SHA-256 digest, because damage to such a file cannot be
         detected.
@@ -157,11 +160,15 @@ class Trajectory(Design):
             raise InputError(
                 f"t[{back[0] + 1}] is {early:.9g} s, after {late:.9g} s; expected increasing times"
             )
-        if self.hold is not None and str(self.hold) not in ("linear", "previous"):
-            raise InputError(f"hold is {self.hold!r}, expected 'linear' or 'previous'")
+        holds = ("linear", "previous")
+        if self.period:
+            holds = (*holds, "smooth")
+        if self.hold is not None and str(self.hold) not in holds:
+            expected = " or ".join(map(repr, holds))
+            raise InputError(f"hold is {self.hold!r}, expected {expected}")
         q = _configurations(robot, self.q, count)
         v, u = as_double("v", self.v), as_double("u", self.u)
-        short = u.shape == (count - 1, nu) and self.hold != "linear"
+        short = u.shape == (count - 1, nu) and self.hold not in ("linear", "smooth")
         hint = f", or ({count - 1}, {nu}) if each row acts over an interval"
         if short:
             u = np.vstack((u, u[-1:]))
@@ -198,6 +205,13 @@ class Trajectory(Design):
             raise InputError(
                 f"period is {period:g} s, expected the duration of the trajectory, {duration:g} s"
             )
+        if self.robot.orbit and is_elliptic(self.robot.orbit):
+            orbits = period / self.robot.orbit.period
+            if round(orbits) < 1 or abs(orbits - round(orbits)) > _SAME_TIME * orbits:
+                raise InputError(
+                    f"period is {period:g} s, but the field of the elliptic orbit repeats after "
+                    f"{self.robot.orbit.period:g} s; give a multiple of this period"
+                )
         apart = pin.difference(self.robot.model, self.q[0], self.q[-1])
         wheels = [joint.idx_v for joint in self.robot.joints if joint.unbounded]
         apart[wheels] = 0.0
@@ -350,7 +364,23 @@ class Trajectory(Design):
         u: Array = self.u[k]
         if self.hold == "previous":
             return u
+        if self.hold == "smooth":
+            return self._smooth_input(k, fraction)
         return u + fraction * (self.u[k + 1] - u)
+
+    def _smooth_input(self, k: int | Indices, fraction: float | Array) -> Array:
+        """Return the inputs by periodic cubic splines; the arguments are those of `_input`."""
+        start = self.t[k]
+        times = start + np.reshape(fraction, np.shape(start)) * (self.t[k + 1] - start)
+        u: Array = self._splines(times)
+        return u
+
+    @cached_property
+    def _splines(self) -> CubicSpline:
+        from scipy.interpolate import CubicSpline
+
+        values = np.vstack((self.u[:-1], self.u[:1]))
+        return CubicSpline(self.t, values, bc_type="periodic")
 
     def accelerations(self) -> Array:
         """Return the accelerations (N, nv) just after each knot, in Pinocchio's order."""
@@ -681,3 +711,12 @@ def cubic(first: Array, last: Array, rate: Array, end_rate: Array) -> Array:
         (first, rate, 3 * apart - 2 * rate - end_rate, rate + end_rate - 2 * apart),
         axis=1,
     )
+
+
+def refuse_periodic(traj: Trajectory, what: str) -> None:
+    """Raise `InputError` for a periodic trajectory; `what` is the subject of the message."""
+    if traj.period:
+        raise InputError(
+            f"{what} needs a trajectory that ends, but this one repeats after {traj.period:g} s; "
+            "use tvlqr with Qf='periodic'"
+        )

@@ -56,7 +56,11 @@ def periodic_cost(period: Array) -> Array:
     scale = _balance(period)
     T, G, W = period
     maps = np.array(
-        (T * scale / scale[:, None], G / np.outer(scale, scale), W * np.outer(scale, scale))
+        (
+            T * scale / scale[:, None],
+            G / np.outer(scale, scale),
+            W * np.outer(scale, scale),
+        )
     )
     with np.errstate(over="ignore", invalid="ignore"):
         for _ in range(_MOST_DOUBLINGS):
