@@ -8,6 +8,7 @@ from fflin.robot.loading import from_model as from_model
 from fflin.robot.catalog import list_robots as list_robots
 from fflin.robot.robot import Robot as Robot
 from fflin.robot.orbit import CircularOrbit as CircularOrbit
+from fflin.robot.orbit import EllipticOrbit as EllipticOrbit
 from fflin.robot.equipment.appendages import FlexibleAppendage as FlexibleAppendage
 from fflin.robot.equipment.appendages import Slosh as Slosh
 from fflin.robot.constraints import Weld as Weld
@@ -56,6 +57,7 @@ from fflin.linear.equilibrium import equilibrium as equilibrium
 from fflin.linear.equilibrium import Equilibrium as Equilibrium
 from fflin.linear.trajectory import Trajectory as Trajectory
 from fflin.linear.linear_trajectory import linearize_trajectory as linearize_trajectory
+from fflin.linear.orbit_motion import linearize_orbit as linearize_orbit
 from fflin.linear.linear_trajectory import LinearTrajectory as LinearTrajectory
 from fflin.linear.exchange import transform as transform
 from fflin.linear.exchange import from_tool as from_tool

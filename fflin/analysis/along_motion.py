@@ -40,7 +40,10 @@ class Split(NamedTuple):
 def ends(traj: LinearTrajectory) -> tuple[LinearModel, LinearModel]:
     """Return the continuous models at the first and the last knot."""
     linearizer = Linearizer(traj.robot, moving=True)
-    first, last = (linearizer(traj.q[k], traj.v[k], traj.u_base[k]) for k in (0, -1))
+    first, last = (
+        linearizer(traj.q[k], traj.v[k], traj.u_base[k], t=float(traj.t[k]))
+        for k in (0, -1)
+    )
     return first, last
 
 

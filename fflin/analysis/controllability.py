@@ -19,7 +19,7 @@ from fflin.base.errors import (
 )
 from fflin.base.validation import Array, Values
 from fflin.linear.linear_trajectory import LinearTrajectory
-from fflin.linear.model import LinearModel
+from fflin.linear.model import LinearModel, refuse_frozen
 
 _LOOPS = (
     "a periodic joint motion can still rotate the base of the nonlinear robot, by O(e^2) for a "
@@ -148,7 +148,7 @@ def controllability(lin: LinearModel | LinearTrajectory) -> Controllability:
     ----------
     lin : LinearModel or LinearTrajectory
         Linear model: continuous or sampled, full or reduced. A model loaded from a file is also
-        accepted. A `LinearTrajectory` is analysed over its whole duration.
+        accepted. A `LinearTrajectory` is analysed over its whole duration, or over its period.
 
     Returns
     -------
@@ -191,6 +191,7 @@ def controllability(lin: LinearModel | LinearTrajectory) -> Controllability:
     if isinstance(lin, LinearTrajectory):
         return _along(lin)
     lin = mechanics.of_robot(lin)
+    refuse_frozen(lin, "controllability")
     if not lin.is_equilibrium():
         return _in_motion(lin)
     conserved, size = mechanics.conserved(lin), np.tile(np.sqrt(lin.M.diagonal()), 2)

@@ -17,7 +17,7 @@ from fflin.base.rotation import skew
 from fflin.base.tables import counted, folded, grid, width
 from fflin.base.validation import Array, Complex, FrozenArrays, Values
 from fflin.dynamics.state import StateMap
-from fflin.linear.model import LinearModel
+from fflin.linear.model import LinearModel, refuse_frozen
 from fflin.robot.equipment.assembly import effective_shares
 from fflin.robot.joints import ROOT
 from fflin.robot.mass_properties import mode_carriers
@@ -361,6 +361,7 @@ def modes(lin: LinearModel) -> Modes:
     (13, array([0.9, 1.2]))
     """
     lin = checked(lin)
+    refuse_frozen(lin, "modes")
     if lin.dt:
         raise InputError(
             f"the model is sampled at dt = {lin.dt:g} s; give the continuous model"

@@ -21,7 +21,7 @@ from fflin.base.errors import InputError, listed
 from fflin.base.validation import Array, FrozenArrays, Values, instance, positive
 from fflin.dynamics.integrators import held_cost
 from fflin.linear.linear_trajectory import LinearTrajectory
-from fflin.linear.model import LinearModel
+from fflin.linear.model import LinearModel, refuse_frozen
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -104,7 +104,7 @@ def observability(lin: LinearModel | LinearTrajectory) -> Observability:
     ----------
     lin : LinearModel or LinearTrajectory
         Linear model: continuous or sampled, full or reduced. A model loaded from a file is also
-        accepted. A `LinearTrajectory` is analysed over its whole duration.
+        accepted. A `LinearTrajectory` is analysed over its whole duration, or over its period.
 
     Returns
     -------
@@ -127,6 +127,7 @@ def observability(lin: LinearModel | LinearTrajectory) -> Observability:
     if isinstance(lin, LinearTrajectory):
         return _along(lin)
     lin = mechanics.of_robot(lin)
+    refuse_frozen(lin, "observability")
     if not lin.is_equilibrium():
         return _in_motion(lin)
     nv = len(lin.M)
@@ -368,6 +369,7 @@ def gramians(lin: LinearModel, duration: float | None = None) -> Gramians:
     (18, 18)
     """
     instance("lin", lin, LinearModel, "a fflin.LinearModel")
+    refuse_frozen(lin, "gramians")
     pairs = ((lin.A, lin.B), (lin.A.T, lin.C.T))
     if duration is None:
         poles = np.linalg.eigvals(lin.A)

@@ -28,7 +28,7 @@ from fflin.base.validation import Array, Indices, Mask, frozen
 from fflin.dynamics.coordinates import ANGULAR, LINEAR, refuse_constraints
 from fflin.dynamics.state import StateMap, selection
 from fflin.linear.files import given
-from fflin.linear.model import Delay, LinearModel
+from fflin.linear.model import Delay, LinearModel, refuse_frozen
 from fflin.robot.joints import frame_index
 from fflin.robot.robot import Robot
 from fflin.robot.rotors import motor_of
@@ -208,6 +208,7 @@ def momentum_reduction(
     (('q_m.joint_1', 'q_m.joint_2'), 6)
     """
     whole = mechanics.checked(lin)
+    refuse_frozen(whole, "momentum_reduction")
     wheels = removed_wheels(whole, wheel_speeds)
     lin = without(whole, wheels) if len(wheels) else whole
     momenta = mechanics.conserved(lin)

@@ -360,7 +360,7 @@ class Result(FrozenArrays):
 _TITLE: dict[str, Callable[[Any], str]] = {
     "robot": "'{}'".format,
     "__len__": lambda count: f"{count()} points",
-    "t": lambda times: f"knots={len(times)}",
+    "t": lambda t: f"t={t:g} s" if isinstance(t, float) else f"knots={len(t)}",
     "parameters": lambda names: f"parameters={len(names)}",
     "state_names": lambda names: f"nx={len(names)}",
     "input_names": lambda names: f"nu={len(names)}",

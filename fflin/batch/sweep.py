@@ -28,6 +28,7 @@ from fflin.dynamics.coordinates import (
     Chart,
     ReferenceChart,
     refuse_constraints,
+    refuse_elliptic,
 )
 from fflin.dynamics.rnea import AccelerationDerivatives
 from fflin.kernel.compiled import compiles
@@ -165,6 +166,7 @@ def sweep(
     refuse_constraints(robot, "sweeps")
     how = Execution(executor, workers, threads, chunk, progress)
     path = None if out is None else output_path(out)
+    refuse_elliptic(robot, "sweeps", "use fflin.linearize(robot, q, t=...)")
     linearizer = Linearizer(robot, frame=frame, reference=reference, moving=moving)
     job = ChunkJob(linearizer, at_rest=v is None and u is None, engine=engine)
     task = SweepTask(job, q, v, u)
@@ -210,6 +212,8 @@ def kernel_of(prepared: Prepared, engine: str | None) -> RowAccelerations | None
 
 def _reason(prepared: Prepared) -> str:
     """Return why the compiled kernel cannot be used, or an empty text if it can."""
+    if prepared.robot.orbit and not prepared.map.axes[1]:
+        return f"in orbit, models in base axes (of '{prepared.robot.name}') need Python"
     task = Task(robots=(prepared.robot,), outputs=prepared.sensing is not None)
     return reason_against(task)
 

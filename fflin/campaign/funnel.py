@@ -34,7 +34,7 @@ from fflin.control.tvlqr import GainSchedule
 from fflin.dynamics.points import point_of, start_of
 from fflin.dynamics.state import StateMap
 from fflin.dynamics.state_rows import moved_by, moving_error
-from fflin.linear.trajectory import Trajectory
+from fflin.linear.trajectory import Trajectory, refuse_periodic
 from fflin.robot.robot import Robot
 
 _OPTIONS = ("dt", "method", "project", "sample", "delay", "limits", "disturbance")
@@ -398,6 +398,7 @@ def funnel(
     )
     feedback = prepared(schedule, robot)
     assert isinstance(feedback, TrajectoryFeedback)
+    refuse_periodic(feedback.trajectory, "a funnel")
     require_known("option of funnel", options, _OPTIONS)
     samples = validation.count("samples", samples)
     seed = validation.whole("seed", seed, 0)

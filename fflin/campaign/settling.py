@@ -23,7 +23,7 @@ from fflin.dynamics.integrators import DEFAULT_INTEGRATOR, held_exponential
 from fflin.dynamics.state import StateMap
 from fflin.linear.fit import require_fit
 from fflin.linear.linearization import linearize
-from fflin.linear.model import LinearModel, refuse_delayed
+from fflin.linear.model import LinearModel, refuse_delayed, refuse_frozen
 from fflin.robot.robot import Robot
 from fflin.simulation.pace import Pace, Poles
 from fflin.simulation.run import STOPS
@@ -58,6 +58,7 @@ class Loop:
         instance("robot", robot, Robot, "a fflin.Robot")
         instance("lin", lin, LinearModel, "a fflin.LinearModel")
         refuse_delayed(lin, "the comparison of linear and nonlinear motions")
+        refuse_frozen(lin, "the comparison of linear and nonlinear motions")
         # A gain with integral action must be given itself, because its matrix has more columns.
         has_integrals = isinstance(gain, Gain) and bool(gain.integrals)
         K = gain if has_integrals else as_double("gain", gain_matrix(gain))

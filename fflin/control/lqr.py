@@ -39,7 +39,7 @@ from fflin.control.weights import (
 )
 from fflin.dynamics.state import selection
 from fflin.linear.holding import held, is_held
-from fflin.linear.model import LinearModel
+from fflin.linear.model import LinearModel, refuse_frozen
 
 # A relative residual above _COARSE gives a warning, and a residual above _USELESS raises an error.
 _COARSE, _USELESS = 1e-8, 1e-3
@@ -416,6 +416,7 @@ def at_fixed_point(lin: LinearModel) -> LinearModel:
     modified after the robot was created.
     """
     instance("lin", lin, LinearModel, "a fflin.LinearModel").require_unchanged()
+    refuse_frozen(lin, "a design about a fixed point")
     if is_held(lin):
         return lin
     advice = (

@@ -44,7 +44,7 @@ from fflin.control.optimal.largest_gain import largest_gain
 from fflin.control.policy import Policy, System, as_policy
 from fflin.dynamics.delays import HeldSystem, split
 from fflin.linear.holding import lags_by_name
-from fflin.linear.model import LinearModel
+from fflin.linear.model import LinearModel, refuse_frozen
 
 Place = Literal["inputs", "outputs"]
 
@@ -283,6 +283,7 @@ def delayed_model(
     If no delay is given and the model has none, the model gets the delay of the policy's model.
     """
     instance("lin", lin, LinearModel, "a fflin.LinearModel")
+    refuse_frozen(lin, "the analysis of a closed loop")
     if delay is not None:
         delay = number("delay", delay)
         if delay < 0.0:

@@ -41,7 +41,8 @@ from fflin.dynamics.outputs import Measuring
 from fflin.dynamics.state import StateMap
 from fflin.linear.fit import require_fit
 from fflin.linear.linear_trajectory import LinearTrajectory, along
-from fflin.linear.model import LinearModel, refuse_delayed
+from fflin.linear.model import LinearModel, refuse_delayed, refuse_frozen
+from fflin.linear.trajectory import refuse_periodic
 from fflin.robot.fields import chosen_limits, input_limits, range_of
 from fflin.robot.robot import Robot
 
@@ -177,6 +178,9 @@ def mpc(
     )
     if isinstance(lin, LinearModel):
         refuse_delayed(lin, "model predictive control")
+        refuse_frozen(lin, "model predictive control")
+    else:
+        refuse_periodic(lin, "model predictive control")
     samples = whole("horizon", horizon, 1)
     if sample is not None and dt is not None:
         raise InputError(

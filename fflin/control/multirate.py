@@ -13,7 +13,7 @@ from fflin.base.validation import Array, Mask, Poles, Vector
 from fflin.control.estimator import BIAS, DISTURBANCE, added_notes, names_of
 from fflin.control.filter_problem import FilterProblem
 from fflin.control.gain import ModelDesign, summary_of_poles
-from fflin.control.optimal.periodic_riccati import PeriodicSolution, periodic_filter
+from fflin.control.optimal.periodic_filter import PeriodicSolution, periodic_filter
 from fflin.control.sensors import SensorTiming
 
 

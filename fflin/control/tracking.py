@@ -53,7 +53,8 @@ class TrajectoryFeedback(Feedback):
     The error is defined as in `linearize_trajectory`. Torques and forces on the base are in base
     axes, and t is the time since the first knot. After the end of the trajectory, the target is
     the last configuration at rest. The command is then the sum of the holding inputs at this
-    target and the feedback of a regulator with the same weights.
+    target and the feedback of a regulator with the same weights. A periodic trajectory has no end:
+    trajectory and gains repeat.
 
     Parameters
     ----------
@@ -134,7 +135,9 @@ class TrajectoryFeedback(Feedback):
         return poles_along(self.schedule)
 
     def form(self, robot: Robot) -> PathForm | OutputForm | None:
-        """Return the trajectory and the gains."""
+        """Return the trajectory and the gains; None if they repeat, which only Python supports."""
+        if self.trajectory.period:
+            return None
         return PathForm(self)
 
     @property
@@ -155,6 +158,8 @@ class TrajectoryFeedback(Feedback):
 
     def reference(self, t: float) -> tuple[Array, Array, Array]:
         """Return the reference q, v, and u in base axes at time t of the run."""
+        if self.trajectory.period:
+            return self.trajectory.point(float(self.trajectory.t[0]) + t)
         if t > self.duration * AT_THE_END:
             return self.end.q, self.end.v, self.end.u0
         first, last = self.trajectory.t[[0, -1]].tolist()
@@ -162,7 +167,12 @@ class TrajectoryFeedback(Feedback):
 
     @property
     def over(self) -> float:
-        """Time [s] after which the command holds the robot at the end of the trajectory."""
+        """Time [s] after which the command holds the robot at the end of the trajectory.
+
+        It is infinite for a periodic trajectory.
+        """
+        if self.trajectory.period:
+            return np.inf
         if self.held or self.schedule.dt:
             return self.duration * (2.0 - AT_THE_END)
         return self.duration * AT_THE_END
@@ -175,7 +185,7 @@ class TrajectoryFeedback(Feedback):
     @property
     def ahead(self) -> float:
         """Time [s] after a sample at which the reference input equals its mean over the sample."""
-        if self.trajectory.hold == "linear":
+        if self.trajectory.hold != "previous":
             return 0.5 * self.schedule.dt
         return 0.0
 
@@ -185,7 +195,10 @@ class TrajectoryFeedback(Feedback):
             return self.reference(np.inf)
         q, v, u = self.reference(t)
         if self.ahead:
-            u = self.reference(min(t + self.ahead, self.duration))[2]
+            middle = t + self.ahead
+            if not self.trajectory.period:
+                middle = min(middle, self.duration)
+            u = self.reference(middle)[2]
         return q, v, u
 
     @cached_property
@@ -240,6 +253,8 @@ class TrajectoryFeedback(Feedback):
         knots = self.schedule.t
         if t > self.over:
             return self.end_gain
+        if self.schedule.period:
+            return self.schedule.gain(float(knots[0]) + t)
         return self.schedule.gain(
             float(knots[0]) + min(max(t, 0.0), float(knots[-1] - knots[0]))
         )
@@ -370,6 +385,7 @@ class TrajectoryOutputFeedback(OutputSensing, TrajectoryFeedback):
 
         def terms_at(t: float) -> tuple[Step, Measuring, Array]:
             # Positions and attitudes are measured relative to the base pose of the trajectory.
+            state.move_to(float(self.trajectory.t[0]) + t)
             q, v, _ = self.reference(t)
             base_pose = state.origin * pin.XYZQUATToSE3(q[:7])
             relative = state.about(base_pose)
@@ -383,8 +399,13 @@ class TrajectoryOutputFeedback(OutputSensing, TrajectoryFeedback):
         """Names of the outputs."""
         return self.filter.output_names
 
-    def form(self, robot: Robot) -> OutputForm:
-        """Return the matrices for each sample of the trajectory, and for the robot at rest."""
+    def form(self, robot: Robot) -> OutputForm | None:
+        """Return the matrices for each sample of the trajectory, and for the robot at rest.
+
+        Return None if the trajectory repeats, which only Python supports.
+        """
+        if self.trajectory.period:
+            return None
         return OutputForm(self.bind(robot), self.terms, len(self.filter.A) + 2)
 
     @cached_property
@@ -398,6 +419,8 @@ class TrajectoryOutputFeedback(OutputSensing, TrajectoryFeedback):
         """Return the matrices and offsets of the sample at time t."""
         gains, seen = self.schedule, self.filter
         k, jump = round(t / seen.dt), np.zeros(len(seen.state_names))
+        if self.trajectory.period:
+            k %= len(seen.A)
         if k < len(seen.A):
             A, B, K, L, C, D = (
                 x[k] for x in (seen.A, seen.B, gains.K, seen.L, seen.C, seen.D)

@@ -11,7 +11,13 @@ from fflin.base.validation import Array, ArrayLike
 from fflin.control.kalman import disturbance, stationary_kalman
 from fflin.control.optimal import differential_riccati as riccati
 from fflin.control.trajectory_end import steady_end
-from fflin.control.tvlqr import FilterSchedule, asks_steady, sample_time
+from fflin.control.tvlqr import (
+    FilterSchedule,
+    asks_periodic,
+    asks_steady,
+    periodic_end,
+    sample_time,
+)
 from fflin.control.weights import Weight, weight
 from fflin.dynamics.integrators import HEAVY, LIGHT, held_cost
 from fflin.linear.linear_trajectory import LinearTrajectory, along, transitions
@@ -51,10 +57,11 @@ def tvkalman(
         Input matrix of the disturbance, interpolated linearly between the knots; W is then (nw,
         nw). With ``G=traj.B``, the disturbance acts at the inputs, and the keys of a mapping W are
         names of inputs.
-    P0 : "steady", or as W
+    P0 : "steady", "periodic", or as W
         Covariance at the start. "steady" is the covariance of `kalman` about the start point. The
         start point is the first configuration, in its initial motion if this motion is steady,
-        otherwise at rest, or in free fall as in `tvlqr`.
+        otherwise at rest, or in free fall as in `tvlqr`. "periodic" is the covariance after
+        infinitely many periods of a periodic trajectory, such as `linearize_orbit` returns.
     sample : float
         Sampling time [s], which must divide the duration.
 
@@ -72,6 +79,8 @@ def tvkalman(
     EquilibriumError, DetectabilityError
         If P0 is "steady", and either no inputs can hold the robot at the start point or the model
         at this point is not detectable.
+    StabilizabilityError
+        If P0 is "periodic", and the covariance grows from period to period.
 
     References
     ----------
@@ -97,6 +106,8 @@ def tvkalman(
         spread = input_matrix @ noise @ input_matrix.T
         return 0.5 * (spread + spread.T)
 
+    periodic = asks_periodic(P0, traj, "P0")
+    P: Array = np.zeros((len(traj.state_names), len(traj.state_names)))
     if asks_steady(P0, "P0", "a covariance"):
         start, early = steady_end(traj, 0), intensity(float(traj.t[0]))
         lin = start.of_trajectory(traj.robot)
@@ -105,7 +116,7 @@ def tvkalman(
         ):
             noise = held_cost(lin.A.T, early, dt)
             P = stationary_kalman(lin.discretize(dt), noise, V).P
-    else:
+    elif not periodic:
         P = weight("P0", P0, traj.state_names)
     held = list(transitions(traj, dt))
     at_samples = along(traj.resampled(dt))
@@ -130,6 +141,8 @@ def tvkalman(
                 disturbed, maps, at_samples.C, strict=False
             )
         ]
+        if periodic:
+            P = periodic_end(traj, stages)
         K, P, residual = riccati.samples_back(stages, P)
     L = K.transpose(0, 2, 1)
     return FilterSchedule._of(

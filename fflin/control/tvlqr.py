@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
-from functools import cached_property
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.linalg import block_diag
 
-from fflin.base.errors import InputError
+from fflin.analysis.reduction import regulated_part
+from fflin.base.errors import InputError, StabilizabilityError
 from fflin.base.process import in_one_thread
 from fflin.base.tables import folded
 from fflin.base.validation import Array, Vector, instance, number
 from fflin.control.default_weights import pace_along
 from fflin.control.gain import ModelDesign
 from fflin.control.optimal import differential_riccati as riccati
+from fflin.control.optimal import periodic_riccati
 from fflin.control.trajectory_end import steady_end, steady_regulator
 from fflin.control.weights import (
     Rule,
@@ -30,6 +33,8 @@ from fflin.control.weights import (
 from fflin.dynamics.integrators import held_cost
 from fflin.dynamics.state import StateMap
 from fflin.linear.fit import require_same
+from fflin.linear.floquet import multiplier_text
+from fflin.linear.floquet import multipliers as multipliers_of
 from fflin.linear.linear_trajectory import LinearTrajectory, transitions
 from fflin.linear.trajectory import Trajectory
 from fflin.robot.robot import Robot
@@ -47,6 +52,10 @@ class Schedule(ModelDesign):
     t: Vector
     P: Array
     residual: float
+    period: float = field(default=0.0, kw_only=True)
+    orbit: str = field(
+        default_factory=str, kw_only=True
+    )  # of a periodic motion, as JSON text
 
     @cached_property
     def starts(self) -> list[float]:
@@ -59,9 +68,20 @@ class Schedule(ModelDesign):
         starts: list[float] = times.tolist()
         return starts
 
+    def in_period(self, t: float) -> float:
+        """Return the time t of a periodic schedule, moved into the period of its knots."""
+        if not self.period:
+            return t
+        first = float(self.t[0])
+        moved = first + (t - first) % self.period
+        # A time slightly before the start of a sample counts as its start.
+        if self.dt and first + self.period - moved <= 1e-9 * self.dt:
+            return first
+        return moved
+
     def interval(self, t: float) -> int:
         """Return the index of the interval or sample at t; if there is none, raise `InputError`."""
-        t = number("t", t)
+        t = self.in_period(number("t", t))
         first = self.starts[0]
         last = float(self.t[-1])
         if not first <= t <= last:
@@ -99,6 +119,11 @@ class GainSchedule(Schedule):
         Sampling time [s], over which u is held; 0 for continuous time.
     weights : str
         Description of the rule that set the weights.
+    period : float
+        Time [s] after which the gains repeat; 0 if they do not repeat.
+    multipliers : ndarray (nx,)
+        Magnitudes of the characteristic multipliers of the closed loop over one period, the largest
+        first; empty if the gains do not repeat.
     knots, q, v, u, hold, frame
         Data of the trajectory, which `trajectory` returns as a `Trajectory`.
 
@@ -127,10 +152,15 @@ class GainSchedule(Schedule):
     u: Array
     hold: str
     frame: str
+    multipliers: Vector = field(default_factory=partial(np.zeros, 0), kw_only=True)
 
     def _report(self) -> str:
         """Return the report, which contains the sizes, the residual and the rule of the weights."""
-        return folded([repr(self), f"weights: {self.weights or 'as given'}"])
+        lines = [repr(self), f"weights: {self.weights or 'as given'}"]
+        if self.period:
+            loop = multiplier_text(self.multipliers)
+            lines.append(f"repeats after {self.period:.6g} s; closed loop: {loop}")
+        return folded(lines)
 
     def trajectory(self, robot: Robot) -> Trajectory:
         """Return the trajectory that the gains were designed for."""
@@ -138,8 +168,14 @@ class GainSchedule(Schedule):
         made = f"the gain schedule was made for '{self.robot}'"
         require_same(made, state, "state", self.state_names, None)
         require_same(made, state, "input", self.input_names, None)
+        if self.period and self.orbit != orbit_text(robot):
+            raise InputError(
+                f"{made} in another orbit than that of '{robot.name}'; use the same orbit for both"
+            )
         parts = self.knots, self.q, self.v, self.u
-        return Trajectory(robot, *parts, hold=self.hold, frame=self.frame)
+        return Trajectory(
+            robot, *parts, hold=self.hold, frame=self.frame, period=self.period
+        )
 
     def to(self, tool: str, robot: Robot) -> ToolSchedule:
         """Return the gains and the trajectory in the coordinates of Pinocchio or Crocoddyl.
@@ -171,7 +207,7 @@ class GainSchedule(Schedule):
         if self.dt:
             K: Array = self.K[k]
             return K
-        x = t - self.starts[k]
+        x = self.in_period(t) - self.starts[k]
         square = x * x
         fourth = square * square
         powers = np.array(
@@ -183,7 +219,7 @@ class GainSchedule(Schedule):
     def cost_to_go(self, t: float) -> Array:
         """Return P (nx, nx) at time t: interpolated, or of the latest sample if sampled."""
         k = self.interval(t)
-        P: Array = self.P[k] if self.dt else self._cubics(t)
+        P: Array = self.P[k] if self.dt else self._cubics(self.in_period(t))
         return P
 
     @cached_property
@@ -252,6 +288,8 @@ class FilterSchedule(Schedule):
         Name of the robot, and SHA-256 of its URDF.
     dt : float
         Sampling time [s].
+    period : float
+        Time [s] after which the filter repeats; 0 if it does not repeat.
 
     Examples
     --------
@@ -319,12 +357,15 @@ def tvlqr(
         Weight on the error, positive semidefinite, as in `lqr`.
     R : array_like (nu, nu) or (nu,), float, or mapping, optional
         Weight on the inputs, positive definite.
-    Qf : "steady", or as Q
+    Qf : "steady", "periodic", or as Q
         Weight on the error at the end. "steady" is the infinite-horizon cost of `lqr` about the end
         point. The end point is the last configuration, in its final motion if this motion is
         steady, otherwise at rest. A robot that falls freely at the end, such as a legged robot in
         a jump, is at rest there relative to axes that fall with it (5.4). States that the inputs
-        cannot stabilise have zero weight in Qf, see `momentum_reduction`.
+        stabilise have zero weight in Qf, see `momentum_reduction`. "periodic" is the cost over
+        infinitely many periods of a periodic trajectory, such as `linearize_orbit` returns: the
+        schedule then repeats. It is the stabilising solution of the periodic Riccati equation.
+        States of the base that no input pushes have zero weight, as in `lqr`.
     sample : float, optional
         Sampling time [s], which must divide the duration.
     weights : {"urdf", "identity"} or mapping, optional
@@ -348,7 +389,7 @@ def tvlqr(
         If a name does not exist.
     EquilibriumError, StabilizabilityError
         If Qf is "steady", no inputs can hold the robot at the end point, and the robot does not
-        fall freely there.
+        fall freely there. If Qf is "periodic", the inputs cannot stabilise the motion.
 
     References
     ----------
@@ -366,10 +407,11 @@ def tvlqr(
     (21, 9, 18)
     """
     dt, steady = sample_time(traj, sample), asks_steady(Qf)
+    periodic = asks_periodic(Qf, traj)
     names = traj.state_names
     if Q is None and R is None:
         pace = pace_along(float(traj.t[-1] - traj.t[0]), dt)
-        end = steady_end(traj).model
+        end = traj[0] if periodic else steady_end(traj).model
         warn_of_integral(end, (Q, R), weights, "a law along a trajectory")
         Q, R, _, rule = rule_weights(end, weights, pace)
     elif weights is not None or Q is None or R is None:
@@ -377,11 +419,14 @@ def tvlqr(
             "give either both Q and R, or only weights='urdf' or 'identity'"
         )
     Q, R, _ = cost_weights(traj, Q, R, None)
-    Qf = (
-        steady_regulator(steady_end(traj), Q, R, sample)[0]
-        if steady
-        else weight("Qf", Qf, names)
-    )
+    if periodic:
+        Q, left_out = _of_regulated(traj, Q)
+        rule += left_out
+        Qf = np.zeros_like(Q)  # replaced by the periodic solution
+    elif steady:
+        Qf = steady_regulator(steady_end(traj), Q, R, sample)[0]
+    else:
+        Qf = weight("Qf", Qf, names)
 
     def at(times: Array) -> Array:
         A, B = traj.matrices_at(times)
@@ -389,14 +434,25 @@ def tvlqr(
 
     residual = 0.0
     remedy = "smaller weights or a larger R"
+    multipliers: Array = np.zeros(0)
     with riccati.bounded_by(remedy):
         if sample is not None:
             stages = list(held_stages(traj, dt, Q, R))
+            if periodic:
+                Qf = periodic_end(traj, stages[::-1])
             gains, costs, residual = riccati.samples_back(reversed(stages), Qf)
             t = traj.samples(dt)
             P = costs[::-1]
             K = np.concatenate((gains[::-1], gains[:1]))
             A, B = np.split(np.array([whole for _, whole in stages]), [len(Q)], axis=2)
+            if periodic:
+                multipliers = loop_multipliers(A - B @ K[:-1])
+        elif periodic:
+            t, P, maps = _periodic_back(traj, at)
+            Qf = P[-1]
+            multipliers = loop_multipliers(periodic_riccati.loop_factors(maps, P))
+            A, B = traj.matrices_at(t)
+            K = np.linalg.solve(R, B.transpose(0, 2, 1) @ P)
         else:
             t, P = riccati.solve_back(at, traj.t, Qf)
             A, B = traj.matrices_at(t)
@@ -417,6 +473,8 @@ def tvlqr(
         dt=dt,
         weights=rule,
         knots=traj.t,
+        multipliers=multipliers,
+        orbit=orbit_text(traj.robot),
     )
     if dt:
         return schedule
@@ -424,11 +482,118 @@ def tvlqr(
         return replace(schedule, residual=schedule.defect(at))
 
 
+def orbit_text(robot: Robot) -> str:
+    """Return the orbit of a robot as JSON text; empty without an orbit."""
+    return robot.orbit.to_json() if robot.orbit else ""
+
+
 def asks_steady(value: object, name: str = "Qf", kind: str = "a weight") -> bool:
-    """Return whether `value` is "steady"; raise `InputError` if `value` is another string."""
-    if isinstance(value, str) and value != "steady":
-        raise InputError(f"{name} is {value!r}, expected 'steady' or {kind}")
-    return isinstance(value, str)
+    """Return whether `value` is "steady"; raise `InputError` if `value` is an unknown string."""
+    if isinstance(value, str) and value not in ("steady", "periodic"):
+        raise InputError(
+            f"{name} is {value!r}, expected 'steady', 'periodic' or {kind}"
+        )
+    return isinstance(value, str) and value == "steady"
+
+
+def asks_periodic(value: object, traj: LinearTrajectory, name: str = "Qf") -> bool:
+    """Return whether `value` is "periodic"; raise `InputError` if the trajectory does not fit."""
+    periodic = isinstance(value, str) and value == "periodic"
+    if periodic and not traj.period:
+        raise InputError(
+            f"{name} is 'periodic', but the trajectory has no period; fflin.linearize_orbit "
+            "returns a periodic trajectory"
+        )
+    if traj.period and not periodic:
+        raise InputError(
+            f"the trajectory is periodic and has no end; give {name}='periodic'"
+        )
+    return periodic
+
+
+def _of_regulated(traj: LinearTrajectory, Q: Array) -> tuple[Array, str]:
+    """Return Q with zero weight for states that are not regulated, and a text that names them."""
+    lin = traj[0]
+    kept = regulated_part(lin, None).state_names
+    left_out = [name for name in lin.state_names if name not in kept]
+    rows = [lin.state_names.index(name) for name in left_out]
+    Q = Q.copy()
+    Q[rows] = 0.0
+    Q[:, rows] = 0.0
+    text = f"; not regulated: {', '.join(left_out)}" if left_out else ""
+    return Q, text
+
+
+def periodic_end(
+    traj: LinearTrajectory, stages: Sequence[tuple[Array, Array]]
+) -> Array:
+    """Return P at the end of the period of a sampled regulator, or at the start for a filter.
+
+    `stages` are the cost matrix and the transition matrix of each sample, in the order in which
+    the Riccati difference equation passes them.
+    """
+    with stabilised(traj):
+        maps = [periodic_riccati.sample_transition(*stage) for stage in stages]
+        P = periodic_riccati.periodic_cost(periodic_riccati.over_period(maps))
+        return periodic_riccati.repeated(
+            lambda end: riccati.samples_back(stages, end)[1][-1], P, _UNSTABLE
+        )
+
+
+_UNSTABLE = "give other inputs, or zero weights for states that the inputs cannot hold"
+
+
+@contextmanager
+def stabilised(traj: LinearTrajectory) -> Iterator[None]:
+    """Replace a `LinAlgError` of the doubling by a `StabilizabilityError`."""
+    try:
+        yield
+    except np.linalg.LinAlgError:
+        largest = float(np.abs(traj.multipliers).max())
+        raise StabilizabilityError(
+            f"no periodic solution of the Riccati equation exists for '{traj.robot.name}', whose "
+            f"largest multiplier is {largest:.6g}: the cost grows from period to period; "
+            f"{_UNSTABLE}"
+        ) from None
+
+
+def _periodic_back(
+    traj: LinearTrajectory, at: Callable[[Array], Array]
+) -> tuple[Array, Array, Array]:
+    """Return times, P at these times, and T, G and W between them, for the periodic solution."""
+    with stabilised(traj):
+        coarse = periodic_riccati.interval_maps(at, traj.t)
+        P = periodic_riccati.periodic_cost(
+            periodic_riccati.over_period(iter(coarse[::-1]))
+        )
+        # This sweep finds the times at which the solution is accurate. The doubling is repeated
+        # with the maps between these times, so that it agrees with a sweep to machine precision.
+        times, _ = riccati.solve_back(at, traj.t, P)
+        maps = periodic_riccati.interval_maps(at, times)
+        P = periodic_riccati.periodic_cost(
+            periodic_riccati.over_period(iter(maps[::-1]))
+        )
+
+        def sweep(end: Array) -> Array:
+            start: Array = _swept(maps, end)[0]
+            return start
+
+        P = periodic_riccati.repeated(sweep, P, _UNSTABLE)
+        return times, _swept(maps, P), maps
+
+
+def _swept(maps: Array, P: Array) -> Array:
+    """Return P (k + 1, nx, nx) at all times for P at the last one."""
+    values = [P]
+    for one in maps[::-1]:
+        values.append(riccati.stepped_back(one, values[-1]))
+    return np.array(values[::-1])
+
+
+def loop_multipliers(factors: Array) -> Array:
+    """Return the magnitudes (nx,) of the multipliers of a closed loop, the largest first."""
+    size: Array = np.sort(np.abs(multipliers_of(factors)))[::-1]
+    return size
 
 
 def held_stages(

@@ -61,7 +61,7 @@ class Aba:
         wrenches = self._wrenches(q, absolute, u)
         rate = self._accelerate(self._model, q, absolute, forces, wrenches)
         if self.field:
-            return self.field.relative(v, absolute, rate)
+            return self.field.relative(q, v, absolute, rate)
         return rate
 
     def constraint_forces(self, q: Array, v: Array, u: Array) -> dict[str, Array]:
@@ -73,9 +73,20 @@ class Aba:
         free = self._free_acceleration(self._model, q, absolute, forces, wrenches)
         return self._constraints.forces(q, absolute, free)
 
-    def accelerations(self, q: Array, v: Array, u: Array) -> Array:
-        """Return dv/dt (N, nv) at N points, computed as in `acceleration`."""
+    def accelerations(
+        self, q: Array, v: Array, u: Array, t: Array | None = None
+    ) -> Array:
+        """Return dv/dt (N, nv) at N points, computed as in `acceleration`.
+
+        `t` (N,) are the times [s] of the points, by default the time of `state`.
+        """
         state = self.state
+        if t is not None and state.elliptic:
+            rates = np.empty_like(v)
+            for k, time in enumerate(t.tolist()):
+                state.move_to(time)
+                rates[k] = self.acceleration(q[k], v[k], u[k])
+            return rates
         if (
             self.field
             or state.robot.followers

@@ -12,12 +12,13 @@ from fflin.base.errors import InputError, listed
 from fflin.base.rotation import product, rotation_matrices, rotation_matrix, skew
 from fflin.base.validation import Array, Indices
 from fflin.robot.inputs import BaseForce, BaseTorque
+from fflin.robot.orbit import is_elliptic
 from fflin.robot.robot import Robot
 
 Frame = Literal["hybrid", "local", "world", "lvlh", "hill"]
 
-# Frames of a circular orbit. If a robot is in orbit, one of these frames replaces Pinocchio's world
-# frame.
+# Frames of an orbit. If a robot is in orbit, one of these frames replaces Pinocchio's world
+# frame. The frame "local" in orbit has the world of the first one, with velocities in base axes.
 ORBITAL: tuple[Frame, ...] = ("lvlh", "hill")
 
 # For each frame, two flags. The first is true if omega_b and tau_b are in reference axes, and false
@@ -42,7 +43,7 @@ def frame_of(robot: Robot, frame: object) -> Frame:
     """Return the frame, or the default frame of the robot if `frame` is None.
 
     Raise `InputError` if the frame is unknown. Also raise it if the frame is orbital but the robot
-    is not in orbit, or if the robot is in orbit but the frame is not orbital.
+    is not in orbit, or if the robot is in orbit but the frame is neither orbital nor "local".
     """
     if frame is None:
         return ORBITAL[0] if robot.orbit else "hybrid"
@@ -50,7 +51,9 @@ def frame_of(robot: Robot, frame: object) -> Frame:
         raise InputError(
             f"frame is {frame!r}, expected one of {', '.join(get_args(Frame))}"
         )
-    if (frame in ORBITAL) != bool(robot.orbit):
+    if (frame in ORBITAL) != bool(robot.orbit) and not (
+        robot.orbit and frame == "local"
+    ):
         where = "in no orbit"
         remedy = (
             "use hybrid, local or world, or give the robot an orbit (orbit=, --orbit)"
@@ -78,6 +81,16 @@ def refuse_constraints(robot: Robot, what: str) -> None:
         raise InputError(
             f"{what} do not support constraints, but '{robot.name}' has the constraints {names}; "
             "remove them with robot.replace(constraints=[])"
+        )
+
+
+def refuse_elliptic(robot: Robot, what: str, remedy: str = "") -> None:
+    """Raise `InputError` if a robot is in an elliptic orbit; `what` is the unsupported feature."""
+    if is_elliptic(getattr(robot, "orbit", None)):
+        remedy = remedy or "give a circular orbit, fflin.CircularOrbit(altitude)"
+        raise InputError(
+            f"{what} do not support elliptic orbits, in which the model depends on time, but "
+            f"'{robot.name}' is in one; {remedy}"
         )
 
 

@@ -4,7 +4,6 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-import pinocchio as pin
 
 from fflin.base.rotation import rotation_matrix
 from fflin.base.validation import Array
@@ -68,8 +67,7 @@ class BaseDisturbance:
         for wave in self.waves:
             value = np.array(wave.vector) * math.sin(wave.rate * t + wave.phase)
             if wave.axes == INERTIAL and self._field:
-                # The orbital frame has rotated by t times its angular velocity.
-                value = pin.exp3(-t * self._field.rate) @ value
+                value = self._field.turned(t).T @ value
             if wave.axes != BASE:
                 value = value @ R
             total[_ROWS[wave.name]] += value

@@ -11,7 +11,7 @@ from fflin.base.errors import InputError
 from fflin.base.tables import folded
 from fflin.base.validation import Array, FrozenArrays, dimension, instance, vector
 from fflin.base.validation import placement as checked_placement
-from fflin.dynamics.coordinates import refuse_constraints
+from fflin.dynamics.coordinates import refuse_constraints, refuse_elliptic
 from fflin.dynamics.state import StateMap
 from fflin.robot.joints import ROOT, by_joint, find_frame
 from fflin.robot.loading import body_alone
@@ -361,6 +361,7 @@ def capture(
     """
     instance("robot", robot, Robot, "a fflin.Robot").require_unchanged()
     refuse_constraints(robot, "captures")
+    refuse_elliptic(robot, "captures")
     if isinstance(payload, pin.Inertia):
         alone = body_alone(payload, prefix)
         other = replace(alone, gravity=robot.gravity, orbit=robot.orbit)

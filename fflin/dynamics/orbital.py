@@ -1,4 +1,4 @@
-"""Frame of a circular orbit: velocities relative to it, and the gravity-gradient field (14.1)."""
+"""Orbital frame: velocities relative to it, and the gravity-gradient field (14.1), (14.9)."""
 
 import math
 import warnings
@@ -12,13 +12,16 @@ from fflin.base.rotation import rotation_matrices, skew
 from fflin.base.validation import Array, Mask
 from fflin.dynamics.coordinates import ANGULAR, LINEAR, PIN_ANGULAR, PIN_LINEAR
 from fflin.robot.joints import ROOT
+from fflin.robot.orbit import CircularOrbit, EllipticOrbit, OrbitState
 from fflin.robot.robot import Robot
 
 # For each orbital frame, two unit vectors in its axes: the direction away from the central body,
-# and the orbit normal.
+# and the orbit normal. The frame "local" has velocities in base axes, and its world is "lvlh".
+_LVLH = ((0.0, 0.0, -1.0), (0.0, -1.0, 0.0))
 _AXES = {
     "hill": ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
-    "lvlh": ((0.0, 0.0, -1.0), (0.0, -1.0, 0.0)),
+    "lvlh": _LVLH,
+    "local": _LVLH,
 }
 
 
@@ -33,32 +36,36 @@ _COARSE, _USELESS = 0.01, 0.5
 
 
 class OrbitField:
-    """Accelerations of masses in the rotating frame of a circular orbit.
+    """Accelerations of masses in the rotating frame of an orbit at one time.
+
+    If the orbit is elliptic, `move_to` changes the time and with it all quantities of this list:
 
     - `rate` (3,): angular velocity of the frame [rad/s].
+    - `rate_change` (3,): derivative of `rate` [rad/s^2]; zero in a circular orbit.
     - `tide` (3, 3): matrix G of (14.1). At a position x, gravity per unit mass minus gravity at the
       frame's origin is `tide` x.
-    - `pull` (3, 3): matrix K of (14.2). A free mass that is at rest in the frame at x has the
-      acceleration `pull` x relative to the frame.
     - `gradient`: the gravitational parameter divided by the cube of the radius [1/s^2].
+    - `pull` (3, 3): matrix K of (14.2) or (14.9). A free mass that is at rest in the frame at x has
+      the acceleration `pull` x relative to the frame.
+
+    One quantity is constant:
+
     - `axes` (3, 3): its columns are three unit vectors: away from the central body, along the
       orbit, and along the orbit normal.
     """
 
     def __init__(self, robot: Robot, frame: str) -> None:
         r, z = (np.array(axis) for axis in _AXES[frame])
-        n = mean_motion(robot)
         bodies = robot.model.inertias.tolist()[ROOT:]
         self.robot = robot
-        self._radius = robot.orbit.radius if robot.orbit else math.inf
         self._root = robot.model.jointPlacements[ROOT]
         self._stored = robot.stored_momentum
-        self.rate: Array = n * z
-        self.gradient = n * n
-        self.tide: Array = n * n * (3.0 * np.outer(r, r) - np.eye(3))
         self.axes: Array = np.column_stack((r, np.cross(z, r), z))
-        self._turning = skew(self.rate)
-        self.pull: Array = self.tide - self._turning @ self._turning
+        self._normal = z
+        self._tide_of_unit = 3.0 * np.outer(r, r) - np.eye(3)
+        self.elliptic = isinstance(robot.orbit, EllipticOrbit)
+        self._start = _state_at(robot.orbit, 0.0)
+        self._set(self._start)
         self._mass = np.array([[body.mass] for body in bodies])
         self._lever = np.array([body.lever for body in bodies])[..., None]
         self._levers = np.array([skew(body.lever) for body in bodies])
@@ -67,6 +74,36 @@ class OrbitField:
         placements = robot.model.jointPlacements.tolist()[ROOT + 1 :]
         steps = [placement.translation for placement in placements]
         self._reach = sum(float(np.linalg.norm(x)) for x in (*steps, *self._lever))
+
+    def _set(self, now: OrbitState) -> None:
+        self._now = now
+        self.gradient = now.gradient
+        self.rate: Array = now.rate * self._normal
+        self.rate_change: Array = now.rate_change * self._normal
+        self.tide: Array = now.gradient * self._tide_of_unit
+        self._turning = skew(self.rate)
+        self.pull: Array = self.tide - self._turning @ self._turning
+        if self.elliptic:
+            self.pull = self.pull - skew(self.rate_change)
+
+    @property
+    def _radius(self) -> float:
+        """Distance [m] from the central body; infinite without an orbit."""
+        return self._now.radius if self.robot.orbit else math.inf
+
+    def move_to(self, t: float) -> None:
+        """Set the time t [s]. In a circular orbit, nothing depends on time."""
+        if self.elliptic:
+            self._set(_state_at(self.robot.orbit, t))
+
+    def turned(self, t: float) -> Array:
+        """Return the rotation (3, 3) of the orbital axes from t = 0 to time t [s]."""
+        rotation = t * self.rate
+        if self.elliptic:
+            angle = _state_at(self.robot.orbit, t).angle - self._start.angle
+            rotation = angle * self._normal
+        axes: Array = pin.exp3(rotation)
+        return axes
 
     def base(self, q: Array) -> tuple[Array, Array]:
         """Return the attitude (3, 3) and position (3,) of the base in the orbital frame."""
@@ -123,12 +160,17 @@ class OrbitField:
         inertial[PIN_ANGULAR] += R.T @ self.rate
         return inertial
 
-    def relative(self, v: Array, absolute: Array, rate: Array) -> Array:
-        """Return dv/dt (nv,) of the velocity v relative to the orbital frame, see (14.2).
+    def relative(self, q: Array, v: Array, absolute: Array, rate: Array) -> Array:
+        """Return dv/dt (nv,) of the velocity v relative to the orbital frame, see (14.2), (14.9).
 
         `absolute` (nv,) is the inertial velocity, and `rate` (nv,) is its time derivative.
         """
         frame = absolute - v
+        if self.elliptic:
+            R, position = self.base(q)
+            rate = rate.copy()
+            rate[PIN_LINEAR] -= R.T @ (skew(self.rate_change) @ position)
+            rate[PIN_ANGULAR] -= R.T @ self.rate_change
         omega_cross = skew(v[PIN_ANGULAR])
         relative_rate = rate.copy()
         relative_rate[PIN_LINEAR] += (
@@ -221,6 +263,8 @@ class OrbitField:
         # inertial acceleration at the point that `near` returns. The velocities w and v of the base
         # are relative to the frame. The matrices `spin`, `W` and `V` are [s]x, [w]x and [v]x.
         by_q[:, ANGULAR] += by_v[:, ANGULAR] @ spin
+        if self.elliptic:
+            by_q[ANGULAR, ANGULAR] -= skew(R.T @ self.rate_change)
         by_q[ANGULAR, ANGULAR] += W @ spin
         by_v[ANGULAR, ANGULAR] -= spin
         by_v[:, LINEAR] = 0.0
@@ -235,19 +279,43 @@ class OrbitField:
         It is the sum of two terms of (14.3): the integral over the mass of the robot, and the sum
         over the wheels with a constant momentum.
         """
-        # The integral term is -1/2 times the integral of x^T K x. The matrix K of (14.3) is `pull`,
-        # and is named G in the next lines.
+        # The integral term is -1/2 times the integral of x^T K x. The matrix K of (14.3) is `pull`.
+        # If the orbit is elliptic, only the symmetric part of `pull` contributes.
+        energy = -0.5 * self._weighted(data, self.pull)
+        for joint, momentum in self._stored:
+            energy -= float(self.rate @ data.oMi[joint].rotation @ momentum)
+        return energy
+
+    def _weighted(self, data: pin.Data, G: Array) -> float:
+        """Return the integral of x^T G x over the mass of the robot, for a matrix G (3, 3)."""
         R, center = self._bodies(data)
-        G, inertia = self.pull, self._inertia
+        inertia = self._inertia
         second = (
             0.5 * np.trace(inertia, axis1=1, axis2=2)[:, None, None] * np.eye(3)
             - inertia
         )
         flying = (self._mass[..., None] * center.swapaxes(1, 2) @ G @ center).sum()
-        energy = -0.5 * float(flying + (R.swapaxes(1, 2) @ G @ R * second).sum())
-        for joint, momentum in self._stored:
-            energy -= float(self.rate @ data.oMi[joint].rotation @ momentum)
-        return energy
+        return float(flying + (R.swapaxes(1, 2) @ G @ R * second).sum())
+
+    def power(self, model: pin.Model, data: pin.Data, q: Array, v: Array) -> float:
+        """Return the power [W] that changes the Jacobi integral because the orbit is elliptic.
+
+        The Jacobi integral changes because its potentials depend on time, and because the
+        acceleration of the frame exerts the force -Omega' x r per unit mass, see (14.10).
+        """
+        if not self.elliptic:
+            return 0.0
+        pin.computeCentroidalMomentum(model, data, q, v)
+        center = data.com[0]
+        momentum = data.hg.angular + np.cross(center, data.hg.linear)
+        for joint, stored in self._stored:
+            momentum = momentum + data.oMi[joint].rotation @ stored
+        z = self._normal
+        turning = 2.0 * self._now.rate * self._now.rate_change
+        pull_change = self._now.gradient_change * self._tide_of_unit
+        pull_change = pull_change + turning * (np.eye(3) - np.outer(z, z))
+        power = -0.5 * self._weighted(data, pull_change)
+        return power - float(self.rate_change @ momentum)
 
     def _bodies(self, data: pin.Data) -> tuple[Array, Array]:
         """Return the attitudes (k, 3, 3) and the centres of mass (k, 3, 1) of the k bodies.
@@ -260,17 +328,37 @@ class OrbitField:
         return R, origins[..., None] + R @ self._lever
 
 
+def _state_at(orbit: CircularOrbit | EllipticOrbit | None, t: float) -> OrbitState:
+    """Return rotation and gravity gradient at time t [s]; without an orbit, all are zero."""
+    if isinstance(orbit, EllipticOrbit):
+        return orbit.at(t)
+    n = 0.0
+    radius = math.inf
+    if orbit:
+        n = orbit.mean_motion
+        radius = orbit.radius
+    return OrbitState(
+        rate=n,
+        rate_change=0.0,
+        gradient=n * n,
+        gradient_change=0.0,
+        radius=radius,
+        angle=n * t,
+    )
+
+
 # Weights in (14.4), divided by n^2. The three weights are for rotations about the radial direction,
 # the direction of flight and the orbit normal.
 _WEIGHTS = (2.0, -1.0, -1.0)
 
 
 class GravityGradient(NamedTuple):
-    """Gravity-gradient field of an orbit at one base pose, in base axes.
+    """Gravity-gradient field of an orbit at one base pose and one time, in base axes.
 
     A rotation about a unit vector s at unit rate gives a point at x the acceleration [s]x^2 x. The
     field n^2 (3 r r^T - E) x is a weighted sum of three such accelerations (14.4). The weights are
     2 n^2 for the radial direction, -n^2 for the direction of flight and -n^2 for the orbit normal.
+    In an elliptic orbit, mu / r^3 replaces n^2.
     """
 
     # (weight, unit vector (3,)) of each rotation
@@ -279,17 +367,22 @@ class GravityGradient(NamedTuple):
     # Acceleration (3,) [m/s^2], relative to the orbital frame, of a free mass that is at rest in
     # this frame at the base's origin.
     fall: Array
+    spin_change: Array  # derivative (3,) of the angular velocity of the frame [rad/s^2]
+    pull: Array  # matrix K (3, 3) of (14.2) or (14.9) [1/s^2]
 
     @classmethod
     def at(cls, field: OrbitField, q: Array) -> "GravityGradient":
         """Return the field at the base pose of q (nq,), which `require_near` checks first."""
         field.require_near(q)
         R, position = field.base(q)
-        n = mean_motion(field.robot)
-        turns = zip(
-            (weight * n * n for weight in _WEIGHTS), (R.T @ field.axes).T, strict=True
+        weights = (weight * field.gradient for weight in _WEIGHTS)
+        return cls(
+            turns=tuple(zip(weights, (R.T @ field.axes).T, strict=True)),
+            spin=R.T @ field.rate,
+            fall=R.T @ (field.pull @ position),
+            spin_change=R.T @ field.rate_change,
+            pull=R.T @ field.pull @ R,
         )
-        return cls(tuple(turns), R.T @ field.rate, R.T @ (field.pull @ position))
 
     def force(
         self, model: pin.Model, data: pin.Data, q: Array

@@ -195,6 +195,14 @@ def inertia_bounds(model: pin.Model) -> Array | None:
     return bounds
 
 
+class Turning(NamedTuple):
+    """Rotation and field of the orbital frame, in base axes (.., 3) and (.., 3, 3)."""
+
+    spin: Array  # Omega [rad/s]
+    spin_change: Array  # its derivative [rad/s^2]
+    pull: Array  # K of (14.2) or (14.9) [1/s^2]
+
+
 class AccelerationDerivatives(NamedTuple):
     """Accelerations c of the base and the joints (3.1), and their derivatives, in base axes.
 
@@ -279,6 +287,8 @@ class Accelerations:
         ]
         self._field = state.field
         self._still = np.zeros(robot.nv)
+        # Rotation of the orbital frame at the last point of `rates`; None without an orbit.
+        self.turning: Turning | None = None
 
     def rates(
         self, q: Array, v: Array, nu: Array, u: Array, slopes: Array, by_u: Array
@@ -349,6 +359,8 @@ class Accelerations:
                 self.contact, q, v, nu, -self._minus_inverse, slopes, by_u
             )
         gravity = tide.fall if tide else state.gravity(q)
+        if tide:
+            self.turning = Turning(tide.spin, tide.spin_change, tide.pull)
         return AccelerationDerivatives(c, slopes, by_u, gravity)
 
     def _write_force_slopes(self, by_q: Array, by_v: Array) -> None:

@@ -48,7 +48,10 @@ class StateMap:
         - local: omega_b and v_b in base axes;
         - world: omega_b and v_b in reference axes;
         - lvlh (default in orbit) or hill: the same axes as hybrid, for a robot in orbit only.
-          Pinocchio's world is then the orbital frame, with the axes lvlh or hill.
+          Pinocchio's world is then the orbital frame, with the axes lvlh or hill. With local in
+          orbit, it is the orbital frame with the axes lvlh.
+    t : float
+        Time [s] for which `orbit` holds. It matters only in an elliptic orbit.
 
     Attributes
     ----------
@@ -101,6 +104,7 @@ class StateMap:
         *,
         reference: pin.SE3 | None = None,
         frame: Frame | None = None,
+        t: float = 0.0,
     ) -> None:
         instance("robot", robot, Robot, "a fflin.Robot; fflin.load makes one")
         robot.require_unchanged()
@@ -111,6 +115,9 @@ class StateMap:
         self.in_reference = tuple(compress((ANGULAR, LINEAR), self.axes))
         # Acceleration field of the orbit, or None if the robot is not in orbit.
         self.field = OrbitField(robot, self.frame) if robot.orbit else None
+        # Whether the dynamics depend on time.
+        self.elliptic = self.field is not None and self.field.elliptic
+        self.move_to(t)
         self.nx = 12 + 2 * n
         self.groups = names.Groups(
             q_b=slice(0, 3),
@@ -174,10 +181,20 @@ class StateMap:
         self._position, self.origin_quaternion = offset[:3], offset[3:]
         self._rotation = turning.rotation_matrix(self.origin_quaternion)
         self._aligned = bool((self._rotation == np.eye(3)).all())
-        field, R = self.field, oMref.rotation
-        self.orbit: tuple[Array, Array] | None = None
-        if field:
-            self.orbit = (R.T @ field.rate, R.T @ field.pull @ R)
+
+    def move_to(self, t: float) -> None:
+        """Set the time t [s] for which `orbit` and the field hold; see `OrbitField.move_to`."""
+        if self.field:
+            self.field.move_to(t)
+
+    @property
+    def orbit(self) -> tuple[Array, Array] | None:
+        """Rotation and field of the orbit in the axes of the reference, see `StateMap`."""
+        field = self.field
+        if field is None:
+            return None
+        R = self._reference.rotation
+        return R.T @ field.rate, R.T @ field.pull @ R
 
     @property
     def reference(self) -> pin.SE3:

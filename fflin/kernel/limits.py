@@ -14,6 +14,7 @@ from typing import NamedTuple
 from fflin.kernel.compiled import numba_is_there, without_numba
 from fflin.kernel.tree import batch_tree
 from fflin.robot.joints import ROOT
+from fflin.robot.orbit import is_elliptic
 from fflin.robot.robot import Robot
 
 
@@ -71,6 +72,10 @@ class Limit(NamedTuple):
     reason: str
 
 
+def _is_in_elliptic_orbit(robot: Robot) -> bool:
+    return is_elliptic(robot.orbit)
+
+
 def _has_other_joint(robot: Robot) -> bool:
     return batch_tree(robot) is None
 
@@ -95,6 +100,10 @@ LIMITS = (
     Limit(lambda task: task.disturbance, "disturbances are computed in Python"),
     Limit(
         lambda task: task.lagging, "lags of inputs and outputs are computed in Python"
+    ),
+    Limit(
+        lambda task: task.first(_is_in_elliptic_orbit),
+        "'{}' is in an elliptic orbit, whose field is computed in Python",
     ),
     Limit(lambda task: task.python_policy, "a {} is computed in Python"),
     Limit(

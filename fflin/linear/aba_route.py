@@ -44,13 +44,13 @@ def _dynamics(
     state = aba.state
     # Pinocchio differentiates about the world's origin, and loses accuracy if the base is distant.
     # So place the base at the world's origin. This is allowed, because A and B do not depend on the
-    # position of the base, even in orbit.
-    # A robot that is anchored in inertial space stays where it is.
+    # position of the base, even in orbit. But the linear acceleration in base axes does, and a
+    # robot that is anchored in inertial space stays where it is.
     anchored = state.robot.anchored
-    relative = not (state.field or anchored)
     q, slow = q.copy(), v.copy()
-    if not anchored:
+    if not anchored and (not state.field or state.axes[1]):
         q[:3] = 0.0
+    relative = not (state.field or anchored)
     if relative:
         # Without an orbit, the dynamics do not depend on the linear velocity of the base, except
         # for the rotation of the base axes, which adds -omega x v to the rate of this velocity.
@@ -110,7 +110,9 @@ class Route:
     """
 
     def __init__(self, robot: Robot, lin: LinearModel) -> None:
-        self.state = state = StateMap(robot, reference=lin.reference, frame=lin.frame)
+        self.state = state = StateMap(
+            robot, reference=lin.reference, frame=lin.frame, t=lin.time
+        )
         self.aba = Aba(state)
         self.q = robot.checked_configuration(lin.q)
         self.v = robot.checked_velocity(lin.v)

@@ -230,7 +230,7 @@ def check_all(
 
 def _comparisons(robot: Robot, lin: LinearModel) -> Iterator[Row]:
     """Yield the row of each comparison of a model with independent computations."""
-    state = StateMap(robot, reference=lin.reference, frame=lin.frame)
+    state = StateMap(robot, reference=lin.reference, frame=lin.frame, t=lin.time)
     if robot.constraints:
         require_fit(lin, robot, state, sensed=True)
         _require_independent(robot, lin)

@@ -23,6 +23,7 @@ from fflin.dynamics.coordinates import (
     forces_of,
     frame_of,
     refuse_constraints,
+    refuse_elliptic,
 )
 from fflin.dynamics.disturbance import BaseDisturbance
 from fflin.dynamics.orbital import OrbitField, mean_motion
@@ -102,6 +103,11 @@ class Equilibrium(html.Reported, FrozenArrays):
         names = [name.partition(".")[2] for name in self.force_names[6:]]
         units = ["m" if unit == "N" else "rad" for unit in self.force_units[6:]]
         return f"{text}\n{signals('deflections', shown, names, units)}"
+
+
+_PERIODIC = (
+    "fflin.linearize_orbit finds periodic motions and the inputs that hold the robot"
+)
 
 
 def equilibrium(
@@ -210,6 +216,7 @@ def equilibrium(
     """
     state = StateMap(robot, frame=frame, reference=reference)
     refuse_constraints(robot, "equilibria")
+    refuse_elliptic(robot, "equilibria", _PERIODIC)
     tilt = truth("tilt", tilt)
     pushed = BaseDisturbance(robot, state.field, constant=True)
     if not truth("disturbed", disturbed):
@@ -697,6 +704,7 @@ def relative_equilibria(
             f"'{robot.name}' is not in orbit; give it an orbit by "
             "robot.replace(orbit=fflin.CircularOrbit(altitude=...)) or --orbit"
         )
+    refuse_elliptic(robot, "relative equilibria", _PERIODIC)
     if robot.stored_momentum:
         raise InputError(
             f"wheels of '{robot.name}' store momentum, whose gyroscopic torque is not considered "

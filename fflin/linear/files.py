@@ -103,6 +103,8 @@ def record_of(lin: LinearModel) -> Record:
         if key not in entries:
             value = getattr(lin, key)
             entries[key] = list(value) if key in _LISTS else value
+    if lin.t is not None:
+        entries["t"] = float(lin.t)
     return entries | {key: float(entries[key]) for key in _FIGURES}
 
 
@@ -136,7 +138,7 @@ def write_model(path: Path, entries: Record, *, checksummed: bool) -> None:
     for key, value in rest.items():
         plain = (
             value
-            if key in (*_TEXTS, *_FIGURES)
+            if key in (*_TEXTS, *_FIGURES, "t")
             else json.dumps(np.asarray(value).tolist())
         )
         tables["info"].append([key, plain])
@@ -157,6 +159,8 @@ def read_model(
             fields["_wheels"] = partial(given, fields.pop("wheels"))
         fields |= {key: text(entries[key]) for key in _TEXTS}
         fields |= {key: figure(entries[key]) for key in _FIGURES}
+        if "t" in entries:
+            fields["t"] = figure(entries["t"])
         if fields["frame"] not in get_args(Frame):
             raise ValueError(f"unknown frame '{fields['frame']}'")
         sizes = {signal: len(fields[f"{signal}_names"]) for signal in _SIGNALS}

@@ -183,7 +183,8 @@ def outputs(
     array([0. , 0.4, 0. ])
     """
     instance("robot", robot, Robot, "a fflin.Robot")
-    state = StateMap(robot, reference=about_point(lin).reference, frame=lin.frame)
+    reference = about_point(lin).reference
+    state = StateMap(robot, reference=reference, frame=lin.frame, t=lin.time)
     require_fit(lin, robot, state, sensed=True)
     q = robot.checked_configuration(q)
     v = np.zeros(robot.nv) if v is None else robot.checked_velocity(v)

@@ -13,7 +13,7 @@ import numpy as np
 
 from fflin.base.errors import InputError
 from fflin.base.process import in_one_thread
-from fflin.base.validation import Array, ArrayLike
+from fflin.base.validation import Array, ArrayLike, Complex
 from fflin.dynamics.coordinates import refuse_constraints
 from fflin.dynamics.integrators import GAUSS, HEAVY, LIGHT, held_exponential
 from fflin.linear.check import Check, check_all
@@ -55,6 +55,10 @@ class LinearTrajectory(Trajectory):
         Names of dx, du and dy.
     dt : float
         Sampling time [s], during which du is constant; 0 in continuous time.
+    period : float
+        Time [s] after which the motion and the models repeat; 0 if they do not repeat.
+    multipliers : ndarray (nx,)
+        Characteristic multipliers of a periodic motion.
     robot, t, q, v, u, hold, frame : see `Trajectory`
 
     Examples
@@ -93,14 +97,27 @@ class LinearTrajectory(Trajectory):
     def __getitem__(self, index: int) -> LinearModel:
         """Return the linear model at the knot with the given index."""
         k = range(len(self))[index]
-        lin = self._linearizer(self.q[k], self.v[k], self.u_base[k])
+        t = float(self.t[k])
+        lin = self._linearizer(self.q[k], self.v[k], self.u_base[k], t=t)
         matrices = {name: getattr(self, name)[k] for name in "ABCD"}
         if self.dt:
-            lin = lin.discretize(self.dt)
+            time = lin.t
+            lin = replace(replace(lin, t=None).discretize(self.dt), t=time)
         return replace(lin, **matrices, y0=self.y[k], verified=self.verified)
 
     def __iter__(self) -> Iterator[LinearModel]:
         return map(self.__getitem__, range(len(self)))
+
+    def _remarks(self) -> list[str]:
+        remarks = super()._remarks()
+        if self.period:
+            from fflin.linear.floquet import multiplier_text
+
+            period = f"period {self.period:.6g} s"
+            remarks = [*remarks, f"{period}; {multiplier_text(self.multipliers)}"]
+        if self.robot.orbit:
+            remarks = [*remarks, str(self.robot.orbit)]
+        return remarks
 
     @cached_property
     def _linearizer(self) -> Linearizer:
@@ -113,13 +130,15 @@ class LinearTrajectory(Trajectory):
 
     def matrices_at(self, times: Array) -> tuple[Array, Array]:
         """Return A (k, nx, nx) and B (k, nx, nu) at times (k,), with one matrix pair per time."""
+        times = self.within_period(times)
         k, s = intervals_of(self.t, times)
         if self.dt:
             s = 0.0 * s
         inside, knot = (s > 0.0) & (s < 1.0), k + (s == 1.0)
         A, B = self.A[knot], self.B[knot]
         if inside.any():
-            models = self._linearizer.along(*self.points(times[inside]))
+            inner = times[inside]
+            models = self._linearizer.along(*self.points(inner), inner)
             A[inside], B[inside] = models["A"], models["B"]
         return A, B
 
@@ -145,6 +164,38 @@ class LinearTrajectory(Trajectory):
         """
         title = f"{self.robot.name}, {len(self)} knots"
         return check_all(self.robot, self, title, tolerance=tolerance)
+
+    @cached_property
+    def multipliers(self) -> Complex:
+        """Characteristic multipliers of a periodic motion, complex, the largest first.
+
+        They are the eigenvalues of the transition matrix over one period. The motion is stable if
+        all magnitudes are below 1. They are computed from the factors of this matrix, so that small
+        multipliers are not lost beside large ones. The report states multipliers below 1e-16 of the
+        largest as such.
+
+        Raises
+        ------
+        InputError
+            If the motion has no period.
+        """
+        from fflin.linear.floquet import multipliers
+
+        values = multipliers(self.monodromy_factors())
+        values.setflags(write=False)
+        return values
+
+    def monodromy_factors(self) -> Array:
+        """Return the transition matrices (k, nx, nx) from knot to knot of a periodic motion."""
+        if not self.period:
+            raise InputError(
+                "the trajectory has no period, so it has no multipliers; linearize_orbit makes a "
+                "periodic one"
+            )
+        if self.dt:
+            return self.A
+        nx = len(self.state_names)
+        return np.array([whole[:, :nx] for _, whole in knot_transitions(self)])
 
     @in_one_thread
     def discretize(self, dt: float) -> LinearTrajectory:
@@ -270,7 +321,9 @@ def linearize_trajectory(
 def along(motion: Trajectory) -> LinearTrajectory:
     """Return the error dynamics of a trajectory, linearised about all knots."""
     linearizer = Linearizer(motion.robot, moving=True)
-    fields: dict[str, Any] = linearizer.along(motion.q, motion.v, motion.u_base)
+    fields: dict[str, Any] = linearizer.along(
+        motion.q, motion.v, motion.u_base, motion.t
+    )
     for key in ("state_names", "input_names", "output_names"):
         fields[key] = linearizer.prepared.common[key]
     made = LinearTrajectory._of(motion, **fields, dt=0.0)

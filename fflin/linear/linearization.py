@@ -12,11 +12,11 @@ import pinocchio as pin
 
 from fflin.base import __version__
 from fflin.base.errors import InputError
-from fflin.base.validation import Array, frozen, truth, vector
+from fflin.base.validation import Array, frozen, number, truth, vector
 from fflin.dynamics.closure import Closure
-from fflin.dynamics.coordinates import Chart, Frame, ReferenceChart, refuse_orbit
+from fflin.dynamics.coordinates import Chart, Frame, ReferenceChart
 from fflin.dynamics.outputs import Sensing
-from fflin.dynamics.rnea import AccelerationDerivatives, Accelerations
+from fflin.dynamics.rnea import AccelerationDerivatives, Accelerations, Turning
 from fflin.dynamics.state import Actuation, StateMap
 from fflin.linear.aba_route import inertia_matrix
 from fflin.linear.check import certify
@@ -70,8 +70,6 @@ class Prepared:
     ) -> None:
         self.robot = robot
         self.moving = truth("moving", moving)
-        if moving:
-            refuse_orbit(robot, "models with moving=True")
         if moving and frame is None:
             frame = "local"
         self.map = state = StateMap(robot, reference=reference, frame=frame)
@@ -81,8 +79,8 @@ class Prepared:
                 "and no frame other than 'local' can be given; leave out reference and frame"
             )
         # If no reference is given, the reference is the base placement at the operating point. In
-        # orbit, it is the orbital frame instead.
-        self.own_reference = reference is None and robot.orbit is None
+        # orbit, it is the orbital frame instead, unless the reference moves.
+        self.own_reference = reference is None and (moving or robot.orbit is None)
         robot.require_inertia()
         self.actuation = Actuation(state)
         self.sensing: Sensing | None = None
@@ -318,10 +316,16 @@ class Linearizer:
         self._known = ready.free and ready.own_reference and ready.actuation.default
 
     def __call__(
-        self, q: Array | None = None, v: Array | None = None, u: Array | None = None
+        self,
+        q: Array | None = None,
+        v: Array | None = None,
+        u: Array | None = None,
+        *,
+        t: float = 0.0,
     ) -> LinearModel:
         """Linearise about a point; see `linearize` for the arguments and errors."""
         robot = self.robot
+        t = number("t", t)
         q = robot.neutral() if q is None else robot.checked_configuration(q).copy()
         known = v is None and u is None and self._known
         still_v, still_u = self._still
@@ -343,7 +347,7 @@ class Linearizer:
                 v = self._closure.velocity(q, v)
             # Suppress NumPy's overflow warnings, because `_require_finite` reports an overflow.
             with np.errstate(over="ignore", invalid="ignore"):
-                return self._anywhere(q, v, u)
+                return self._anywhere(q, v, u, t)
 
     def write_by_u(self, q: Array, out: Array) -> None:
         """Write the lower half of B (6 + n, nu) about a valid q at rest; see `Prepared.free`."""
@@ -369,9 +373,10 @@ class Linearizer:
         )
         return make, (self.robot,)
 
-    def _anywhere(self, q: Array, v: Array, u: Array) -> LinearModel:
+    def _anywhere(self, q: Array, v: Array, u: Array, t: float) -> LinearModel:
         ready, lower = self.prepared, self._lower
         state, actuation = ready.map, ready.actuation
+        state.move_to(t)
         chart = _REFERENCE_CHART if ready.own_reference else state.chart(q)
         nu = state.velocities(v)
         u_base = actuation.in_base_axes(chart, u)
@@ -395,7 +400,16 @@ class Linearizer:
                 self._accelerations.contact,
             )
             _require_finite(*seen.values())
-        rate = assemble(actuation, chart, nu, u_base, rates, A, moving=ready.moving)
+        rate = assemble(
+            actuation,
+            chart,
+            nu,
+            u_base,
+            rates,
+            A,
+            moving=ready.moving,
+            turning=self._accelerations.turning,
+        )
         _require_finite(A, B, rate)
         if ready.moving:
             rate = drift(state, rate, rates.gravity)
@@ -403,24 +417,30 @@ class Linearizer:
         for array in made.values():
             array.setflags(write=False)
         contact = self._accelerations.contact
-        if self._reducer is None or contact is None:
-            return LinearModel(self._fields | made)
-        whole = LinearModel(self._fields | made)
-        reduction = self._reducer.reduction(chart, q, v, nu, contact.space)
-        fields = reduced_fields(state, reduction, whole)
-        return LinearModel(
-            {**self._fields, "_computed": {}, **made, **fields}
-            | {"_inertia": partial(given, frozen(reduction.M))}
-        )
+        if self._reducer is not None and contact is not None:
+            whole = LinearModel(self._fields | made)
+            reduction = self._reducer.reduction(chart, q, v, nu, contact.space)
+            fields = reduced_fields(state, reduction, whole)
+            return LinearModel(
+                {**self._fields, "_computed": {}, **made, **fields}
+                | {"_inertia": partial(given, frozen(reduction.M))}
+            )
+        if state.elliptic:
+            return LinearModel(self._fields | made, t=t)
+        return LinearModel(self._fields | made)
 
-    def along(self, q: Array, v: Array, u: Array) -> dict[str, Array]:
+    def along(
+        self, q: Array, v: Array, u: Array, t: Array | None = None
+    ) -> dict[str, Array]:
         """Return A, B, C, D and y (N, ..) about N valid points, with the inputs u in base axes.
 
-        Each model must be relative to the base placement at its point.
+        Each model must be relative to the base placement at its point. t (N,) are the times [s],
+        which matter only in an elliptic orbit.
         """
         ready = self.prepared
         lower = self._lower
         count = len(q)
+        times = np.zeros(count) if t is None else t
         state, actuation, sensing = ready.map, ready.actuation, ready.sensing
         chart, nu = ReferenceChart(count), state.velocities(v)
         x0 = state.compose(chart, chart.q_b, state.joint_positions(q), nu)
@@ -429,10 +449,14 @@ class Linearizer:
         c = np.empty_like(nu)
         gravity = np.empty((count, 3))
         seen = []
+        turnings = list[Turning]()
         with self._lock:
             for k, point in enumerate(zip(q, v, nu, u, strict=True)):
+                state.move_to(float(times[k]))
                 rates = self._accelerations.rates(*point, A[k, lower], B[k, lower])
                 c[k], gravity[k] = rates.c, rates.gravity
+                if self._accelerations.turning is not None:
+                    turnings.append(self._accelerations.turning)
                 if sensing is not None:
                     measured_point = _REFERENCE_CHART, rates, x0[k], point
                     seen.append(
@@ -440,8 +464,20 @@ class Linearizer:
                             sensing, actuation, self._data, *measured_point
                         )
                     )
+        turning = None
+        if turnings:
+            turning = Turning(*map(np.array, zip(*turnings, strict=True)))
         all_rates = AccelerationDerivatives(c, A[:, lower], B[:, lower], gravity)
-        f0 = assemble(actuation, chart, nu, u, all_rates, A, moving=ready.moving)
+        f0 = assemble(
+            actuation,
+            chart,
+            nu,
+            u,
+            all_rates,
+            A,
+            moving=ready.moving,
+            turning=turning,
+        )
         if sensing is None:
             C, D = (np.tile(ready.common[key], (count, 1, 1)) for key in "CD")
             y = x0
@@ -474,6 +510,7 @@ def linearize(
     reference: pin.SE3 | None = None,
     moving: bool = False,
     independent: Sequence[str] | None = None,
+    t: float = 0.0,
 ) -> LinearModel:
     """Linearise a robot about an operating point, by default at rest with neutral joints.
 
@@ -488,7 +525,8 @@ def linearize(
         Inputs of the robot, see `effort`; zero by default.
     frame : {"hybrid", "local", "world", "lvlh", "hill"}, optional
         Axes of the base's velocities and wrenches, see `StateMap`; by default
-        "hybrid", or "lvlh" if the robot is in orbit.
+        "hybrid", or "lvlh" if the robot is in orbit. In orbit, "local" has the axes of
+        "lvlh" for the position, and base axes for the velocities and wrenches.
     reference : pin.SE3, optional
         Pose relative to which the attitude and position of the base are measured. The
         default is the base pose at the operating point, or the orbital frame if the
@@ -499,6 +537,10 @@ def linearize(
     independent : sequence of str, optional
         Coordinates of the model of a robot with constraints, such as joint names; see
         `Linearizer`.
+    t : float
+        Time [s] for which the model holds, if the robot is in an elliptic orbit. In all other
+        cases, the model does not depend on time. See `EllipticOrbit` for the position of the robot
+        at t = 0.
 
     Returns
     -------
@@ -532,4 +574,4 @@ def linearize(
     linearizer = Linearizer(
         robot, frame=frame, reference=reference, moving=moving, independent=independent
     )
-    return linearizer(q, v, u)
+    return linearizer(q, v, u, t=t)

@@ -251,6 +251,9 @@ class LinearModel(ModelHeader, StateSpace):
         Default weights of `lqr`, with the keys of `weights` in `Robot.replace`.
     mean_motion : float
         Mean motion of the robot's orbit [rad/s]; 0 without an orbit.
+    t : float or None
+        Time [s] for which the model holds, if the robot is in an elliptic orbit. None if the model
+        does not depend on time.
     added : tuple of str
         Names of the last states, which are not states of the robot: the forces of inputs with a
         lag, see `with_lags`, and the earlier commands of a model with delayed inputs, see
@@ -303,6 +306,7 @@ class LinearModel(ModelHeader, StateSpace):
     _delays: tuple[float, ...] = ()  # empty if no input is delayed
     _lags: tuple[float, ...] = ()  # empty if no input has a lag
     _output_lags: tuple[float, ...] = ()  # empty if no output has a lag
+    t: float | None = None
 
     def __init__(
         self, shared: Mapping[str, object] | None = None, /, **fields: object
@@ -327,6 +331,11 @@ class LinearModel(ModelHeader, StateSpace):
     def reference(self) -> pin.SE3:
         """Placement oMref relative to which the attitude and position of the base are measured."""
         return pin.XYZQUATToSE3(self.placement)
+
+    @property
+    def time(self) -> float:
+        """Time [s] for which the model holds; 0 if it does not depend on time."""
+        return 0.0 if self.t is None else self.t
 
     @cached_property
     def M(self) -> Array:
@@ -681,6 +690,7 @@ class LinearModel(ModelHeader, StateSpace):
         self.require_unchanged()
         dt = positive("dt", dt, "s")
         refuse_sampled(self.dt, "discretize")
+        refuse_frozen(self, "discretize")
         delays = delays_of(self, delay, dt)
         Ad, held = held_exponential(self.A, np.column_stack((self.B, self.f0)), dt)
         if not (np.isfinite(Ad).all() and np.isfinite(held).all()):
@@ -710,6 +720,7 @@ class LinearModel(ModelHeader, StateSpace):
         from scipy.signal import StateSpace
 
         self.require_unchanged()
+        refuse_frozen(self, "to_scipy")
         matrices = (self.A, self.B, self.C, self.D)
         if self.dt:
             return StateSpace(*matrices, dt=self.dt)
@@ -732,6 +743,7 @@ class LinearModel(ModelHeader, StateSpace):
             created.
         """
         self.require_unchanged()
+        refuse_frozen(self, "to_control")
         matrices = (self.A, self.B, self.C, self.D)
         return state_space(
             matrices, self.dt, self.state_names, self.input_names, self.output_names
@@ -811,6 +823,19 @@ def refuse_sampled(dt: float, do: str) -> None:
         raise InputError(
             f"the model is already sampled, at dt = {dt:g} s; {do} the continuous-time model "
             "instead"
+        )
+
+
+def refuse_frozen(lin: LinearModel, what: str) -> None:
+    """Raise `InputError` for a model in an elliptic orbit, which holds at one time only.
+
+    `what` is the function or the feature that needs a model for all times.
+    """
+    if lin.t is not None:
+        raise InputError(
+            f"{what} needs a model that does not depend on time, but '{lin.robot}' is in an "
+            f"elliptic orbit, and the model holds only at t = {lin.t:g} s; use linearize_orbit, "
+            "then tvlqr or tvkalman with 'periodic'"
         )
 
 

@@ -92,7 +92,7 @@ class Nonlinear:
         """Return the relative error of f, compared with differences of x along short motions."""
         lin, robot = self._lin, self.state.robot
         reference = pin.SE3(lin.reference.rotation, np.zeros(3))
-        state = StateMap(robot, reference=reference, frame=lin.frame)
+        state = StateMap(robot, reference=reference, frame=lin.frame, t=lin.time)
         near = Nonlinear(self._aba, lin, state)
         # The first row is the operating point. In each other row, one component of the base
         # velocity is increased by 1.

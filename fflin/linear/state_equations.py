@@ -13,7 +13,7 @@ from fflin.base.validation import Array
 from fflin.dynamics.contact import Contact
 from fflin.dynamics.coordinates import ANGULAR, LINEAR, Chart, times
 from fflin.dynamics.outputs import Sensing
-from fflin.dynamics.rnea import AccelerationDerivatives
+from fflin.dynamics.rnea import AccelerationDerivatives, Turning
 from fflin.dynamics.state import Actuation, StateMap
 
 
@@ -26,13 +26,15 @@ def assemble(
     A: Array,
     *,
     moving: bool,
+    turning: Turning | None = None,
 ) -> Array:
     """Complete A (.., nx, nx) and the lower half of B for one or many points; return f0 (.., nx).
 
     On entry, the upper half of A must be [0, N], as at rest (2.1). `rates.slopes` must be a view of
     the lower half of A. `rates.by_u` is the lower half of B. On entry, both arrays must contain
     derivatives in base axes. The function converts both in place to the chart and the frame. `nu`
-    and `u` are in base axes.
+    and `u` are in base axes. `turning` is required in an elliptic orbit, and in orbit if v_b is in
+    base axes.
     """
     state = actuation.state
     g = state.groups
@@ -45,7 +47,7 @@ def assemble(
     # (4.8)
     f0 = np.concatenate((chart.rate(w), position_rate, nu[..., 6:], rates.c), -1)
 
-    D_theta = _rotation_derivative(actuation, chart, u, rates, W, v)
+    D_theta = _rotation_derivative(actuation, chart, nu, u, rates, W, turning)
     lower[..., g.q_b] = chart.over_q_b(D_theta)
 
     # Write the rows of attitude and position. If the base is at the reference, do not write the
@@ -75,13 +77,13 @@ def assemble(
     if state.falls:
         f0[..., g.v_b] += rates.gravity
     if state.orbit:  # (14.2), (14.5), (14.6)
-        turn, pull = state.orbit
-        spin = chart.R.mT @ turn
-        A[..., g.v_b, g.r_b] = pull
-        A[..., g.v_b, g.v_b] = 0.0 - 2.0 * skew(turn)
-        A[..., g.omega_b, g.omega_b] -= skew(spin)
+        _add_orbit(state, chart, turning, A)
+        spin = _spin(state, chart, turning)
         f0[..., g.omega_b] += times(W, spin)
         f0[..., g.v_b] -= 2.0 * times(skew(spin), v)
+        if state.elliptic:  # (14.9)
+            assert turning is not None
+            f0[..., g.omega_b] -= turning.spin_change
     if not v_in_reference:
         V = skew(v)
         A[..., g.r_b, g.q_b] = -chart.over_q_b(chart.turned(V))  # (4.3)
@@ -107,17 +109,49 @@ def _turn_columns(
             chart.turn_rows((LINEAR,), rates.by_nu.mT)
 
 
+def _spin(state: StateMap, chart: Chart, turning: Turning | None) -> Array:
+    """Return the angular velocity (.., 3) of the orbital frame in base axes."""
+    if state.axes[1] and state.orbit:
+        spin: Array = chart.R.mT @ state.orbit[0]
+        return spin
+    assert turning is not None
+    return turning.spin
+
+
+def _add_orbit(
+    state: StateMap, chart: Chart, turning: Turning | None, A: Array
+) -> None:
+    """Add the terms of an orbit to the blocks of A for the velocities of the base (14.6)."""
+    g = state.groups
+    assert state.orbit is not None
+    spin = _spin(state, chart, turning)
+    A[..., g.omega_b, g.omega_b] -= skew(spin)
+    if state.axes[1]:
+        turn, pull = state.orbit
+        A[..., g.v_b, g.r_b] = pull
+        A[..., g.v_b, g.v_b] = 0.0 - 2.0 * skew(turn)
+        return
+    # The rows of the linear acceleration are in base axes. With `moving`, the position is too.
+    assert turning is not None
+    pull = turning.pull
+    if not chart.at_reference:
+        pull = product(pull, chart.R.mT)
+    A[..., g.v_b, g.r_b] = pull
+    A[..., g.v_b, g.v_b] -= 2.0 * skew(spin)
+
+
 def _rotation_derivative(
     actuation: Actuation,
     chart: Chart,
+    nu: Array,
     u: Array,
     rates: AccelerationDerivatives,
     W: Array,
-    v: Array,
+    turning: Turning | None,
 ) -> Array:
     """Return D_theta (.., 6 + n, 3): the derivative of the accelerations by base rotations (4.4).
 
-    The result may be the array `rates.by_turn`, changed in place.
+    `nu` and `u` are in base axes. The result may be the array `rates.by_turn`, changed in place.
     """
     state = actuation.state
     c = rates.c
@@ -129,7 +163,7 @@ def _rotation_derivative(
         turned = product(rates.by_nu[..., ANGULAR], W)
         D_theta = D_theta + turned if anchored else turned
     if v_in_reference and anchored:
-        D_theta = D_theta + product(rates.by_nu[..., LINEAR], skew(v))
+        D_theta = D_theta + product(rates.by_nu[..., LINEAR], skew(nu[..., LINEAR]))
     if np.count_nonzero(u):
         # A wrench that is fixed in reference axes turns relative to the base.
         for columns in actuation.held:
@@ -146,7 +180,13 @@ def _rotation_derivative(
     elif state.falls:
         linear_rows += skew(rates.gravity)
     if state.orbit:  # (14.5)
-        angular_rows += W @ skew(chart.R.mT @ state.orbit[0])
+        spin_cross = skew(_spin(state, chart, turning))
+        angular_rows += product(W, spin_cross)
+        if state.elliptic:  # (14.9)
+            assert turning is not None
+            angular_rows -= skew(turning.spin_change)
+        if not v_in_reference:
+            linear_rows += 2.0 * product(skew(nu[..., LINEAR]), spin_cross)
     return D_theta
 
 
@@ -157,7 +197,7 @@ def drift(state: StateMap, f0: Array, gravity: Array) -> Array:
     about the vertical, because a rotation about the vertical does not affect the dynamics of a
     robot that is not anchored.
     """
-    if not state.falls or state.robot.anchored:
+    if not state.falls or state.orbit or state.robot.anchored:
         return f0
     weight = (gravity * gravity).sum(axis=-1, keepdims=True)
     if not np.count_nonzero(weight):

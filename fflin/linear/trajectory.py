@@ -25,10 +25,12 @@ from fflin.dynamics.integrators import DEFAULT_INTEGRATOR, integrate_rows
 from fflin.dynamics.points import require_slow
 from fflin.dynamics.state import Actuation, StateMap
 from fflin.linear.optimality import Optimality
+from fflin.robot.orbit import is_elliptic
 from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:
     from pandas import DataFrame
+    from scipy.interpolate import CubicSpline
 
     from fflin.base.validation import Array, Indices, Vector
 
@@ -60,6 +62,9 @@ _SAME_TIME = 1e-9
 _EPS = float(np.finfo(float).eps)
 _POSITION_ROUNDING, _SUM_ROUNDING = 16.0 * _EPS, 1e3 * _EPS
 
+# Largest difference [SI units] between the first and the last state of a periodic motion.
+_CLOSED = 1e-6
+
 # A time counts as the time of a knot if the two differ by less than this fraction of the interval.
 _NEAR = 1e-9
 
@@ -82,9 +87,10 @@ class Trajectory(Design):
         Velocities in Pinocchio's order.
     u : array_like (N, nu) or (N - 1, nu)
         Inputs at the knots. If u has N - 1 rows, each row applies to one interval between knots.
-    hold : {"linear", "previous"}, optional
+    hold : {"linear", "previous", "smooth"}, optional
         Inputs between the knots: "linear" interpolates, and "previous" holds the value of the
-        previous knot, like a digital controller. The default is "linear", or "previous" if u has
+        previous knot, like a digital controller. "smooth" interpolates the inputs of a periodic
+        motion by periodic cubic splines. The default is "linear", or "previous" if u has
         N - 1 rows.
     frame : {"local", "hybrid", "world"}
         Axes of the force and torque on the base:
@@ -94,6 +100,11 @@ class Trajectory(Design):
         - world: force and torque in world axes.
 
         If the inputs are held ("previous"), the force and torque are constant in these axes.
+    period : float
+        Time [s] after which the motion repeats: the time from the first knot to the last, or 0 for
+        a motion that ends. The states at both knots must be equal. In orbit, only periodic motions
+        are accepted, as `linearize_orbit` makes them. Their q and v are relative to the orbital
+        frame with the axes ``lvlh``, and t = 0 is defined by the orbit.
     verified : bool
         False for data from a file without a SHA-256 digest, because damage to such a file cannot be
         detected.
@@ -123,6 +134,7 @@ class Trajectory(Design):
     u: Array
     hold: str | None = field(default=None, kw_only=True)
     frame: str = field(default="local", kw_only=True)
+    period: float = field(default=0.0, kw_only=True)
     # last lines of the report; not saved in files
     _note: str = field(default="", kw_only=True)
     # residuals of a plan, which `save` also writes
@@ -132,7 +144,8 @@ class Trajectory(Design):
         robot = instance(
             "robot", self.robot, Robot, "a fflin.Robot; fflin.load makes one"
         )
-        refuse_orbit(robot, "trajectories")
+        if not self.period:
+            refuse_orbit(robot, "trajectories without a period")
         nu = len(self.actuation.names)
         times = vector(
             "t", as_double("t", self.t), np.size(self.t), "times of the knots"
@@ -147,11 +160,15 @@ class Trajectory(Design):
             raise InputError(
                 f"t[{back[0] + 1}] is {early:.9g} s, after {late:.9g} s; expected increasing times"
             )
-        if self.hold is not None and str(self.hold) not in ("linear", "previous"):
-            raise InputError(f"hold is {self.hold!r}, expected 'linear' or 'previous'")
+        holds = ("linear", "previous")
+        if self.period:
+            holds = (*holds, "smooth")
+        if self.hold is not None and str(self.hold) not in holds:
+            expected = " or ".join(map(repr, holds))
+            raise InputError(f"hold is {self.hold!r}, expected {expected}")
         q = _configurations(robot, self.q, count)
         v, u = as_double("v", self.v), as_double("u", self.u)
-        short = u.shape == (count - 1, nu) and self.hold != "linear"
+        short = u.shape == (count - 1, nu) and self.hold not in ("linear", "smooth")
         hint = f", or ({count - 1}, {nu}) if each row acts over an interval"
         if short:
             u = np.vstack((u, u[-1:]))
@@ -176,7 +193,48 @@ class Trajectory(Design):
         values["hold"] = self.hold or default_hold
         for name, value in values.items():
             object.__setattr__(self, name, value)
+        if self.period:
+            self._require_period()
         super().__post_init__()
+
+    def _require_period(self) -> None:
+        """Raise `InputError` if the motion does not repeat after `period`."""
+        period = number("period", self.period)
+        duration = float(self.t[-1] - self.t[0])
+        if not abs(period - duration) <= _SAME_TIME * duration:
+            raise InputError(
+                f"period is {period:g} s, expected the duration of the trajectory, {duration:g} s"
+            )
+        if self.robot.orbit and is_elliptic(self.robot.orbit):
+            orbits = period / self.robot.orbit.period
+            if round(orbits) < 1 or abs(orbits - round(orbits)) > _SAME_TIME * orbits:
+                raise InputError(
+                    f"period is {period:g} s, but the field of the elliptic orbit repeats after "
+                    f"{self.robot.orbit.period:g} s; give a multiple of this period"
+                )
+        apart = pin.difference(self.robot.model, self.q[0], self.q[-1])
+        wheels = [joint.idx_v for joint in self.robot.joints if joint.unbounded]
+        apart[wheels] = 0.0
+        speed = np.abs(self.v).max(initial=0.0)
+        jump = np.abs(self.v[-1] - self.v[0]).max()
+        if np.abs(apart).max() > _CLOSED or jump > _CLOSED * max(1.0, speed):
+            raise InputError(
+                f"the motion does not repeat after {period:g} s: its first and last states differ "
+                f"by {np.abs(apart).max():.2g} (rad, m) and {jump:.2g} (rad/s, m/s); give a "
+                "periodic motion"
+            )
+        object.__setattr__(self, "period", period)
+
+    def within_period(self, times: Array) -> Array:
+        """Return times (k,) of a periodic motion, moved into its first period.
+
+        The times of a motion that ends are returned unchanged.
+        """
+        if not self.period:
+            return times
+        start = self.t[0]
+        late = (times > self.t[-1]) | (times < start)
+        return np.where(late, start + np.mod(times - start, self.period), times)
 
     def __repr__(self) -> str:
         return (
@@ -284,13 +342,14 @@ class Trajectory(Design):
         Raises
         ------
         InputError
-            If the time is before the first or after the last knot.
+            If the motion has no period, and the time is before the first or after the last knot.
         """
         q, v, u = self.points(np.array([self._within(t)]))
         return q[0], v[0], u[0]
 
     def points(self, times: Array) -> tuple[Array, Array, Array]:
         """Return q, v and u (k, ..) at times (k,); see `point`."""
+        times = self.within_period(times)
         k, s = intervals_of(self.t, times)
         s = s[:, None]
         steps, v = np.einsum("ij,lijk->lik", s ** np.arange(4), self.cubics[:, k])
@@ -305,11 +364,27 @@ class Trajectory(Design):
         u: Array = self.u[k]
         if self.hold == "previous":
             return u
+        if self.hold == "smooth":
+            return self._smooth_input(k, fraction)
         return u + fraction * (self.u[k + 1] - u)
+
+    def _smooth_input(self, k: int | Indices, fraction: float | Array) -> Array:
+        """Return the inputs by periodic cubic splines; the arguments are those of `_input`."""
+        start = self.t[k]
+        times = start + np.reshape(fraction, np.shape(start)) * (self.t[k + 1] - start)
+        u: Array = self._splines(times)
+        return u
+
+    @cached_property
+    def _splines(self) -> CubicSpline:
+        from scipy.interpolate import CubicSpline
+
+        values = np.vstack((self.u[:-1], self.u[:1]))
+        return CubicSpline(self.t, values, bc_type="periodic")
 
     def accelerations(self) -> Array:
         """Return the accelerations (N, nv) just after each knot, in Pinocchio's order."""
-        return self._aba.accelerations(self.q, self.v, self.u_base)
+        return self._aba.accelerations(self.q, self.v, self.u_base, self.t)
 
     def resampled(self, dt: float) -> Trajectory:
         """Return the motion with new knots every dt [s] and at the end, interpolated by `point`.
@@ -464,6 +539,8 @@ class Trajectory(Design):
 
     def _within(self, t: float) -> float:
         t = number("t", t)
+        if self.period:
+            return float(self.within_period(np.array([t]))[0])
         if not self.t[0] <= t <= self.t[-1]:
             raise InputError(
                 f"t is {t:g} s, expected a time of the trajectory, {self.t[0]:g} to "
@@ -488,13 +565,17 @@ class Trajectory(Design):
         v = self.v.copy()
         velocities = (rotations @ v[:, :3, None])[..., 0]
         usual = np.median(velocities, axis=0)
+        if self.robot.orbit:
+            # In orbit, the accelerations depend on position and velocity of the base.
+            usual = np.zeros(3)
         flown = np.outer(t - t[0], usual)
         farthest = float(np.abs(q[:, 7:]).max(initial=1.0))
         digits = np.full(v.shape[1], _POSITION_ROUNDING * farthest)
         digits[:3] = _POSITION_ROUNDING * np.abs((q[:, :3], flown, velocities)).max()
-        q[:, :3] -= q[0, :3] + flown
+        if not self.robot.orbit:
+            q[:, :3] -= q[0, :3] + flown
         v[:, :3] -= usual @ rotations
-        rates = self._aba.accelerations(q, v, self._in_base_axes(q, u))
+        rates = self._aba.accelerations(q, v, self._in_base_axes(q, u), t)
         terms = [
             state.spread(self._aba.terms(*knot)) for knot in zip(q, v, u, strict=True)
         ]
@@ -506,6 +587,12 @@ class Trajectory(Design):
         alone = [joint.idx_v for joint in state.robot.joints if joint.name in rotors]
         others = sorted({*range(6, len(digits))} - {*alone})
         speed = np.abs(v).max(axis=0)
+        if self.robot.orbit:
+            # A robot that is held at rest has no velocities and accelerations. So the scale of its
+            # errors is the acceleration by its inputs, over the time in which the orbit turns by
+            # 1 rad.
+            push = np.maximum(push, sums)
+            speed = np.maximum(speed, push / self.robot.orbit.mean_motion)
         for group in ([0, 1, 2], [3, 4, 5], *([rotor] for rotor in alone), others):
             for x in (speed, push):
                 x[group] = x[group].max(initial=0.0) or 1.0
@@ -545,7 +632,10 @@ class Trajectory(Design):
         h = self.t[k + 1] - self.t[k]
         method = DEFAULT_INTEGRATOR(self.robot.model, h / steps)
 
+        state = self._aba.state
+
         def rate(t: float, q: Array, v: Array) -> Array:
+            state.move_to(t)
             u = self._in_base_axes(q, self._input(k, (t - start) / h))
             return self._aba.acceleration(q, v, u).copy()
 
@@ -560,11 +650,11 @@ class Trajectory(Design):
         v = self.v
         h = np.diff(self.t)[:, None]
         model = self.robot.model
-        begin = self._aba.accelerations(q, v, self.u_base)
+        begin = self._aba.accelerations(q, v, self.u_base, self.t)
         end = begin[1:]
         if self.hold == "previous":
             u = self._in_base_axes(q[1:], self.u[:-1])
-            end = self._aba.accelerations(q[1:], v[1:], u)
+            end = self._aba.accelerations(q[1:], v[1:], u, self.t[1:])
         apart = np.array([pin.difference(model, *pair) for pair in pairwise(q)])
         wheels = [joint.idx_v for joint in self.robot.joints if joint.unbounded]
         # The knots give the angle of a continuous joint only modulo full turns. Compute the number
@@ -621,3 +711,12 @@ def cubic(first: Array, last: Array, rate: Array, end_rate: Array) -> Array:
         (first, rate, 3 * apart - 2 * rate - end_rate, rate + end_rate - 2 * apart),
         axis=1,
     )
+
+
+def refuse_periodic(traj: Trajectory, what: str) -> None:
+    """Raise `InputError` for a periodic trajectory; `what` is the subject of the message."""
+    if traj.period:
+        raise InputError(
+            f"{what} needs a trajectory that ends, but this one repeats after {traj.period:g} s; "
+            "use tvlqr with Qf='periodic'"
+        )

@@ -1,4 +1,4 @@
-"""Circular orbits, with the rotating orbital frame in which the motion of a robot is described."""
+"""Orbits, with the rotating orbital frame in which the motion of a robot is described."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ import math
 import warnings
 from collections.abc import Mapping
 from dataclasses import KW_ONLY, asdict, dataclass
-from typing import Any
+from functools import lru_cache
+from typing import Any, NamedTuple, TypeAlias
 
 from fflin.base.errors import FflinWarning, InputError, require_known
 from fflin.base.validation import instance, number, positive
@@ -27,6 +28,9 @@ BODIES = {
 
 # If an altitude over the earth is below this value [m], it was probably given in km.
 _LOWEST = 80e3
+
+# Largest eccentricity. For larger ones, r at perigee loses digits by cancellation.
+_LARGEST_ECCENTRICITY = 0.99
 
 _FOLLOWS: Any = None  # default of fields that follow from other fields
 
@@ -96,22 +100,12 @@ class CircularOrbit:
     body_radius: float = _FOLLOWS
 
     def __post_init__(self) -> None:
-        instance("body", self.body, str, "a name such as 'earth'")
-        if (self.mu is None) != (self.body_radius is None):
-            raise InputError(
-                "only one of mu and body_radius is given; give both or none"
-            )
+        mu, ground = _central_body(self.body, self.mu, self.body_radius)
         if (self.altitude is None) == (self.mean_motion is None):
             raise InputError(
                 f"altitude is {self.altitude} [m] and mean_motion is {self.mean_motion} [rad/s]; "
                 "give exactly one of them"
             )
-        if self.mu is None:
-            require_known("central body", [self.body], BODIES)
-            mu, ground = BODIES[self.body]
-        else:
-            mu = positive("mu", self.mu)
-            ground = positive("body_radius", self.body_radius)
         if self.altitude is None:
             n = positive("mean_motion", self.mean_motion)
             # The radius is (mu / n^2)^(1/3), computed without overflow of n^2.
@@ -128,9 +122,7 @@ class CircularOrbit:
             # Do not warn if `mu` is given. In this case, the orbit was read from a saved file, or
             # "earth" is the user's name for another body.
             if self.body == "earth" and self.mu is None and altitude < _LOWEST:
-                message = f"an altitude of {altitude:.8g} m over earth is too low for an orbit"
-                message += "; altitudes are in metres, so write 400 km as 400e3"
-                warnings.warn(message, FflinWarning, stacklevel=3)
+                _warn_of_kilometres("an altitude", altitude)
         known = {
             "altitude": altitude,
             "mean_motion": n,
@@ -173,11 +165,310 @@ class CircularOrbit:
         )
 
 
-def checked_orbit(value: object) -> CircularOrbit | None:
+def _central_body(
+    body: object, mu: float | None, body_radius: float | None
+) -> tuple[float, float]:
+    """Return the gravitational parameter [m^3/s^2] and the radius [m] of the central body."""
+    name = instance("body", body, str, "a name such as 'earth'")
+    if (mu is None) != (body_radius is None):
+        raise InputError("only one of mu and body_radius is given; give both or none")
+    if mu is None:
+        require_known("central body", [name], BODIES)
+        return BODIES[name]
+    return positive("mu", mu), positive("body_radius", body_radius)
+
+
+def _warn_of_kilometres(what: str, altitude: float) -> None:
+    """Warn that an altitude over the earth was probably given in km."""
+    message = f"{what} of {altitude:.8g} m over earth is too low for an orbit"
+    message += "; altitudes are in metres, so write 400 km as 400e3"
+    warnings.warn(message, FflinWarning, stacklevel=4)
+
+
+class OrbitState(NamedTuple):
+    """Rotation and gravity gradient of an orbital frame at one time."""
+
+    rate: float  # d theta/dt [rad/s] of the angle theta from the perigee
+    rate_change: float  # d^2 theta/dt^2 [rad/s^2]
+    gradient: float  # mu / r^3 [1/s^2]
+    gradient_change: float  # its derivative [1/s^3]
+    radius: float  # r [m]
+    angle: float  # theta [rad], which grows by 2 pi in each revolution
+
+
+@dataclass(frozen=True, kw_only=True)
+class EllipticOrbit:
+    r"""Elliptic orbit about a central body; the model of the robot then depends on time.
+
+    The orbital frame is defined as in `CircularOrbit`: its origin moves on the orbit, in free fall,
+    and its axes are ``lvlh`` (default) or ``hill``. But in ``lvlh``, x is along the orbit only at
+    perigee and apogee. Elsewhere, x is perpendicular to z, which points towards the central body.
+    With the true anomaly :math:`\theta` and the radius r, the frame rotates at
+    :math:`\Omega = \dot\theta \hat z` about the orbit normal, and the gravity gradient is
+    :math:`\mu/r^3 (3 \hat r \hat r^T - E)`.
+
+    Parameters
+    ----------
+    perigee : float
+        Height [m] of the lowest point of the orbit above the surface.
+    apogee : float, optional
+        Height [m] of the highest point of the orbit above the surface.
+    eccentricity : float, optional
+        Eccentricity e of the orbit, 0 <= e < 1, instead of the apogee.
+    inclination : float
+        Angle [rad] between the orbital plane and the equator, 0 to pi. The gravity gradient does
+        not depend on it.
+    argument_of_perigee : float
+        Angle [rad] from the ascending node to the perigee. The gravity gradient does not depend on
+        it.
+    anomaly : float
+        True anomaly [rad] at t = 0: the angle from the perigee to the robot.
+    body : str
+        "earth", "moon", "mars", "venus", "mercury", "jupiter" or "saturn"; any other name
+        requires `mu` and `body_radius`.
+    mu, body_radius : float, optional
+        Gravitational parameter [m^3/s^2] and radius [m] of the central body.
+
+    Attributes
+    ----------
+    perigee, apogee, eccentricity, inclination, argument_of_perigee, anomaly, body, mu, body_radius
+        The parameters; omitted parameters are computed from the others.
+    semi_major_axis : float
+        Semi-major axis [m].
+    mean_motion : float
+        Mean motion n [rad/s].
+    period : float
+        Period 2 pi / n [s].
+
+    Raises
+    ------
+    InputError
+        If apogee and eccentricity are both given or both omitted, an angle is out of range, the
+        orbit is not an ellipse, or it is below the surface.
+    UnknownNameError
+        If the central body is unknown.
+
+    Examples
+    --------
+    >>> orbit = fflin.EllipticOrbit(perigee=400e3, apogee=35_786e3)
+    >>> round(orbit.eccentricity, 3), round(orbit.period / 3600, 2)  # h
+    (0.723, 10.58)
+    >>> robot = fflin.load("cubesat", orbit=orbit)
+    >>> lin = fflin.linearize(robot, t=1800.0)  # half an hour after perigee
+    >>> lin.t
+    1800.0
+    """
+
+    perigee: float
+    apogee: float = _FOLLOWS
+    eccentricity: float = _FOLLOWS
+    inclination: float = 0.0
+    argument_of_perigee: float = 0.0
+    anomaly: float = 0.0
+    body: str = "earth"
+    mu: float = _FOLLOWS
+    body_radius: float = _FOLLOWS
+
+    def __post_init__(self) -> None:
+        mu, ground = _central_body(self.body, self.mu, self.body_radius)
+        if (self.apogee is None) == (self.eccentricity is None):
+            raise InputError(
+                f"apogee is {self.apogee} [m] and eccentricity is {self.eccentricity}; give "
+                "exactly one of them"
+            )
+        low = number("perigee", self.perigee)
+        if not 0.0 < low < 1e15:
+            raise InputError(
+                f"a perigee of {low:g} m over {self.body} is not on an orbit; give a height above "
+                "0 and below 1e15 m"
+            )
+        nearest = ground + low
+        if self.apogee is None:
+            e = number("eccentricity", self.eccentricity)
+            _require_ellipse(e)
+            high = (ground + low) * (1.0 + e) / (1.0 - e) - ground if e else low
+        else:
+            high = number("apogee", self.apogee)
+            if not low <= high < 1e18:
+                raise InputError(
+                    f"apogee is {high:g} m, expected at least the perigee of {low:g} m, and below "
+                    "1e18 m"
+                )
+            e = (high - low) / (2.0 * ground + high + low)
+            _require_ellipse(e)
+        angles = {
+            "inclination": (0.0, math.pi),
+            "argument_of_perigee": (-2.0 * math.pi, 2.0 * math.pi),
+            "anomaly": (-2.0 * math.pi, 2.0 * math.pi),
+        }
+        for name, (least, largest) in angles.items():
+            angle = number(name, getattr(self, name))
+            if not least <= angle <= largest:
+                raise InputError(
+                    f"{name} is {angle:g} rad, expected {least:.4g} to {largest:.4g} rad; convert "
+                    "degrees to radians"
+                )
+            object.__setattr__(self, name, angle)
+        if self.body == "earth" and self.mu is None and low < _LOWEST:
+            _warn_of_kilometres("a perigee", low)
+        known = {
+            "perigee": low,
+            "apogee": high,
+            "eccentricity": e,
+            "mu": mu,
+            "body_radius": ground,
+        }
+        for name, value in known.items():
+            object.__setattr__(self, name, value)
+        if not math.isfinite(nearest / (1.0 - e)):
+            raise InputError("the orbit is too large to be computed")
+
+    @property
+    def semi_major_axis(self) -> float:
+        """Semi-major axis [m]."""
+        return (self.body_radius + self.perigee) / (1.0 - self.eccentricity)
+
+    @property
+    def mean_motion(self) -> float:
+        """Mean motion n [rad/s]."""
+        a = self.semi_major_axis
+        return math.sqrt(self.mu / a) / a
+
+    @property
+    def period(self) -> float:
+        """Time of one revolution [s]."""
+        return 2.0 * math.pi / self.mean_motion
+
+    def at(self, t: float) -> OrbitState:
+        """Return the rotation and the gravity gradient of the orbital frame at time t [s]."""
+        e = self.eccentricity
+        n = self.mean_motion
+        mean = _mean_anomaly(self.anomaly, e) + n * t
+        revolutions = round(mean / (2.0 * math.pi))
+        E = eccentric_anomaly(mean - 2.0 * math.pi * revolutions, e)
+        # r / a, and (dr/dt) / r
+        ratio = 1.0 - e * math.cos(E)
+        climb = n * e * math.sin(E) / (ratio * ratio)
+        rate = n * math.sqrt(1.0 - e * e) / (ratio * ratio)
+        gradient = n * n / (ratio * ratio * ratio)
+        theta = true_anomaly(E, e) + 2.0 * math.pi * revolutions
+        return OrbitState(
+            rate=rate,
+            rate_change=-2.0 * climb * rate,
+            gradient=gradient,
+            gradient_change=-3.0 * climb * gradient,
+            radius=self.semi_major_axis * ratio,
+            angle=theta,
+        )
+
+    def to_json(self) -> str:
+        """Return the orbit as JSON text."""
+        return json.dumps(asdict(self))
+
+    @classmethod
+    def from_json(cls, text: str) -> EllipticOrbit:
+        """Return the orbit from the JSON text of `to_json`, with bit-for-bit equal values."""
+        try:
+            parts = json.loads(text)
+            apogee = parts.pop("apogee")
+            orbit = cls(**parts)
+        except (AttributeError, KeyError, TypeError, json.JSONDecodeError):
+            raise InputError(f"{text!r} is not the JSON text of an orbit") from None
+        object.__setattr__(orbit, "apogee", positive("apogee", apogee))
+        return orbit
+
+    def __str__(self) -> str:
+        return (
+            f"elliptic orbit {self.perigee / 1e3:.6g} x {self.apogee / 1e3:.6g} km over "
+            f"{self.body}, eccentricity {self.eccentricity:.5g}, period "
+            f"{self.period / 60.0:.5g} min, true anomaly {math.degrees(self.anomaly):.4g} deg at "
+            "t = 0"
+        )
+
+
+Orbit: TypeAlias = CircularOrbit | EllipticOrbit
+
+
+def _require_ellipse(e: float) -> None:
+    if not 0.0 <= e <= _LARGEST_ECCENTRICITY:
+        raise InputError(
+            f"the eccentricity is {e:g}, expected 0 to {_LARGEST_ECCENTRICITY:g}"
+        )
+
+
+def eccentric_anomaly(mean: float, e: float) -> float:
+    """Solve Kepler's equation E - e sin E = M for the eccentric anomaly E [rad].
+
+    The root is between M - e and M + e. Each step of Newton's method that leaves the interval
+    around the root is replaced by a bisection, so the iteration cannot fail. M is `mean` [rad].
+    """
+    low = mean - e
+    high = mean + e
+    E = mean + e * math.sin(mean)
+    for _ in range(_KEPLER_STEPS):
+        residual = E - e * math.sin(E) - mean
+        if residual > 0.0:
+            high = min(high, E)
+        else:
+            low = max(low, E)
+        step = residual / (1.0 - e * math.cos(E))
+        following = E - step
+        if not low <= following <= high:
+            following = 0.5 * (low + high)
+        if abs(following - E) <= 1e-16 * (1.0 + abs(E)):
+            return following
+        E = following
+    return E
+
+
+# Bisection alone needs about 55 steps for all digits.
+_KEPLER_STEPS = 80
+
+
+def true_anomaly(E: float, e: float) -> float:
+    """Return the true anomaly [rad] for the eccentric anomaly E [rad], both in [-pi, pi]."""
+    return 2.0 * math.atan2(
+        math.sqrt(1.0 + e) * math.sin(0.5 * E), math.sqrt(1.0 - e) * math.cos(0.5 * E)
+    )
+
+
+@lru_cache(maxsize=64)
+def _mean_anomaly(theta: float, e: float) -> float:
+    """Return the mean anomaly [rad] for the true anomaly theta [rad]."""
+    revolutions = round(theta / (2.0 * math.pi))
+    rest = theta - 2.0 * math.pi * revolutions
+    E = 2.0 * math.atan2(
+        math.sqrt(1.0 - e) * math.sin(0.5 * rest),
+        math.sqrt(1.0 + e) * math.cos(0.5 * rest),
+    )
+    return E - e * math.sin(E) + 2.0 * math.pi * revolutions
+
+
+def orbit_from_json(text: str) -> Orbit:
+    """Return a circular or an elliptic orbit from the JSON text of its `to_json`."""
+    kind = EllipticOrbit if '"perigee"' in text else CircularOrbit
+    return kind.from_json(text)
+
+
+def is_elliptic(orbit: Orbit | None) -> bool:
+    """Return whether models in an orbit depend on time."""
+    return isinstance(orbit, EllipticOrbit)
+
+
+def checked_orbit(value: object) -> Orbit | None:
     """Convert an orbit, an altitude [m] or a mapping of parameters to an orbit; None stays None."""
-    if value is None or isinstance(value, CircularOrbit):
+    if value is None or isinstance(value, CircularOrbit | EllipticOrbit):
         return value
     if not isinstance(value, Mapping):
         return CircularOrbit(number("orbit", value))
+    # A mapping with one of these names describes an elliptic orbit.
+    elliptic = {"perigee", "apogee", "eccentricity"} & set(value)
+    if elliptic:
+        require_known("part of orbit", value, EllipticOrbit.__dataclass_fields__)
+        if "perigee" not in value:
+            raise InputError(
+                f"the orbit has {sorted(elliptic)[0]} but no perigee; give perigee [m]"
+            )
+        return EllipticOrbit(**value)
     require_known("part of orbit", value, CircularOrbit.__dataclass_fields__)
     return CircularOrbit(**value)

@@ -28,7 +28,7 @@ from fflin.robot.inputs import (
     named_wheels,
 )
 from fflin.robot.joints import Coordinates, Joint
-from fflin.robot.orbit import CircularOrbit
+from fflin.robot.orbit import Orbit
 from fflin.robot.outputs import FullState, Output
 
 if TYPE_CHECKING:
@@ -80,7 +80,7 @@ class RobotData(Coordinates):
     damping: Mapping[str, float] = field(default_factory=dict)
     rest: Mapping[str, float] = field(default_factory=dict)
     gravity: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    orbit: CircularOrbit | None = None
+    orbit: Orbit | None = None
     disturbance: DisturbanceTerms = field(default_factory=dict)
     package_dirs: tuple[Path, ...] = ()
     xacro: Mapping[str, str] = field(default_factory=dict)

@@ -27,7 +27,7 @@ from fflin.linear.files import arguments, labels, write_table
 from fflin.linear.model import StatesAndInputs
 from fflin.linear.trajectory import Trajectory
 from fflin.robot.joints import ROOT
-from fflin.robot.orbit import CircularOrbit
+from fflin.robot.orbit import Orbit, orbit_from_json
 from fflin.robot.robot import Robot
 from fflin.simulation.pointing import pointing
 from fflin.simulation.report import (
@@ -98,7 +98,8 @@ class Motion(StatesAndInputs, Design):
 
         In orbit, momentum is not conserved. Therefore the drift in orbit is the relative error of
         `energy`: the difference from the expected energy, divided by the largest terms of the
-        energy. The expected energy is the initial energy plus the work of inputs and disturbances.
+        energy. The expected energy is the initial energy plus the work of inputs and disturbances,
+        and in an elliptic orbit plus the work of the changing field.
     com_drift : ndarray (N,)
         Distance [m] between the centre of mass and its expected position, which follows from the
         initial velocity and the impulse of external forces. The array is empty in orbit, or if the
@@ -274,12 +275,12 @@ class Motion(StatesAndInputs, Design):
         return pin.XYZQUATToSE3(self.placement)
 
     @property
-    def orbit(self) -> CircularOrbit | None:
-        """Circular orbit of the robot, or None.
+    def orbit(self) -> Orbit | None:
+        """Orbit of the robot, or None.
 
         In orbit, the world is the orbital frame with the axes named by `frame`.
         """
-        return CircularOrbit.from_json(self.circles) if self.circles else None
+        return orbit_from_json(self.circles) if self.circles else None
 
     @property
     def kept(self) -> str:

@@ -47,7 +47,7 @@ from fflin.control.policy import (
 )
 from fflin.control.tracking import prepared
 from fflin.dynamics import points
-from fflin.dynamics.coordinates import ORBITAL, Frame, refuse_orbit
+from fflin.dynamics.coordinates import ORBITAL, Frame
 from fflin.dynamics.integrators import held_exponential, integrator
 from fflin.dynamics.methods import DEFAULT_METHOD
 from fflin.dynamics.state import StateMap, selection
@@ -376,9 +376,10 @@ def _state_of(policy: Policy | None, options: SimulationOptions) -> StateMap:
             f"frame={frame!r} or reference= is given, but the policy defines its own, with frame "
             f"'{own_frame}'; leave them out"
         )
-    if policy and policy.followed_trajectory:
-        refuse_orbit(robot, "trajectories to follow")
-    if own_frame and (own_frame in ORBITAL) != bool(robot.orbit):
+    followed = policy.followed_trajectory if policy else None
+    if followed is not None:
+        _require_same_orbit(robot, followed.robot)
+    elif own_frame and (own_frame in ORBITAL) != bool(robot.orbit):
         designed, simulated = "without an orbit", "in orbit"
         if own_frame in ORBITAL:
             designed, simulated = "in orbit", "not in orbit"
@@ -389,6 +390,18 @@ def _state_of(policy: Policy | None, options: SimulationOptions) -> StateMap:
     reference = own_reference if reference is None else reference
     frame = own_frame if frame is None else frame
     return StateMap(robot, reference=reference, frame=frame)
+
+
+def _require_same_orbit(robot: Robot, design: Robot) -> None:
+    """Raise `InputError` if a trajectory was made for a robot in another orbit."""
+    if robot.orbit != design.orbit:
+        given = [
+            f"in {x.orbit}" if x.orbit else "not in orbit" for x in (robot, design)
+        ]
+        raise InputError(
+            f"'{robot.name}' is {given[0]}, but the trajectory to follow is for a robot "
+            f"{given[1]}; use the same orbit for both"
+        )
 
 
 def _functions(options: SimulationOptions) -> tuple[Event, ...]:

@@ -108,8 +108,11 @@ class Plant(Aba):
 
         The wrench consists of the force and the torque on the robot about the base, in base axes.
         Gravity is not included. In orbit, the wrench is replaced by [power, 0, 0, 0, 0, 0], with
-        the total power [W] of inputs, disturbance and dampers.
+        the total power [W] of inputs, disturbance and dampers, and of the change of an elliptic
+        orbit's field.
         """
+        if self.state.elliptic:
+            self.state.move_to(t)
         if self._faulty:
             given = np.empty(len(u))
             begin, h = self.step
@@ -141,6 +144,7 @@ class Plant(Aba):
             power = nu.dot(force) - self.robot.springs.damping.dot(nu[6:] ** 2)
             if disturbed is not None:
                 power = power + v.dot(disturbed)
+            power = power + self.field.power(self._model, self._data, q, v)
             push = np.append(power, np.zeros(5))
         return rate, push
 

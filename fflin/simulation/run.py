@@ -4,7 +4,7 @@ Without external forces, the momentum about a fixed point is constant. The centr
 r_c(t) = r_c(0) + p t / m, with the linear momentum p and the mass m.
 
 In orbit, the momentum is not constant. The Jacobi integral (14.3) is constant if inputs,
-disturbance and dampers do no work.
+disturbance and dampers do no work. In an elliptic orbit, it changes by (14.10).
 """
 
 from __future__ import annotations
@@ -78,7 +78,8 @@ class Conserved:
         if any(robot.gravity):
             self._weight = robot.mass * np.array(robot.gravity)
         self._root_is_identity = self._root.isIdentity(0.0)
-        _, _, center, kept, _ = self.histories(plan.q[None], plan.v[None])
+        start_time = np.zeros(1)
+        _, _, center, kept, _ = self.histories(start_time, plan.q[None], plan.v[None])
         self.momentum, self._momentum, self._center = kept[0], kept[0], center[0]
         per_mass = 1.0 / robot.mass
         # The centre of mass at time t is the first column of `_line` plus t times the second. The
@@ -162,8 +163,10 @@ class Conserved:
         v_b = v[:6]
         v_b += dposv(self._M_bb, lack, 0, 0, 1)[1]
 
-    def histories(self, q: Array, v: Array) -> tuple[Array, Array, Array, Array, Array]:
-        """Return the conserved quantities at all rows of q (N, nq) and v (N, nv).
+    def histories(
+        self, t: Array, q: Array, v: Array
+    ) -> tuple[Array, Array, Array, Array, Array]:
+        """Return the conserved quantities at times t (N,), for q (N, nq) and v (N, nv).
 
         The five arrays are, in this order,
 
@@ -198,15 +201,19 @@ class Conserved:
         p, about_center = np.split(momentum, 2, axis=1)
         kept = np.hstack((p, about_center + np.cross(center, p)))
         if self._field:
-            potential = np.array([self._potential(q_i) for q_i in q])
+            times = t.tolist()
+            potential = np.array(
+                [self._potential(t_i, q_i) for t_i, q_i in zip(times, q, strict=True)]
+            )
             scale = np.array([(np.abs(energy) + np.abs(potential)).max(), 0.0])
             energy += potential
             kept = np.column_stack((energy, np.zeros((rows, 5))))
         return energy, momentum, center, kept, scale
 
-    def _potential(self, q: Array) -> float:
-        """Return the potential energy [J] of the orbit at q."""
+    def _potential(self, t: float, q: Array) -> float:
+        """Return the potential energy [J] of the orbit at time t and q."""
         assert self._field is not None
+        self._field.move_to(t)
         pin.forwardKinematics(self._model, self._data, q)
         return self._field.potential(self._data)
 

@@ -26,7 +26,7 @@ from fflin.dynamics.methods import DEFAULT_METHOD
 from fflin.dynamics.outputs import sensors_by_signal
 from fflin.dynamics.state_rows import state_history
 from fflin.kernel.compiled import is_kept
-from fflin.linear.model import Delay, LinearModel
+from fflin.linear.model import Delay, LinearModel, refuse_frozen
 from fflin.robot.fields import limits_of
 from fflin.robot.robot import Robot
 from fflin.simulation.lanes import engine_of, loop_name, not_compilable, recorded
@@ -329,7 +329,9 @@ def motion_of(plan: Plan, run: Recording, foresees: Predictor | None = None) -> 
     prediction = x[:0]
     if foresees is not None and beyond is None:
         prediction = predict(plan, foresees, x, run.steps)
-    energy, momentum, center, kept, scale = Conserved(plan).histories(run.q, run.v)
+    energy, momentum, center, kept, scale = Conserved(plan).histories(
+        run.t, run.q, run.v
+    )
     notes = plan.policy.notes if plan.policy else ()
     if plan.law and isinstance(plan.law.policy, BoundLaw):
         notes += plan.law.policy.notes
@@ -498,6 +500,10 @@ def predictor(plan: Plan) -> Predictor | None:
             )
     elif linear is not None and not linear:
         return None
+    if lin is not None and lin.t is not None:
+        if linear is None:
+            return None
+        refuse_frozen(lin, "a linear prediction (linear=)")
     if lin is not None and lin.state_names == state.names:
         lin = _with_lags_of(plan, lin)
         if policy is None:

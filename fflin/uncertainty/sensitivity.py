@@ -16,7 +16,7 @@ from fflin.base.writing import as_path
 from fflin.control.gain import Gain, gain_matrix
 from fflin.dynamics.coordinates import refuse_constraints
 from fflin.linear.files import record_of
-from fflin.linear.model import LinearModel
+from fflin.linear.model import LinearModel, refuse_frozen
 from fflin.uncertainty.derivatives import ModelDerivatives
 from fflin.uncertainty.parameters import Parameter, Parameters
 
@@ -398,6 +398,7 @@ def sensitivity(lin: LinearModel) -> Sensitivity:
             "the model was loaded from a file, which contains no robot; linearise the robot again"
         )
     refuse_constraints(robot, "sensitivities")
+    refuse_frozen(lin, "sensitivity")
     source = lin.generator
     if source is None:
         raise InputError(

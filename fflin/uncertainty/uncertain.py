@@ -19,7 +19,7 @@ from fflin.base.validation import (
     vector,
     whole,
 )
-from fflin.dynamics.coordinates import refuse_constraints
+from fflin.dynamics.coordinates import refuse_constraints, refuse_elliptic
 from fflin.dynamics.state import StateMap
 from fflin.linear.linearization import Prepared, linearize
 from fflin.robot.robot import Robot
@@ -299,6 +299,7 @@ def uncertain(robot: Robot, ranges: Mapping[str, object]) -> Uncertain:
     """
     instance("robot", robot, Robot, "a fflin.Robot").require_unchanged()
     refuse_constraints(robot, "uncertain models")
+    refuse_elliptic(robot, "uncertain models")
     given: dict[str, object] = {}
     for key, value in by_name("ranges", ranges, "parameter").items():
         if isinstance(value, Mapping) and "range" not in value:

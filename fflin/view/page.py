@@ -30,6 +30,7 @@ from fflin.dynamics.orbital import OrbitField
 from fflin.robot.equipment.assembly import turned_to
 from fflin.robot.inputs import Thruster, named_wheels
 from fflin.robot.joints import ROOT, find_frame
+from fflin.robot.orbit import CircularOrbit
 from fflin.robot.robot import Robot
 from fflin.view.shapes import (
     PLAIN,
@@ -424,7 +425,10 @@ def subtitle(robot: Robot) -> str:
         parts.append(counted(wheels, "wheel"))
     parts.append(f"{robot.mass:.4g} kg")
     if robot.orbit:
-        parts.append(f"{robot.orbit.altitude / 1e3:.6g} km over {robot.orbit.body}")
+        height = str(robot.orbit).partition(",")[0]
+        if isinstance(robot.orbit, CircularOrbit):
+            height = f"{robot.orbit.altitude / 1e3:.6g} km over {robot.orbit.body}"
+        parts.append(height)
     return ", ".join(parts)
 
 
@@ -479,7 +483,8 @@ class Page:
         robot = self.robot
         nodes = self.nodes
         orbit = dict[str, object]()
-        if self.scene == "space" and robot.orbit:
+        # The page turns planet and stars at a constant rate, so it omits them in an elliptic orbit.
+        if self.scene == "space" and isinstance(robot.orbit, CircularOrbit):
             field = OrbitField(robot, frame_of(robot, self.frame))
             # The rows of "up" are the axes of the page in the orbital frame: x along the orbit, y
             # (upwards) away from the central body, and z opposite to the orbit normal.

@@ -11,8 +11,11 @@ from fflin.kernel.limits import LIMITS, Task, reason_against
 from fflin.robot.joints import ROOT
 
 CUBESAT = fflin.load("cubesat")
+IN_ELLIPSE = CUBESAT.replace(orbit={"perigee": 500e3, "eccentricity": 0.1})
 CONSTRAINED = CUBESAT.replace(constraints=[fflin.Weld("base")])
-CONSTRAINED_IN_ORBIT = CONSTRAINED.replace(orbit=500e3)
+CONSTRAINED_IN_ORBIT = fflin.load(
+    "dual_arm", orbit=500e3, constraints=[fflin.Weld("tool_left", "tool_right")]
+)
 
 
 def with_displaced_root():
@@ -39,12 +42,13 @@ TASKS = {
     "disturbances are computed in Python": Task(robots=(CUBESAT,), disturbance=True),
     "lags of inputs and outputs are": Task(robots=(CUBESAT,), lagging=True),
     "a Mpc is computed in Python": Task(robots=(CUBESAT,), python_policy="Mpc"),
+    "'cubesat' is in an elliptic orbit": Task(robots=(CUBESAT, IN_ELLIPSE)),
     "a joint of 'composite' does not": Task(robots=(with_displaced_axis(),)),
     "the root joint of 'displaced'": Task(
         robots=(with_displaced_root(),), simulated=True
     ),
     "the constraints of 'cubesat' are": Task(robots=(CONSTRAINED,)),
-    "the constraints of 'cubesat' are simulated in orbit": Task(
+    "the constraints of 'dual_arm' are simulated in orbit": Task(
         robots=(CONSTRAINED_IN_ORBIT,), simulated=True
     ),
     "its sample time differs": Task(robots=(CUBESAT,), own_sample_time=True),

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
 
-from fflin.control.optimal.periodic_riccati import periodic_filter
+from fflin.control.optimal.periodic_filter import periodic_filter
 
 
 def system(n=5, k=3, seed=0):

@@ -1,0 +1,234 @@
+"""Periodic regulators and filters: Riccati equations over one period, and laws that repeat."""
+
+import numpy as np
+import pytest
+from scipy.linalg import block_diag, solve_continuous_are, solve_discrete_are
+
+import fflin
+from fflin.control.optimal import differential_riccati as riccati
+from fflin.control.optimal import periodic_riccati
+from fflin.control.tvlqr import held_stages
+from tests.support.orbits import in_ellipse, in_orbit
+from tests.support.robots import free_body
+
+BODY = (3.0, 5.0, 4.0)
+Q, R = {"q_b": 1.0, "r_b": 0.5, "omega_b": 0.3, "v_b": 0.2}, 2.0
+
+
+@pytest.fixture(scope="module")
+def along():
+    return fflin.linearize_orbit(in_ellipse(free_body(BODY), 0.3), steps=16)
+
+
+@pytest.fixture(scope="module")
+def schedule(along):
+    return fflin.tvlqr(along, Q, R, "periodic", sample=along.period / 8)
+
+
+def apart(P, expected):
+    """Largest difference of two matrices, relative to the largest entry."""
+    return np.abs(P - expected).max() / np.abs(expected).max()
+
+
+def test_the_sampled_solution_satisfies_the_periodic_equation(schedule):
+    assert apart(schedule.P[0], schedule.P[-1]) < 1e-12
+    assert schedule.residual < 1e-9
+    assert np.array_equal(schedule.K[0], schedule.gain(0.0))
+    least = np.linalg.eigvalsh(schedule.P)[:, 0]
+    assert (least > 0.0).all()
+
+
+def test_a_backward_sweep_over_many_periods_gives_the_same_solution(along, schedule):
+    Q_matrix, R_matrix = schedule.Q, schedule.R
+    stages = list(held_stages(along, along.period / 8, Q_matrix, R_matrix))
+    P = np.zeros((12, 12))
+    for _ in range(60):
+        _, costs, _ = riccati.samples_back(reversed(stages), P)
+        P = costs[-1]
+    assert apart(P, schedule.P[0]) < 1e-10
+
+
+def test_the_lifted_system_has_the_same_solution(along):
+    h = along.period / 3
+    schedule = fflin.tvlqr(along, Q, R, "periodic", sample=h)
+    # All inputs of a period are the inputs of one sample of the lifted system.
+    nx, nu = 12, 6
+    state = np.hstack((np.eye(nx), np.zeros((nx, 3 * nu))))
+    cost = np.zeros((nx + 3 * nu, nx + 3 * nu))
+    for k, (weights, whole) in enumerate(held_stages(along, h, schedule.Q, schedule.R)):
+        pick = np.zeros((nu, nx + 3 * nu))
+        pick[:, nx + k * nu : nx + (k + 1) * nu] = np.eye(nu)
+        both = np.vstack((state, pick))
+        cost += both.T @ weights @ both
+        state = whole @ both
+    A, B = state[:, :nx], state[:, nx:]
+    Q_lifted, S, R_lifted = cost[:nx, :nx], cost[:nx, nx:], cost[nx:, nx:]
+    expected = solve_discrete_are(A, B, Q_lifted, R_lifted, s=S)
+    assert apart(schedule.P[0], expected) < 1e-9
+    assert schedule.P.shape == (4, 12, 12)
+
+
+def test_the_multipliers_are_those_of_the_closed_loop(schedule):
+    total = np.eye(12)
+    for A, B, K in zip(schedule.A, schedule.B, schedule.K, strict=False):
+        total = (A - B @ K) @ total
+    expected = np.sort(np.abs(np.linalg.eigvals(total)))[::-1]
+    # Small eigenvalues of the product itself are not accurate.
+    assert np.allclose(schedule.multipliers[:3], expected[:3], rtol=1e-6)
+    assert schedule.multipliers[0] < 1.0
+
+
+@pytest.mark.parametrize("sampled", [True, False])
+def test_constant_models_give_the_solution_of_the_algebraic_equation(sampled):
+    along = fflin.linearize_orbit(in_orbit(free_body(BODY)), steps=8)
+    sample = along.period / 40 if sampled else None
+    schedule = fflin.tvlqr(along, Q, R, "periodic", sample=sample)
+    A, B = along.A[0], along.B[0]
+    if not sampled:
+        expected = solve_continuous_are(A, B, schedule.Q, schedule.R)
+        assert len(schedule.t) < 200
+    else:
+        lin = along[0].discretize(sample)
+        Qd, Rd, N = fflin.sampled_cost(along[0], sample, schedule.Q, schedule.R)
+        expected = solve_discrete_are(lin.A, lin.B, Qd, Rd, s=N)
+    for P in schedule.P[:: len(schedule.P) // 4]:
+        assert apart(P, expected) < 1e-9
+
+
+def test_the_continuous_solution_repeats(along):
+    schedule = fflin.tvlqr(along, Q, R, "periodic")
+    assert apart(schedule.P[0], schedule.P[-1]) < 1e-12
+    assert schedule.residual < 1e-5
+    assert schedule.multipliers[0] < 1.0
+    # A sweep with the method of other schedules, from this cost, gives this cost again.
+    S = along.B @ np.linalg.solve(schedule.R, along.B.mT)
+
+    def at(times):
+        A, B = along.matrices_at(times)
+        S = B @ np.linalg.solve(schedule.R, B.mT)
+        return np.array((A, S, np.broadcast_to(schedule.Q, A.shape)))
+
+    _, P = riccati.solve_back(at, along.t, schedule.P[-1])
+    assert apart(P[0], schedule.P[0]) < 1e-7
+    late = schedule.period + 1.0
+    assert np.allclose(schedule.gain(late), schedule.gain(1.0), rtol=0.0, atol=1e-12)
+    assert np.allclose(
+        schedule.cost_to_go(late), schedule.cost_to_go(1.0), rtol=1e-12, atol=1e-12
+    )
+    assert S.shape == (17, 12, 12)
+
+
+def test_the_filter_is_the_dual_of_the_regulator():
+    robot = in_ellipse(free_body(BODY), 0.3).replace(outputs=[fflin.BasePose()])
+    along = fflin.linearize_orbit(robot, steps=8)
+    h = along.period / 8
+    filtered = fflin.tvkalman(along, 1e-3, 1e-4, P0="periodic", sample=h)
+    assert filtered.period == along.period
+    assert apart(filtered.P[-1], filtered.P[0]) < 1e-12
+    assert filtered.residual < 1e-9
+    # A filter that starts with another covariance forgets it.
+    P = np.eye(12)
+    for _ in range(5):
+        for Phi, C, W in zip(filtered.A, filtered.C, filtered.W, strict=False):
+            gain = P @ C.T @ np.linalg.inv(C @ P @ C.T + filtered.V)
+            P = Phi @ (P - gain @ C @ P) @ Phi.T + W
+            P = 0.5 * (P + P.T)
+    assert apart(P, filtered.P[0]) < 1e-9
+    assert np.array_equal(filtered.gain(late := 2.5 * h), filtered.L[2])
+    assert np.array_equal(filtered.gain(late + along.period), filtered.L[2])
+
+
+def test_cross_terms_are_removed_before_the_doubling():
+    rng = np.random.default_rng(3)
+    stages = []
+    for _ in range(4):
+        root = rng.normal(size=(5, 5))
+        stages.append((root @ root.T + np.eye(5), rng.normal(size=(3, 5))))
+    maps = [periodic_riccati.sample_transition(*stage) for stage in stages]
+    P = periodic_riccati.periodic_cost(periodic_riccati.over_period(maps))
+    _, costs, _ = riccati.samples_back(stages, P)
+    assert apart(costs[-1], P) < 1e-12
+    assert np.linalg.eigvalsh(P)[0] > 0.0
+
+
+@pytest.mark.exhaustive
+def test_states_that_no_input_pushes_are_not_regulated():
+    robot = fflin.load(
+        "cubesat",
+        inputs=[fflin.BaseTorque()],
+        orbit={"perigee": 500e3, "eccentricity": 0.1},
+    )
+    along = fflin.linearize_orbit(robot, steps=16)
+    schedule = fflin.tvlqr(along, 1.0, 1e4, "periodic", sample=along.period / 32)
+    assert "not regulated: r_b.x" in schedule.weights
+    rows = [3, 4, 5, 9, 10, 11]
+    assert not schedule.K[:, :, rows].any()
+    # The six multipliers of the translation are 1; all others are stable.
+    assert schedule.multipliers[5] == pytest.approx(1.0, abs=1e-6)
+    assert schedule.multipliers[6] < 0.1
+    assert "repeats after" in str(schedule)
+
+
+@pytest.mark.exhaustive
+def test_default_weights_follow_from_limits_as_for_lqr():
+    robot = fflin.load("cubesat", orbit={"perigee": 500e3, "eccentricity": 0.1})
+    along = fflin.linearize_orbit(robot, steps=16)
+    default = fflin.tvlqr(along, Qf="periodic", sample=along.period / 400)
+    assert "from mass and size" in default.weights
+    assert default.multipliers[0] < 1e-6
+
+
+@pytest.mark.exhaustive
+def test_inputs_that_cannot_stabilise_are_refused():
+    # Forces alone do not control the attitude.
+    robot = in_ellipse(free_body((5.0, 6.0, 2.0)), 0.01)
+    robot = robot.replace(inputs=[fflin.BaseForce()])
+    along = fflin.linearize_orbit(robot, motion="free", steps=8)
+    with pytest.raises(fflin.StabilizabilityError, match="grows from period to period"):
+        fflin.tvlqr(along, 1.0, 1.0, "periodic", sample=along.period / 8)
+
+
+@pytest.mark.parametrize(
+    ("ask", "words"),
+    [
+        (lambda a: fflin.tvlqr(a), "give Qf='periodic'"),
+        (lambda a: fflin.tvlqr(a, 1.0, 1.0, 1.0), "give Qf='periodic'"),
+        (lambda a: fflin.tvlqr(a, 1.0, 1.0, "cyclic"), "'steady', 'periodic'"),
+        (lambda a: fflin.tvkalman(a, 1.0, 1.0, sample=1.0), "give P0='periodic'"),
+        (lambda a: fflin.mpc(a, 5, sample=a.period / 16), "repeats after"),
+        (
+            lambda a: fflin.funnel(
+                a.robot,
+                fflin.tvlqr(a, Q, R, "periodic", sample=a.period / 12),
+                {"attitude": 5.0},
+                samples=2,
+            ),
+            "repeats after",
+        ),
+        (lambda a: a.to("pinocchio"), "orbit"),
+    ],
+)
+def test_periodic_trajectories_are_refused_where_an_end_is_needed(along, ask, words):
+    with pytest.raises(fflin.InputError, match=words) as refused:
+        ask(along)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_trajectory_that_ends_has_no_periodic_law():
+    robot = fflin.load("planar_detumble")
+    motion = fflin.simulate(robot, duration=0.2, dt=0.1)
+    ends = fflin.linearize_trajectory(robot, motion.trajectory())
+    with pytest.raises(fflin.InputError, match="has no period"):
+        fflin.tvlqr(ends, 1.0, 1.0, "periodic")
+
+
+def test_a_file_keeps_a_periodic_schedule(schedule, along, tmp_path):
+    schedule.save(tmp_path / "schedule.npz")
+    back = fflin.GainSchedule.load(tmp_path / "schedule.npz")
+    assert (back.period, back.orbit) == (schedule.period, schedule.orbit)
+    assert np.array_equal(back.multipliers, schedule.multipliers)
+    assert back.trajectory(along.robot).period == along.period
+    other = in_ellipse(free_body(BODY), 0.2)
+    with pytest.raises(fflin.InputError, match="another orbit"):
+        back.trajectory(other)
+    assert block_diag(schedule.Q, schedule.R).shape == (18, 18)
