@@ -382,11 +382,15 @@ def gain_of(
     """Return the regulator of a model.
 
     The options --weights, --q, --r and --bryson define the weights, and --integral the integrated
-    signals. With --sample, the model is first discretised. If `allocated` is true, the error for an
-    unknown name mentions --no-allocate.
+    signals. With --sample or --delay, the model is first discretised. If `allocated` is true, the
+    error for an unknown name mentions --no-allocate.
     """
-    if arguments.sample is not None:
-        lin = lin.discretize(arguments.sample)
+    delay = getattr(arguments, "delay", None) or 0.0
+    sample = arguments.sample
+    if sample is None and delay:
+        sample = delay
+    if sample is not None:
+        lin = lin.discretize(sample, delay=delay)
     try:
         return fflin.lqr(
             lin,
@@ -492,6 +496,8 @@ def about_point(
     thrusters. In these cases, `simulate` predicts the motion with the policy's own model if it can,
     and otherwise makes no prediction.
     """
+    from fflin.control.gain import sampled_for
+
     gain: fflin.Gain | None = None
     feedback: fflin.StateFeedback | fflin.LinearController
     if arguments.mpc:
@@ -532,8 +538,7 @@ def about_point(
         feedback = fflin.LinearController(arguments.controller, lin, sign=sign)
     else:
         gain = gain or gain_of(lin, arguments, allocated=design is not robot)
-        model = lin.discretize(gain.dt) if gain.dt else lin
-        feedback = _state_feedback(model, gain)
+        feedback = _state_feedback(sampled_for(gain, lin), gain)
     if design is not robot:
         return fflin.Allocation(feedback, design), feedback, None
     if arguments.reduce or arguments.controller:

@@ -207,8 +207,7 @@ def _margins_of(policy: object, settings: Mapping[str, Any]) -> tuple[object, st
 
     if not isinstance(policy, Policy) or policy.linear_law() is None:
         return None, ""
-    delay = settings.get("delay") or 0.0
-    margins = margins_at_once(policy, delay, settings.get("sample"))
+    margins = margins_at_once(policy, settings.get("delay"), settings.get("sample"))
     if margins is None:
         return None, "margins of the linear loop: see fflin.margins(policy, lin)"
     if not margins.disk:

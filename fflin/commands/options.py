@@ -78,7 +78,7 @@ OPTIONS: dict[str, dict[str, str]] = {
     },
     "lqr": {
         **_AT_POINT,
-        CONTROLLER: f"{_WEIGHTS} integral dt allocate",
+        CONTROLLER: f"{_WEIGHTS} integral delay dt allocate",
         OUTPUT: "output-file plot",
     },
     "tvlqr": {**_ALONG, CONTROLLER: f"{_WEIGHTS} dt qf", OUTPUT: "output-file"},
@@ -256,7 +256,8 @@ ABOUT: dict[str, str] = {
     "horizon": "number of samples in the horizon of --mpc",
     "free": "simulate the robot without a regulator and without inputs",
     "delay": "delay [s] between a sample and the application of the command that is computed from "
-    "this sample; the regulator is designed without it",
+    "this sample. The regulator is designed for this delay. Without --sample, its sample time is "
+    "then equal to the delay. A law from a file, MPC, and a law along a trajectory do not change",
     "offset": "initial error with respect to the start of the trajectory, in base axes. NAME is a "
     "state, a group or a pattern, such as r_b.x, q_m or omega_b.z (SI units), or it is roll, pitch "
     "or yaw [deg]",
@@ -359,6 +360,8 @@ ABOUT: dict[str, str] = {
     "funnel knots": "number of knots to test",
     "funnel threads": "number of threads; by default one per core",
     "lqr dt": "former name of --sample",
+    "lqr delay": "design the regulator for commands that act T s after their sample. Without "
+    "--sample, the sample time is T",
     "lqr output-file": "save the gain to FILE",
     "lqr plot": "plot the poles, the loop gain of each input and the stability margins to FILE",
     "tvlqr dt": "former name of --sample",

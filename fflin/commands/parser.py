@@ -251,7 +251,7 @@ FORMS: dict[str, Form] = {
     "duration": one(number, "T"),
     "pointing": one(number, "WINDOW"),
     "accuracy": one(number, "X"),
-    "delay": one(number, "T", 0.0),
+    "delay": one(number, "T"),
     "times": one(number, "T", nargs="+"),
     "attitude": one(number, "X", 90.0),
     "spread": one(number, "X", 1.0),

@@ -286,16 +286,14 @@ def delayed_model(
         if delay < 0.0:
             raise InputError(f"delay is {delay:g} s, expected at least 0")
         return lin, delay
-    known = policy._lin if isinstance(policy, Gain) else as_policy(policy).model
-    if lin.delay.any():
+    known = policy if isinstance(policy, Gain) else as_policy(policy).model
+    if lin.delay.any() or known is None:
         return lin, 0.0
-    if known is None:
-        if isinstance(policy, Gain) and is_delayed(policy.state_names):
-            raise InputError(
-                "the gain was designed for delayed inputs, but lin has no delay; give the model "
-                "of the gain, lin.discretize(dt, delay=...), or give delay="
-            )
-        return lin, 0.0
+    if not known.delay.any() and is_delayed(known.state_names):
+        raise InputError(
+            "the gain was designed for delayed inputs, but lin has no delay; give the model "
+            "of the gain, lin.discretize(dt, delay=...), or give delay="
+        )
     source = lin.generator if lin.dt else lin
     if (
         not known.delay.any()
@@ -325,6 +323,11 @@ def margins_at_once(
     lin = policy.model
     if lin is None or policy.followed_trajectory is not None:
         return None
+    if delay is not None and lin.delay.any():
+        # The given delay replaces the delay of the model.
+        lin = lin.generator
+        if lin is None:
+            return None
     try:
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             closed = closed_loop(policy, lin, delay, sample)

@@ -252,8 +252,8 @@ def test_a_simulation_reports_the_margins_of_its_loop(capsys):
     text = capsys.readouterr().out
     assert "margins of the linear loop" in text
     lin = fflin.linearize(fflin.load("planar_detumble"))
-    sampled = lin.discretize(0.2)
-    expected = fflin.margins(fflin.lqr(sampled), sampled, delay=0.2).disk
+    late = lin.discretize(0.2, delay=0.2)
+    expected = fflin.margins(fflin.lqr(late), late).disk
     assert f"(disk margin {expected:.3g})" in " ".join(text.split())
     assert main(["simulate", *loop, "--free"]) == 0
     assert "margins of the linear loop" not in capsys.readouterr().out
