@@ -485,7 +485,7 @@ class Dispersions:
             robot = _disturbed(robot, self._of(DISTURBANCE, rows)[0])
         if policy and self._kinds & {*_OF_SENSORS}:
             errors = (self._of(kind, rows)[0] for kind in (*_OF_SENSORS, "seed"))
-            policy = _with_sensor_errors(policy, *errors)
+            policy = with_sensor_errors(policy, *errors)
         if "misalignment" in self._kinds:
             robot = _misaligned(robot, self._of("misalignment", rows)[0])
             if policy and policy.commanded_robot:
@@ -528,7 +528,7 @@ def _disturbed(robot: Robot, drawn: Array) -> Robot:
     return replace(robot, disturbance=terms)
 
 
-def _with_sensor_errors(
+def with_sensor_errors(
     policy: Policy, bias: Array, deviation: Array, seed: Array
 ) -> Policy:
     """Add a bias and white noise to the measurements (ny,) of a policy; return the new policy.

@@ -461,6 +461,66 @@ def loop_of(
     return policy, settings | {"q0": q, "v0": v, "linear": lin}
 
 
+def with_errors(
+    policy: fflin.Policy | None, arguments: Namespace
+) -> fflin.Policy | None:
+    """Return a policy whose measurements have the errors of --noise and --bias."""
+    import numpy as np
+
+    from fflin.base.names import by_name
+    from fflin.campaign.dispersions import with_sensor_errors
+    from fflin.control.data_sheet import output_keys
+
+    given = {
+        name: once(f"--{name}", getattr(arguments, name)) for name in ("noise", "bias")
+    }
+    if not any(given.values()):
+        return policy
+    if policy is None or not policy.sensors:
+        raise InputError(
+            "--noise and --bias need a regulator that measures states or outputs about a point"
+        )
+    if given["noise"] and not policy.sample_time:
+        raise InputError("--noise is the noise of a sample; add --sample H")
+    sizes = {}
+    for name, values in given.items():
+        keys = output_keys(values, policy.sensors)
+        by_key = {keys[key]: value for key, value in values.items()}
+        sizes[name] = np.zeros(len(policy.sensors))
+        for index, value in by_name("measured signal", by_key, policy.sensors).items():
+            sizes[name][index] = value
+    seed = np.zeros(1)
+    return with_sensor_errors(policy.fresh(), sizes["bias"], sizes["noise"], seed)
+
+
+def budget_of(
+    robot: fflin.Robot,
+    policy: fflin.Policy | None,
+    motion: fflin.Motion,
+    arguments: Namespace,
+) -> fflin.ErrorBudget:
+    """Return the error budget of a simulated loop."""
+    if policy is None or policy.model is None or policy.linear_law() is None:
+        raise InputError(
+            "--budget needs a linear regulator about a point; remove --budget, or the options for "
+            "MPC, trajectories or --free"
+        )
+    model, delay = policy.model, arguments.delay
+    if delay is not None:
+        # The given delay replaces the delay of the design.
+        model = model.generator or model
+    return fflin.error_budget(
+        policy,
+        model,
+        noise=once("--noise", arguments.noise),
+        bias=once("--bias", arguments.bias),
+        delay=delay,
+        robot=robot,
+        motion=motion,
+        limit_cycle=True,
+    )
+
+
 def start_of(
     robot: fflin.Robot, arguments: Namespace, reference: pin.SE3 | None = None
 ) -> tuple[Array, Array | None]:

@@ -93,7 +93,7 @@ OPTIONS: dict[str, dict[str, str]] = {
     "simulate": {
         **_LOOP,
         SIMULATION: f"{_LOOP[SIMULATION]} every engine",
-        "pointing errors": "pointing accuracy",
+        "pointing errors": "pointing accuracy budget noise bias",
         OUTPUT: f"plot show output-file html {_PICTURES}",
     },
     "export": {"": "FILE", OUTPUT: "output-folder robot limits name real"},
@@ -328,6 +328,13 @@ ABOUT: dict[str, str] = {
     "file that contains a result of the same kind",
     "pointing": "report pointing errors as in ECSS-E-ST-60-10C, for windows of this length [s]",
     "accuracy": "angle [deg] for the settling time of --pointing",
+    "budget": "report the error of each cause in the linear loop, see fflin.error_budget: the "
+    "disturbance of the robot, --noise and --bias. The part of the simulated errors that they do "
+    "not explain, such as the limit cycle of thrusters, is a further cause",
+    "noise": "standard deviation of the noise in each sample of a measured signal, as a standard "
+    "normal variable. NAME is a state, or an output for --controller, a group or a quantity such "
+    "as gyroscope",
+    "bias": "constant error of a measured signal, named as in --noise",
     "json": "print the results as one JSON object",
     # Options of one command.
     "init output-file": "save the robot file (by default the URDF's name with .toml, in the "

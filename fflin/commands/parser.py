@@ -225,6 +225,7 @@ FORMS: dict[str, Form] = {
         ("joint", "velocity", "target-joint", "target-velocity", "offset"), _PAIRS
     ),
     **dict.fromkeys(("effort", "limit", "bryson", "qf", "goal", "within"), _PAIRS),
+    **dict.fromkeys(("noise", "bias"), _PAIRS),
     "q": _WEIGHTS,
     "r": _WEIGHTS,
     "stiffness": _OF_JOINT,

@@ -7,10 +7,10 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.rotation import rotation_matrix
-from fflin.base.validation import Array
+from fflin.base.validation import Array, Values
 from fflin.dynamics.coordinates import PIN_ANGULAR, PIN_LINEAR
 from fflin.dynamics.orbital import OrbitField
-from fflin.robot.disturbance import BASE, INERTIAL, terms_of
+from fflin.robot.disturbance import BASE, INERTIAL, ORBITAL, terms_of
 from fflin.robot.inputs import BaseForce, BaseTorque
 from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
@@ -42,6 +42,51 @@ def waves_of(robot: Robot) -> list[Wave]:
             rate = 2.0 * math.pi * term.frequency
             waves.append(Wave(name, axes, term.amplitude, rate, term.phase))
     return waves
+
+
+class Phasor(NamedTuple):
+    """Torque or force on the base: real part of vector times exp(j rate t)."""
+
+    name: str  # "tau_b" or "F_b"
+    axes: str  # "base" or "orbital"; without an orbit, "inertial" in place of "orbital"
+    vector: Values  # (3,) of complex [N m | N]
+    rate: float  # [rad/s], at least 0
+
+
+def phasors_of(robot: Robot, field: OrbitField | None) -> list[Phasor]:
+    """Return the disturbances of a robot as phasors; constants have the rate 0.
+
+    `field` is the field of the robot's orbit, or None without an orbit. A vector with inertial axes
+    rotates in the orbital frame, so that it has the rate of the orbit there.
+    """
+    phasors = list[Phasor]()
+    for name, axes, vector, rate, phase in waves_of(robot):
+        # sin(rate t + phase) is the real part of `wave` times exp(j rate t).
+        wave = -1j * np.exp(1j * phase)
+        if not rate:
+            wave = math.sin(phase) + 0j
+        value = np.array(vector) + 0j
+        if axes != INERTIAL or field is None:
+            phasors.append(Phasor(name, axes, wave * value, rate))
+            continue
+        orbit_rate = float(np.linalg.norm(field.rate))
+        normal = field.rate / orbit_rate
+        along = normal * normal.dot(value)
+        phasors.append(Phasor(name, ORBITAL, wave * along, rate))
+        # The part in the orbit plane rotates backwards: it is the real part of `turning` times
+        # exp(j orbit_rate t). The product of two real parts has the sum and the difference of
+        # their rates.
+        turning = value - along + 1j * np.cross(normal, value)
+        if not rate:
+            phasors.append(Phasor(name, ORBITAL, wave * turning, orbit_rate))
+            continue
+        total = 0.5 * turning * wave
+        difference = 0.5 * turning * np.conj(wave)
+        if rate > orbit_rate:
+            difference = np.conj(difference)
+        phasors.append(Phasor(name, ORBITAL, total, orbit_rate + rate))
+        phasors.append(Phasor(name, ORBITAL, difference, abs(orbit_rate - rate)))
+    return phasors
 
 
 class BaseDisturbance:
