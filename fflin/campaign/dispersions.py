@@ -557,7 +557,11 @@ def _disturbed(robot: Robot, drawn: Array, factors: Mapping[str, Array]) -> Robo
     terms = dict(robot.disturbance)
     for name, value in zip(UNITS, drawn.reshape(-1, 3).tolist(), strict=True):
         x, y, z = value
-        scaled = [_scaled(term, factors[name]) for term in terms.get(name, ())]
+        scaled = [
+            _scaled(term, factors[name])
+            for term_name, term in terms_of(robot.disturbance)
+            if term_name == name
+        ]
         terms[name] = (*scaled, DisturbanceTerm(constant=(x, y, z)))
     return replace(robot, disturbance=terms)
 

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 from fflin.kernel.compiled import numba_is_there, without_numba
 from fflin.kernel.tree import batch_tree
+from fflin.robot.disturbance import PLATE
 from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
 
@@ -80,6 +81,10 @@ def _has_displaced_root(robot: Robot) -> bool:
     return not robot.model.jointPlacements[ROOT].isIdentity(0.0)
 
 
+def _has_plates(robot: Robot) -> bool:
+    return PLATE in robot.disturbance
+
+
 LIMITS = (
     Limit(lambda task: not numba_is_there() and without_numba(), "{}"),
     Limit(lambda task: task.outputs, "the outputs are not the state"),
@@ -98,6 +103,10 @@ LIMITS = (
     Limit(
         lambda task: task.simulated and task.first(_has_displaced_root),
         "the root joint of '{}' is not at the origin of the world",
+    ),
+    Limit(
+        lambda task: task.simulated and task.first(_has_plates),
+        "the flat plates of '{}' are computed in Python",
     ),
     Limit(
         lambda task: task.own_sample_time,

@@ -268,7 +268,8 @@ def error_budget(
         Simulated motion whose attitude errors are compared with the budget.
     robot : Robot, optional
         Robot whose field `disturbance` contains further causes, at the attitude of `lin`. In orbit,
-        constants in inertial axes are sinusoids with the rate of the orbit.
+        constants in inertial axes are sinusoids with the rate of the orbit. Flat plates are left
+        out.
     limit_cycle : bool
         Whether the part of the errors of `motion` that the linear superposition does not explain is
         a further cause, "simulated minus superposed". The motion must contain the same causes. Its

@@ -12,6 +12,9 @@ from fflin.robot.joints import ROOT
 
 CUBESAT = fflin.load("cubesat")
 IN_ORBIT = CUBESAT.replace(orbit=500e3)
+WITH_PLATE = CUBESAT.replace(
+    disturbance={"plate": {"area": 0.1, "normal": (0, 0, 1), "sun": (0, 0, 1)}}
+)
 
 
 def with_displaced_root():
@@ -42,6 +45,7 @@ TASKS = {
     "the root joint of 'displaced'": Task(
         robots=(with_displaced_root(),), simulated=True
     ),
+    "the flat plates of 'cubesat'": Task(robots=(WITH_PLATE,), simulated=True),
     "its sample time differs": Task(robots=(CUBESAT,), own_sample_time=True),
     "noise is evaluated at every stage": Task(robots=(CUBESAT,), noise_at_stages=True),
     "no frame": Task(robots=(CUBESAT,), measurements="no frame"),
