@@ -18,6 +18,7 @@ from fflin.base.validation import Array, untied
 from fflin.base.validation import by_name as mapping
 from fflin.base.writing import reason
 from fflin.campaign.spreads import SEED, SEEDS, Inverse, inverse_of
+from fflin.control.data_sheet import output_keys
 from fflin.control.policy import Command, Policy, bound
 from fflin.dynamics.coordinates import PIN_ANGULAR, PIN_LINEAR
 from fflin.dynamics.state import StateMap
@@ -113,6 +114,8 @@ class Dispersions:
                     "needs another description; give (least, largest) in s, a list of times in s "
                     "or a distribution"
                 )
+            if kind in _OF_SENSORS:
+                head = output_keys([head], sensors)[head]
             inverse = inverse_of(str(key), plain_spread, fixed=kind == "noise")
             by_kind.setdefault(kind, {})[head] = inverse, group
         if not by_kind:

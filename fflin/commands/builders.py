@@ -385,6 +385,8 @@ def gain_of(
     signals. With --sample or --delay, the model is first discretised. If `allocated` is true, the
     error for an unknown name mentions --no-allocate.
     """
+    # "none" switches off the integral action of the robot file.
+    integral = [] if arguments.integral == ["none"] else arguments.integral or None
     delay = getattr(arguments, "delay", None) or 0.0
     sample = arguments.sample
     if sample is None and delay:
@@ -396,7 +398,7 @@ def gain_of(
             lin,
             weights=weights_of(arguments),
             wheel_speeds=arguments.wheel_speeds,
-            integral_action=arguments.integral or None,
+            integral_action=integral,
         )
     except UnknownNameError as error:
         message = str(error)

@@ -225,7 +225,8 @@ ABOUT: dict[str, str] = {
     "are comparable",
     "integral": "also integrate a state or an output, so that a constant disturbance leaves no "
     "error in it. NAME is a state, an output or a group, such as q_b. The integrals are slower "
-    "than the loop; the report states their rate",
+    "than the loop; the report states their rate. `none` switches off the integrals that the robot "
+    "file sets",
     "sample": "sample time of the controller [s], with zero-order hold of the inputs. The sampled "
     "gain minimises the continuous-time cost",
     "reduce": "for robots with conserved momentum: regulate only the controllable states",

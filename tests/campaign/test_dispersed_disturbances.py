@@ -99,3 +99,24 @@ def test_an_amplitude_of_no_periodic_disturbance_is_refused():
         campaign_of(robot, {"tau_b.x.amplitude": 0.3}, "python")
     with pytest.raises(fflin.InputError, match="expected more than -1"):
         campaign_of(robot, {"tau_b.amplitude": (-2.0, -1.5)}, "python")
+
+
+def test_a_quantity_names_its_components_as_in_the_filter():
+    robot = fflin.load(
+        "cubesat",
+        inputs=[fflin.BaseTorque()],
+        outputs=[fflin.BasePose(), fflin.Gyroscope("base")],
+    )
+    lin = fflin.linearize(robot).discretize(0.5)
+    noise = {"q_b": 1e-9, "r_b": 1e-4, "gyroscope": 1e-9}
+    estimator = fflin.kalman(lin, {"omega_b": 1e-9}, noise)
+    law = fflin.OutputFeedback(lin, fflin.lqg(fflin.lqr(lin), estimator))
+    options = {"runs": 2, "duration": 1.0, "dt": 0.25, "engine": "python"}
+    named, listed = (
+        fflin.monte_carlo(
+            robot, law, {f"{key}.noise": 1e-4, f"{key}.sensor": 1e-3}, **options
+        )
+        for key in ("gyroscope", "*.gyroscope.*")
+    )
+    assert named.names == listed.names and len(named.names) == 1 + 2 * 3
+    assert np.array_equal(named.q, listed.q)

@@ -257,3 +257,13 @@ def test_a_simulation_reports_the_margins_of_its_loop(capsys):
     assert f"(disk margin {expected:.3g})" in " ".join(text.split())
     assert main(["simulate", *loop, "--free"]) == 0
     assert "margins of the linear loop" not in capsys.readouterr().out
+
+
+def test_none_switches_off_the_integrals_of_the_robot_file(tmp_path, capsys):
+    file = tmp_path / "robot.toml"
+    file.write_text('urdf = "planar_detumble"\n[weights]\nintegral = ["q_b.z"]\n')
+    found = []
+    for options in ((), ("--integral", "none"), ("--integral", "q_b.z")):
+        assert main(["lqr", str(file), *options, "--json"]) == 0
+        found.append(json.loads(capsys.readouterr().out)["integrals"])
+    assert found == [["integral.q_b.z"], [], ["integral.q_b.z"]]
