@@ -23,13 +23,14 @@ from fflin.base.validation import Array, Indices, untied
 from fflin.base.validation import by_name as mapping
 from fflin.base.writing import reason
 from fflin.campaign.spreads import SEED, SEEDS, Inverse, inverse_of
+from fflin.control.data_sheet import output_keys
 from fflin.control.policy import Command, Policy, bound
 from fflin.dynamics.coordinates import PIN_ANGULAR, PIN_LINEAR
 from fflin.dynamics.state import StateMap
 from fflin.kernel.forward import ActuatorFaults
 from fflin.kernel.tree import Tree, batch_tree
 from fflin.linear.model import LinearModel
-from fflin.robot.disturbance import UNITS, DisturbanceTerm
+from fflin.robot.disturbance import UNITS, DisturbanceTerm, terms_of
 from fflin.robot.equipment.assembly import first_impossible, turned_to
 from fflin.robot.fields import warn_of_degrees
 from fflin.robot.inputs import JointTorque, ReactionWheel, Thruster
@@ -52,7 +53,9 @@ _OF_BODIES = ("mass", "com", "inertia", "density")
 _OF_INPUTS, _OF_SPRINGS = ("gain", "bias", "fails"), ("stiffness", "damping")
 _OF_SENSORS = ("sensor", "noise")
 _DISTURBANCES = tuple(f"{name}.{axis}" for name in UNITS for axis in "xyz")
-_FACTORS = ("mass", "inertia", "density", "frequency", *_OF_SPRINGS)
+# Kind of the relative changes of the amplitudes of periodic disturbances.
+_AMPLITUDE = "amplitude"
+_FACTORS = ("mass", "inertia", "density", "frequency", _AMPLITUDE, *_OF_SPRINGS)
 
 
 class Column(NamedTuple):
@@ -92,6 +95,7 @@ class Dispersions:
             **dict.fromkeys(_OF_SPRINGS, robot.joint_names),
             "frequency": modes,
             DISTURBANCE: _DISTURBANCES,
+            _AMPLITUDE: _periodic(robot),
         }
         kinds = [*self._known]
         self._known |= {
@@ -115,6 +119,8 @@ class Dispersions:
                     "needs another description; give (least, largest) in s, a list of times in s "
                     "or a distribution"
                 )
+            if kind in _OF_SENSORS:
+                head = output_keys([head], sensors)[head]
             inverse = inverse_of(str(key), plain_spread, fixed=kind == "noise")
             by_kind.setdefault(kind, {})[head] = inverse, group
         if not by_kind:
@@ -163,6 +169,11 @@ class Dispersions:
             raise InputError(
                 f"'{next(iter(spreads))}.{kind}' is dispersed, but the policy ({named}) has no "
                 "sensors; use a StateFeedback, OutputFeedback or LinearController"
+            )
+        if kind == _AMPLITUDE and not names:
+            raise InputError(
+                f"'{next(iter(spreads))}.{kind}' is dispersed, but '{robot.name}' has no periodic "
+                "disturbance; give the robot one, with amplitude= and frequency="
             )
         if kind in ("noise", "delay") and not self._times.sample:
             raise InputError(
@@ -437,6 +448,13 @@ class Dispersions:
             ]
         return ActuatorFaults(1.0 + gain, bias, until, np.concatenate(turn, axis=1))
 
+    def _amplitudes(self, drawn: Array) -> dict[str, Array]:
+        """Return factors {"tau_b" or "F_b": (N, 3)} of the amplitudes of periodic disturbances."""
+        factors = np.ones((len(drawn), len(_DISTURBANCES)))
+        at = [_DISTURBANCES.index(name) for name in self._known[_AMPLITUDE]]
+        factors[:, at] += self._of(_AMPLITUDE, drawn)
+        return dict(zip(UNITS, np.split(factors, len(UNITS), axis=1), strict=True))
+
     def delays(self, drawn: Array) -> Array:
         """Return the total delays (N, k) in integration steps, with the columns of `Times.delays`.
 
@@ -482,9 +500,13 @@ class Dispersions:
                 runs[key][:, fed] = self._of(kind, drawn)
             if "noise" in self._kinds:
                 runs["seed"] = self._of("seed", drawn)[:, 0]
-        if DISTURBANCE in self._kinds:
+        if self._kinds & {DISTURBANCE, _AMPLITUDE}:
             waves = disturbances_of(plant.robot, dispersed=True)
             vectors = np.tile([wave.vector for wave in waves], (count, 1, 1))
+            factors = self._amplitudes(drawn)
+            for at, wave in enumerate(waves):
+                if wave.rate:
+                    vectors[:, at] *= factors[wave.name]
             vectors = vectors.reshape(count, -1)
             # The last two terms are the dispersed constants, in the order of `_DISTURBANCES`.
             vectors[:, -len(_DISTURBANCES) :] = self._of(DISTURBANCE, drawn)
@@ -513,11 +535,12 @@ class Dispersions:
         robot = replace(
             robot, stiffness=springs["stiffness"], damping=springs["damping"]
         )
-        if DISTURBANCE in self._kinds:
-            robot = _disturbed(robot, self._of(DISTURBANCE, rows)[0])
+        if self._kinds & {DISTURBANCE, _AMPLITUDE}:
+            factors = {name: x[0] for name, x in self._amplitudes(rows).items()}
+            robot = _disturbed(robot, self._of(DISTURBANCE, rows)[0], factors)
         if policy and self._kinds & {*_OF_SENSORS}:
             errors = (self._of(kind, rows)[0] for kind in (*_OF_SENSORS, "seed"))
-            policy = _with_sensor_errors(policy, *errors)
+            policy = with_sensor_errors(policy, *errors)
         if "misalignment" in self._kinds:
             robot = _misaligned(robot, self._of("misalignment", rows)[0])
             if policy and policy.commanded_robot:
@@ -552,16 +575,40 @@ class _Bound(Policy):
         return bound(self.policy, self.robot)
 
 
-def _disturbed(robot: Robot, drawn: Array) -> Robot:
-    """Return a robot with further constant disturbances (6,), in the order of `_DISTURBANCES`."""
+def _periodic(robot: Robot) -> tuple[str, ...]:
+    """Return the entries of `_DISTURBANCES` that periodic terms of a robot contain."""
+    names = set[str]()
+    for name, term in terms_of(robot.disturbance):
+        amplitudes = zip("xyz", term.amplitude, strict=True)
+        names.update(f"{name}.{axis}" for axis, amplitude in amplitudes if amplitude)
+    return tuple(name for name in _DISTURBANCES if name in names)
+
+
+def _disturbed(robot: Robot, drawn: Array, factors: Mapping[str, Array]) -> Robot:
+    """Return a robot with further constant disturbances and other amplitudes.
+
+    The constants `drawn` (6,) are in the order of `_DISTURBANCES`. The amplitudes of the terms
+    tau_b and F_b are multiplied by `factors` {name: (3,)}.
+    """
     terms = dict(robot.disturbance)
     for name, value in zip(UNITS, drawn.reshape(-1, 3).tolist(), strict=True):
         x, y, z = value
-        terms[name] = (*terms.get(name, ()), DisturbanceTerm(constant=(x, y, z)))
+        scaled = [
+            _scaled(term, factors[name])
+            for term_name, term in terms_of(robot.disturbance)
+            if term_name == name
+        ]
+        terms[name] = (*scaled, DisturbanceTerm(constant=(x, y, z)))
     return replace(robot, disturbance=terms)
 
 
-def _with_sensor_errors(
+def _scaled(term: DisturbanceTerm, factors: Array) -> DisturbanceTerm:
+    """Return a disturbance whose amplitude (3,) is multiplied by factors (3,)."""
+    x, y, z = (np.array(term.amplitude) * factors).tolist()
+    return replace(term, amplitude=(x, y, z))
+
+
+def with_sensor_errors(
     policy: Policy, bias: Array, deviation: Array, seed: Array
 ) -> Policy:
     """Add a bias and white noise to the measurements (ny,) of a policy; return the new policy.

@@ -120,7 +120,9 @@ def monte_carlo(
           perpendicular to it.
         - ``tau_b.disturbance`` [N m] and ``F_b.disturbance`` [N]: constant torque and force on the
           base, or one of their components, such as ``tau_b.x.disturbance``. The drawn values add to
-          `Robot.disturbance`, in its default axes.
+          `Robot.disturbance`, in its default axes. ``tau_b.amplitude`` and ``F_b.amplitude``:
+          relative changes of the amplitudes of the periodic terms of `Robot.disturbance`, one for
+          each component, such as ``tau_b.x.amplitude``.
         - ``NAME.sensor``: constant offset in the measurement of a state that a `StateFeedback`
           reads, or of an output that an `OutputFeedback`, `LinearController` or
           `TrajectoryOutputFeedback` measures. ``NAME.noise``: white noise added to this measurement

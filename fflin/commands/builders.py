@@ -389,17 +389,23 @@ def gain_of(
     """Return the regulator of a model.
 
     The options --weights, --q, --r and --bryson define the weights, and --integral the integrated
-    signals. With --sample, the model is first discretised. If `allocated` is true, the error for an
-    unknown name mentions --no-allocate.
+    signals. With --sample or --delay, the model is first discretised. If `allocated` is true, the
+    error for an unknown name mentions --no-allocate.
     """
-    if arguments.sample is not None:
-        lin = lin.discretize(arguments.sample)
+    # "none" switches off the integral action of the robot file.
+    integral = [] if arguments.integral == ["none"] else arguments.integral or None
+    delay = getattr(arguments, "delay", None) or 0.0
+    sample = arguments.sample
+    if sample is None and delay:
+        sample = delay
+    if sample is not None:
+        lin = lin.discretize(sample, delay=delay)
     try:
         return fflin.lqr(
             lin,
             weights=weights_of(arguments),
             wheel_speeds=arguments.wheel_speeds,
-            integral_action=arguments.integral or None,
+            integral_action=integral,
         )
     except UnknownNameError as error:
         message = str(error)
@@ -464,6 +470,66 @@ def loop_of(
     return policy, settings | {"q0": q, "v0": v, "linear": lin}
 
 
+def with_errors(
+    policy: fflin.Policy | None, arguments: Namespace
+) -> fflin.Policy | None:
+    """Return a policy whose measurements have the errors of --noise and --bias."""
+    import numpy as np
+
+    from fflin.base.names import by_name
+    from fflin.campaign.dispersions import with_sensor_errors
+    from fflin.control.data_sheet import output_keys
+
+    given = {
+        name: once(f"--{name}", getattr(arguments, name)) for name in ("noise", "bias")
+    }
+    if not any(given.values()):
+        return policy
+    if policy is None or not policy.sensors:
+        raise InputError(
+            "--noise and --bias need a regulator that measures states or outputs about a point"
+        )
+    if given["noise"] and not policy.sample_time:
+        raise InputError("--noise is the noise of a sample; add --sample H")
+    sizes = {}
+    for name, values in given.items():
+        keys = output_keys(values, policy.sensors)
+        by_key = {keys[key]: value for key, value in values.items()}
+        sizes[name] = np.zeros(len(policy.sensors))
+        for index, value in by_name("measured signal", by_key, policy.sensors).items():
+            sizes[name][index] = value
+    seed = np.zeros(1)
+    return with_sensor_errors(policy.fresh(), sizes["bias"], sizes["noise"], seed)
+
+
+def budget_of(
+    robot: fflin.Robot,
+    policy: fflin.Policy | None,
+    motion: fflin.Motion,
+    arguments: Namespace,
+) -> fflin.ErrorBudget:
+    """Return the error budget of a simulated loop."""
+    if policy is None or policy.model is None or policy.linear_law() is None:
+        raise InputError(
+            "--budget needs a linear regulator about a point; remove --budget, or the options for "
+            "MPC, trajectories or --free"
+        )
+    model, delay = policy.model, arguments.delay
+    if delay is not None:
+        # The given delay replaces the delay of the design.
+        model = model.generator or model
+    return fflin.error_budget(
+        policy,
+        model,
+        noise=once("--noise", arguments.noise),
+        bias=once("--bias", arguments.bias),
+        delay=delay,
+        robot=robot,
+        motion=motion,
+        limit_cycle=True,
+    )
+
+
 def start_of(
     robot: fflin.Robot, arguments: Namespace, reference: pin.SE3 | None = None
 ) -> tuple[Array, Array | None]:
@@ -499,6 +565,8 @@ def about_point(
     thrusters. In these cases, `simulate` predicts the motion with the policy's own model if it can,
     and otherwise makes no prediction.
     """
+    from fflin.control.gain import sampled_for
+
     gain: fflin.Gain | None = None
     feedback: fflin.StateFeedback | fflin.LinearController
     if arguments.mpc:
@@ -539,8 +607,7 @@ def about_point(
         feedback = fflin.LinearController(arguments.controller, lin, sign=sign)
     else:
         gain = gain or gain_of(lin, arguments, allocated=design is not robot)
-        model = lin.discretize(gain.dt) if gain.dt else lin
-        feedback = _state_feedback(model, gain)
+        feedback = _state_feedback(sampled_for(gain, lin), gain)
     if design is not robot:
         return fflin.Allocation(feedback, design), feedback, None
     if arguments.reduce or arguments.controller:

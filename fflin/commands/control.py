@@ -18,6 +18,7 @@ from fflin.commands import DONE, FELL_SHORT
 from fflin.commands.builders import (
     Report,
     along,
+    budget_of,
     check_pictures,
     designed,
     limits_of_options,
@@ -32,6 +33,7 @@ from fflin.commands.builders import (
     robot_of_design,
     state_of,
     weights_of,
+    with_errors,
 )
 
 if TYPE_CHECKING:
@@ -176,8 +178,11 @@ def simulate(arguments: Namespace) -> Report:
         lin = fflin.linearize(robot)
         chosen("state or input", show, (*lin.state_names, *input_keys(lin)))
     policy, settings = loop_of(robot, arguments)
+    measuring = with_errors(policy, arguments)
+    if measuring is not policy:
+        settings.pop("linear", None)  # the linear model has no sensor errors
     motion = fflin.simulate(
-        robot, policy, every=arguments.every, engine=arguments.engine, **settings
+        robot, measuring, every=arguments.every, engine=arguments.engine, **settings
     )
     files: dict[Path | None, Callable[[Path], object] | None] = {
         arguments.output_file: motion.save,
@@ -197,6 +202,10 @@ def simulate(arguments: Namespace) -> Report:
         pointing = motion.pointing(window, accuracy=arguments.accuracy)
         record["pointing"] = pointing
         text += f"\n\n{pointing}"
+    if arguments.budget and not motion.stopped:
+        budget = budget_of(robot, policy, motion, arguments)
+        record["budget"] = budget
+        text += f"\n\n{budget}"
     return Report(robot.name, record, text, files, code, interrupted)
 
 
@@ -207,8 +216,7 @@ def _margins_of(policy: object, settings: Mapping[str, Any]) -> tuple[object, st
 
     if not isinstance(policy, Policy) or policy.linear_law() is None:
         return None, ""
-    delay = settings.get("delay") or 0.0
-    margins = margins_at_once(policy, delay, settings.get("sample"))
+    margins = margins_at_once(policy, settings.get("delay"), settings.get("sample"))
     if margins is None:
         return None, "margins of the linear loop: see fflin.margins(policy, lin)"
     if not margins.disk:

@@ -399,7 +399,7 @@ def equilibrium(arguments: Namespace) -> Report:
     from fflin.base.record import write_record
     from fflin.dynamics.points import LIMIT_SLACK
     from fflin.linear.holding import wheel_notes
-    from fflin.robot.disturbance import terms_of
+    from fflin.robot.disturbance import plates_of, terms_of
     from fflin.robot.fields import limits_of
 
     refuse(
@@ -437,7 +437,8 @@ def equilibrium(arguments: Namespace) -> Report:
         *(folded([note]) for note in wheel_notes(lin)),
     ]
     disturbed: fflin.Equilibrium | None = None
-    if any(any(term.constant) for _, term in terms_of(robot.disturbance)):
+    constant = any(any(term.constant) for _, term in terms_of(robot.disturbance))
+    if constant or plates_of(robot.disturbance):
         title = "u against the constant disturbance too"
         try:
             disturbed = fflin.equilibrium(

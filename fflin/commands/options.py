@@ -78,7 +78,7 @@ OPTIONS: dict[str, dict[str, str]] = {
     },
     "lqr": {
         **_AT_POINT,
-        CONTROLLER: f"{_WEIGHTS} integral dt allocate",
+        CONTROLLER: f"{_WEIGHTS} integral delay dt allocate",
         OUTPUT: "output-file plot",
     },
     "tvlqr": {**_ALONG, CONTROLLER: f"{_WEIGHTS} dt qf", OUTPUT: "output-file"},
@@ -93,7 +93,7 @@ OPTIONS: dict[str, dict[str, str]] = {
     "simulate": {
         **_LOOP,
         SIMULATION: f"{_LOOP[SIMULATION]} every engine",
-        "pointing errors": "pointing accuracy",
+        "pointing errors": "pointing accuracy budget noise bias",
         OUTPUT: f"plot show output-file html {_PICTURES}",
     },
     "export": {"": "FILE", OUTPUT: "output-folder robot limits name real"},
@@ -227,7 +227,8 @@ ABOUT: dict[str, str] = {
     "are comparable",
     "integral": "also integrate a state or an output, so that a constant disturbance leaves no "
     "error in it. NAME is a state, an output or a group, such as q_b. The integrals are slower "
-    "than the loop; the report states their rate",
+    "than the loop; the report states their rate. `none` switches off the integrals that the robot "
+    "file sets",
     "sample": "sample time of the controller [s], with zero-order hold of the inputs. The sampled "
     "gain minimises the continuous-time cost",
     "reduce": "for robots with conserved momentum: regulate only the controllable states",
@@ -258,7 +259,8 @@ ABOUT: dict[str, str] = {
     "horizon": "number of samples in the horizon of --mpc",
     "free": "simulate the robot without a regulator and without inputs",
     "delay": "delay [s] between a sample and the application of the command that is computed from "
-    "this sample; the regulator is designed without it",
+    "this sample. The regulator is designed for this delay. Without --sample, its sample time is "
+    "then equal to the delay. A law from a file, MPC, and a law along a trajectory do not change",
     "offset": "initial error with respect to the start of the trajectory, in base axes. NAME is a "
     "state, a group or a pattern, such as r_b.x, q_m or omega_b.z (SI units), or it is roll, pitch "
     "or yaw [deg]",
@@ -329,6 +331,13 @@ ABOUT: dict[str, str] = {
     "file that contains a result of the same kind",
     "pointing": "report pointing errors as in ECSS-E-ST-60-10C, for windows of this length [s]",
     "accuracy": "angle [deg] for the settling time of --pointing",
+    "budget": "report the error of each cause in the linear loop, see fflin.error_budget: the "
+    "disturbance of the robot, --noise and --bias. The part of the simulated errors that they do "
+    "not explain, such as the limit cycle of thrusters, is a further cause",
+    "noise": "standard deviation of the noise in each sample of a measured signal, as a standard "
+    "normal variable. NAME is a state, or an output for --controller, a group or a quantity such "
+    "as gyroscope",
+    "bias": "constant error of a measured signal, named as in --noise",
     "json": "print the results as one JSON object",
     # Options of one command.
     "init output-file": "save the robot file (by default the URDF's name with .toml, in the "
@@ -361,6 +370,8 @@ ABOUT: dict[str, str] = {
     "funnel knots": "number of knots to test",
     "funnel threads": "number of threads; by default one per core",
     "lqr dt": "former name of --sample",
+    "lqr delay": "design the regulator for commands that act T s after their sample. Without "
+    "--sample, the sample time is T",
     "lqr output-file": "save the gain to FILE",
     "lqr plot": "plot the poles, the loop gain of each input and the stability margins to FILE",
     "tvlqr dt": "former name of --sample",

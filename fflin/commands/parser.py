@@ -235,6 +235,7 @@ FORMS: dict[str, Form] = {
         ("joint", "velocity", "target-joint", "target-velocity", "offset"), _PAIRS
     ),
     **dict.fromkeys(("effort", "limit", "bryson", "qf", "goal", "within"), _PAIRS),
+    **dict.fromkeys(("noise", "bias"), _PAIRS),
     "q": _WEIGHTS,
     "r": _WEIGHTS,
     "stiffness": _OF_JOINT,
@@ -262,7 +263,7 @@ FORMS: dict[str, Form] = {
     "duration": one(number, "T"),
     "pointing": one(number, "WINDOW"),
     "accuracy": one(number, "X"),
-    "delay": one(number, "T", 0.0),
+    "delay": one(number, "T"),
     "times": one(number, "T", nargs="+"),
     "attitude": one(number, "X", 90.0),
     "spread": one(number, "X", 1.0),

@@ -47,6 +47,8 @@ class Compensator(ModelDesign):
         Signals of the compensator. The inputs of the compensator are the outputs of the model.
     robot, urdf_sha256 : str
         Name of the robot, and SHA-256 of its URDF.
+    slow_bias : str
+        Note on an estimated bias that settles more than ten times slower than the loop, or empty.
 
     Examples
     --------
@@ -65,6 +67,7 @@ class Compensator(ModelDesign):
     output_names: tuple[str, ...]
     # Files of earlier versions do not contain E.
     E: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    slow_bias: str = ""
 
     @property
     def disturbances(self) -> tuple[str, ...]:
@@ -81,7 +84,7 @@ class Compensator(ModelDesign):
         poles = table_of_poles(self, "the closed loop")
         title = folded([summary_of_poles(self), self._head()])
         parts = [title, poles]
-        if notes := added_notes(self.state_names):
+        if notes := self._notes():
             parts.append(folded(notes))
         return "\n\n".join(parts)
 
@@ -91,8 +94,15 @@ class Compensator(ModelDesign):
             html.paragraph(self._head()),
             poles_figure(self, "the closed loop"),
             folded_poles(self, "the closed loop"),
-            *(html.paragraph(note) for note in added_notes(self.state_names)),
+            *(html.paragraph(note) for note in self._notes()),
         ]
+
+    def _notes(self) -> list[str]:
+        """Return notes on estimated disturbances and biases."""
+        notes = list(added_notes(self.state_names))
+        if self.slow_bias:
+            notes.append(self.slow_bias)
+        return notes
 
     def _head(self) -> str:
         nu, nz = self.C.shape

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
@@ -109,6 +109,8 @@ class Gain(ModelDesign):
         P, Q and N are zero for states that are not fed back.
     placement : ndarray (7,)
         Pose of the model's reference: position [m] and quaternion x, y, z, w.
+    delay : ndarray (nu,)
+        Delay of the inputs [s] in the model, see `LinearModel.discretize`; zero without a delay.
     integrals : tuple of str (k,)
         Names of the integrals, which are the last entries of `state_names`; empty without integral
         action. All matrices then belong to the model with the integrals as further states, as in
@@ -147,12 +149,21 @@ class Gain(ModelDesign):
     weights: str
     regulated: tuple[str, ...]
     placement: Vector
+    # Files of earlier versions contain no delay.
+    delay: Vector = field(default_factory=partial(np.zeros, 0))
     integrals: tuple[str, ...] = ()
     # The model for which the gain was designed; saved files do not contain it.
     _lin: LinearModel | None = field(default=None, repr=False, compare=False)
 
     def __post_init__(self) -> None:
+        if not self.delay.size:
+            object.__setattr__(self, "delay", np.zeros(len(self.input_names)))
         super().__post_init__()
+        if len(self.delay) != len(self.input_names) or self.delay.min() < 0.0:
+            raise InputError(
+                f"delay is {self.delay.tolist()}, expected a delay of at least 0 s for each of the "
+                f"{len(self.input_names)} inputs"
+            )
         states = self.regulated or self.state_names
         require_known("state", states, self.state_names)
         if self.state_names[self._size :] != self.integrals:
@@ -215,6 +226,8 @@ class Gain(ModelDesign):
                 f"u = u0 - K [x - x0; xi], {self._size} states, "
                 f"{len(self.integrals)} integrals xi"
             )
+        if self.delay.any():
+            time += f", delay {_range(self.delay)} s"
         head = f"{self.robot}: {law}, {nu} inputs"
         return f"{head}, frame {self.frame}, {time}"
 
@@ -458,18 +471,36 @@ def model_of(gain: Gain, robot: Robot, made: str, reference: pin.SE3) -> LinearM
     """
     from fflin.linear.linearization import linearize
 
-    if without_past(gain.model_states) != gain.model_states:
+    states = without_past(gain.model_states)
+    if states != gain.model_states and not gain.delay.any():
         raise InputError(
-            f"{made} with delayed inputs, whose delay the gain does not contain; linearise the "
-            "robot in Python, and use fflin.StateFeedback(lin.discretize(dt, delay=...), gain)"
+            f"{made} with delayed inputs by an earlier version, and its file does not contain the "
+            "delay; design it again, or linearise the robot in Python and use "
+            "fflin.StateFeedback(lin.discretize(dt, delay=...), gain)"
         )
     frame = frame_of(robot, gain.frame)
     state = StateMap(robot, reference=reference, frame=frame)
-    count = len(gain.model_states)
-    require_same(made, state, "state", gain.model_states, gain.state_units[:count])
+    count = len(states)
+    require_same(made, state, "state", states, gain.state_units[:count])
     require_same(made, state, "input", gain.input_names, gain.input_units)
     q, v = state.to_pinocchio(gain.x0[:count])
     return linearize(robot, q, v, gain.u0, frame=frame, reference=reference)
+
+
+def sampled_for(gain: Gain, lin: LinearModel) -> LinearModel:
+    """Return a continuous model, sampled with the sample time and the delays of a gain."""
+    if not gain.dt:
+        return lin
+    delays = dict(zip(input_keys(lin), gain.delay.tolist(), strict=True))
+    return lin.discretize(gain.dt, delay=delays)
+
+
+def _range(delays: Array) -> str:
+    """Return the least and the largest delay, or one number if both are equal."""
+    least, largest = float(delays.min()), float(delays.max())
+    if least == largest:
+        return f"{largest:g}"
+    return f"{least:g} to {largest:g}"
 
 
 def make_gain(

@@ -15,6 +15,7 @@ import numpy as np
 from fflin.base.errors import InputError, StabilizabilityError
 from fflin.base.names import by_name, matching
 from fflin.base.validation import Array, ArrayLike, dimension, numbers, shaped
+from fflin.control.data_sheet import output_keys
 from fflin.control.gain import StaticLoop, static_loop
 from fflin.control.optimal.riccati import Riccati, Solution, best_solution
 from fflin.linear.model import LinearModel
@@ -53,6 +54,11 @@ class IntegralAction:
         return tuple(f"{unit} s".strip() for unit in self.units)
 
 
+def is_off(given: object) -> bool:
+    """Return whether no signals are given, which switches integral action off."""
+    return isinstance(given, Sequence | Mapping) and not given
+
+
 def integral_action(lin: LinearModel, given: Integrated) -> IntegralAction:
     """Return the integrated signals of a model, or raise an error if they are unknown.
 
@@ -80,11 +86,10 @@ def _of_names(
     """Return the integrals of named states or outputs."""
     known = dict.fromkeys((*lin.state_names, *lin.output_names))
     names = list(known)
-    if not keys:
-        raise InputError(
-            "integral_action is empty, expected names of states or outputs"
-        )
-    chosen = [i for key in keys for i in matching("state or output", key, names)]
+    key_of = output_keys(keys, names)
+    chosen = [
+        i for key in keys for i in matching("state or output", key_of[key], names)
+    ]
     indices = list(dict.fromkeys(chosen))
     H, units = [], []
     for index in indices:
@@ -104,7 +109,8 @@ def _of_names(
         units.append(lin.output_units[at])
     values = None
     if weights is not None:
-        by_index = by_name("state or output", weights, names)
+        weight_of = {key_of[key]: weight for key, weight in weights.items()}
+        by_index = by_name("state or output", weight_of, names)
         values = np.array([by_index[i] for i in indices])
         if not (values > 0.0).all():
             name = names[indices[int(values.argmin())]]

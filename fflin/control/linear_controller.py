@@ -283,6 +283,14 @@ class OutputFeedback(LinearController):
                 "estimator for it"
             )
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Notes as of a `LinearController`, and on an estimated bias that settles slowly."""
+        notes = super().notes
+        if self.compensator.slow_bias:
+            notes = (*notes, self.compensator.slow_bias)
+        return notes
+
 
 def _remembers_commands(given: Any) -> bool:
     """Return whether the states of a controller, or of one in a file, contain earlier commands."""

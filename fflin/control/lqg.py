@@ -12,10 +12,15 @@ from fflin.base.names import chosen, group_of, without_past
 from fflin.base.validation import Array, instance
 from fflin.control.compensator import Compensator
 from fflin.control.estimator import DISTURBANCE, Estimator
-from fflin.control.gain import Gain
+from fflin.control.gain import Gain, neutral_poles
 from fflin.control.multirate import MultirateCompensator, MultirateEstimator
+from fflin.control.optimal.riccati import rates_of
 from fflin.control.rejection import rejection
 from fflin.dynamics.state import selection
+
+# A mode belongs to biases if they have more than this fraction of its participation. A note appears
+# if such a mode is slower than the loop by more than the factor _SLOW.
+_MOST, _SLOW = 0.5, 10.0
 
 
 def lqg(
@@ -120,6 +125,7 @@ def lqg(
         state_names=(*names, *gain.integrals),
         input_names=e.output_names,
         output_names=e.input_names,
+        slow_bias=_slow_bias(gain, e),
         verified=gain.verified and e.verified,
     )
 
@@ -162,6 +168,35 @@ def _multirate(
         input_names=e.output_names,
         output_names=e.input_names,
         verified=gain.verified and e.verified,
+    )
+
+
+def _slow_bias(gain: Gain, e: Estimator) -> str:
+    """Return a note on the estimated bias that settles slowest, or an empty text if it is fast."""
+    if not e.biases:
+        return ""
+    names = e.estimated or e.state_names
+    S = selection(names, e.state_names)
+    poles, modes = np.linalg.eig(S @ (e.A - e.L @ e.C) @ S.T)
+    # Participation of each state in each mode: products of right and left eigenvectors.
+    participation = np.abs(modes * np.linalg.pinv(modes).T)
+    participation /= participation.sum(axis=0)
+    biases = [names.index(name) for name in e.biases if name in names]
+    of_bias = participation[biases].sum(axis=0) > _MOST
+    decays = -rates_of(poles, e.dt).real
+    loop_rates = rates_of(gain.poles, gain.dt)
+    loop_decays = -loop_rates.real[~neutral_poles(loop_rates, gain.dt)]
+    if not of_bias.any() or not loop_decays.size:
+        return ""
+    slowest = int(np.where(of_bias, decays, np.inf).argmin())
+    decay, loop = float(decays[slowest]), float(loop_decays.min())
+    if not 0.0 < _SLOW * decay < loop:
+        return ""
+    name = names[biases[int(participation[biases, slowest].argmax())]]
+    return (
+        f"the estimate of {name} settles with a time constant of {1.0 / decay:.3g} s, "
+        f"{loop / decay:.3g} times slower than the loop: after a large error, part of the pointing "
+        "error remains for several time constants; a larger bias_noise shortens this time"
     )
 
 

@@ -120,7 +120,8 @@ def lqr(
         whose product with x - x0 is integrated. By default, the integrals are about three times
         slower than the loop; ``gain.weights`` states their rates. The weights of a mapping are for
         the integral over time of each signal. If no Q and R are given, the entry ``integral`` of
-        `weights`, or of the robot's `weights`, is the default. `Gain` describes the result, and
+        `weights`, or of the robot's `weights`, is the default; an empty list switches integral
+        action off. `Gain` describes the result, and
         ``StateFeedback(lin, gain)`` flies it.
     wheel_speeds : bool, optional
         Whether to regulate the wheel speeds to their values at the operating point. By default,
@@ -176,6 +177,8 @@ def lqr(
     """
     if integral_action is None and Q is None and R is None and N is None:
         integral_action = integrated(lin, weights)
+    if integral.is_off(integral_action):
+        integral_action = None
     gain = regulator(
         lin,
         Q,

@@ -289,19 +289,19 @@ def delayed_model(
         if delay < 0.0:
             raise InputError(f"delay is {delay:g} s, expected at least 0")
         return lin, delay
-    known = policy._lin if isinstance(policy, Gain) else as_policy(policy).model
-    if lin.added:
+    known = policy if isinstance(policy, Gain) else as_policy(policy).model
+    if lin.added or known is None:
         return lin, 0.0
-    if known is None:
-        if isinstance(policy, Gain) and is_delayed(policy.state_names):
-            raise InputError(
-                "the gain was designed for delayed inputs, but lin has no delay; give the model "
-                "of the gain, lin.discretize(dt, delay=...), or give delay="
-            )
-        return lin, 0.0
+    if not known.delay.any() and is_delayed(known.state_names):
+        raise InputError(
+            "the gain was designed for delayed inputs, but lin has no delay; give the model "
+            "of the gain, lin.discretize(dt, delay=...), or give delay="
+        )
+    model = policy._lin if isinstance(policy, Gain) else known
+    has_lags = model is not None and bool(model.lag.any() or model.output_lag.any())
     source = lin.generator if lin.dt else lin
     if (
-        not known.added
+        not (known.delay.any() or has_lags)
         or known.input_names != lin.input_names
         or (lin.dt and not math.isclose(lin.dt, known.dt))
     ):
@@ -311,8 +311,8 @@ def delayed_model(
             "the law was designed for delayed inputs, but lin is sampled without a delay and its "
             "continuous model is unknown; give the continuous model, or delay=0"
         )
-    if known.lag.any() or known.output_lag.any():
-        source = source.with_lags(*lags_by_name(known))
+    if model is not None and has_lags:
+        source = source.with_lags(*lags_by_name(model))
     if not known.dt:
         return source, 0.0
     delays = dict(zip(input_keys(lin), known.delay.tolist(), strict=True))
@@ -332,6 +332,11 @@ def margins_at_once(
     lin = policy.model
     if lin is None or policy.followed_trajectory is not None:
         return None
+    if delay is not None and lin.delay.any():
+        # The given delay replaces the delay of the model.
+        lin = lin.generator
+        if lin is None:
+            return None
     try:
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             closed = closed_loop(policy, lin, delay, sample)

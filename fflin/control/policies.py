@@ -14,7 +14,7 @@ from fflin.base import html
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, frozen, instance, shaped
 from fflin.control.channel import Law
-from fflin.control.delayed import law_with_memory
+from fflin.control.delayed import is_delayed, law_with_memory
 from fflin.control.gain import Gain
 from fflin.control.loops import (
     NOT_CORRECTED,
@@ -477,6 +477,7 @@ def _require_designed_for(gain: Gain, lin: LinearModel) -> None:
         "states": gain.model_states == lin.state_names,
         "inputs": gain.input_names == lin.input_names,
         "sampling time": bool(np.isclose(gain.dt, lin.dt)),
+        "delay": _is_same_delay(gain, lin),
         "frame": gain.frame == lin.frame,
         "point": len(gain.model_states) == len(lin.x0)
         and bool(np.allclose(gain.x0[: len(lin.x0)], lin.x0, atol=1e-9)),
@@ -488,6 +489,17 @@ def _require_designed_for(gain: Gain, lin: LinearModel) -> None:
             f"the gain was designed for a model of '{gain.robot}' with another {different[0]} than "
             "the given model; give the model of the gain, or its matrix gain.K"
         )
+
+
+def _is_same_delay(gain: Gain, lin: LinearModel) -> bool:
+    """Return whether a gain and a model have the same delays.
+
+    Gains from files of earlier versions contain no delay, so that theirs may be any.
+    """
+    if not gain.delay.any() and is_delayed(gain.state_names):
+        return True
+    same: bool = gain.delay.shape == lin.delay.shape
+    return same and bool(np.allclose(gain.delay, lin.delay, atol=1e-9))
 
 
 @dataclass(eq=False)

@@ -13,7 +13,7 @@ from fflin.base.errors import FflinError, InputError
 from fflin.base.rotation import conjugate, quaternion_product
 from fflin.base.validation import Array, Indices, instance
 from fflin.control.compensator import Compensator
-from fflin.control.gain import Gain, model_of
+from fflin.control.gain import Gain, model_of, sampled_for
 from fflin.control.loops import NOT_CORRECTED, Sample
 from fflin.control.multirate_feedback import MultirateFeedback
 from fflin.control.policies import LinearLaw, StateFeedback
@@ -169,8 +169,8 @@ def _law_of(given: Design, robot: Robot) -> Law:
         law: Gain | Array = gain.K
         if gain.integrals:
             law = gain
-            if gain.dt and not model.dt:
-                model = model.discretize(gain.dt)
+        if (gain.integrals or gain.delay.any()) and not model.dt:
+            model = sampled_for(gain, model)
         policy = StateFeedback(model, law)
     form = policy.form(robot)
     if isinstance(form, StateForm) and policy.model:

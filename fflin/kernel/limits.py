@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 from fflin.kernel.compiled import numba_is_there, without_numba
 from fflin.kernel.tree import batch_tree
+from fflin.robot.disturbance import PLATE
 from fflin.robot.joints import ROOT
 from fflin.robot.orbit import is_elliptic
 from fflin.robot.robot import Robot
@@ -92,6 +93,10 @@ def _has_constraints_in_orbit(robot: Robot) -> bool:
     return bool(robot.constraints) and robot.orbit is not None
 
 
+def _has_plates(robot: Robot) -> bool:
+    return PLATE in robot.disturbance
+
+
 LIMITS = (
     Limit(lambda task: not numba_is_there() and without_numba(), "{}"),
     Limit(lambda task: task.outputs, "the outputs are not the state"),
@@ -121,6 +126,10 @@ LIMITS = (
     Limit(
         lambda task: task.first(_has_constraints_in_orbit),
         "the constraints of '{}' are simulated in orbit in Python",
+    ),
+    Limit(
+        lambda task: task.simulated and task.first(_has_plates),
+        "the flat plates of '{}' are computed in Python",
     ),
     Limit(
         lambda task: task.own_sample_time,

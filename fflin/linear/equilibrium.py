@@ -174,7 +174,8 @@ def equilibrium(
         Whether the base may be tilted under gravity, by less than 90 deg. A base that moves is
         never tilted.
     disturbed : bool
-        Whether the inputs also balance the constant part of `Robot.disturbance`. Such inputs show
+        Whether the inputs also balance the constant part of `Robot.disturbance`, and its flat
+            plates at t = 0. Such inputs show
         what the actuators must hold. By default, the inputs are the inputs of a control law, which
         does not know the disturbance; a linear model does not contain it either. Inertial axes are
         those at t = 0.
@@ -220,7 +221,7 @@ def equilibrium(
     tilt = truth("tilt", tilt)
     pushed = BaseDisturbance(robot, state.field, constant=True)
     if not truth("disturbed", disturbed):
-        pushed.waves.clear()
+        pushed.clear()
     given = robot.neutral() if q is None else robot.checked_configuration(q)
     # put the reference at the base, so that forces and inputs are in base axes
     if robot.orbit:

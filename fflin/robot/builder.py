@@ -20,7 +20,7 @@ import pinocchio as pin
 
 from fflin.base.errors import InputError, require_known
 from fflin.base.names import stands_for_any
-from fflin.robot.disturbance import ORBITAL, terms_of
+from fflin.robot.disturbance import ORBITAL, plates_of, terms_of
 from fflin.robot.equipment.appendages import Appendage, FlexibleAppendage, rigid_inertia
 from fflin.robot.equipment.assembly import (
     Mounted,
@@ -120,6 +120,12 @@ def _require_consistent(robot: RobotData) -> None:
             raise InputError(
                 f"disturbance '{name}' is in orbital axes, but '{robot.name}' is not in orbit; "
                 "give base or inertial axes, or give the robot an orbit"
+            )
+    for plate in plates_of(robot.disturbance):
+        if plate.density and not any(plate.velocity) and not robot.orbit:
+            raise InputError(
+                f"disturbance 'plate' has a density, but '{robot.name}' is not in orbit; give "
+                "velocity, in inertial axes, or give the robot an orbit"
             )
     for name in robot.used_frames:
         find_frame(robot.model, name)

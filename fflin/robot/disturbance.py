@@ -9,6 +9,7 @@ from typing import TypeAlias
 
 from fflin.base.errors import InputError, require_known
 from fflin.base.validation import ONE_ROTATION, number, positive
+from fflin.robot.flat_plate import FlatPlate, checked_plate
 from fflin.robot.inputs import BaseForce, BaseTorque, three_numbers
 
 Vector3: TypeAlias = tuple[float, float, float]
@@ -72,14 +73,21 @@ class DisturbanceTerm:
         return f"{' + '.join(parts) or '0'} {UNITS[name]} ({axes} axes)"
 
 
-# Terms {name: terms} of the torque tau_b and the force F_b; their sum acts on the base.
-DisturbanceTerms: TypeAlias = Mapping[str, tuple[DisturbanceTerm, ...]]
+# Name of the flat plates in the field `disturbance`.
+PLATE = "plate"
+
+Disturbing: TypeAlias = DisturbanceTerm | FlatPlate
+
+# Terms {name: terms} of the torque tau_b and the force F_b, and flat plates; their sum acts on the
+# base.
+DisturbanceTerms: TypeAlias = Mapping[str, tuple[Disturbing, ...]]
 
 
-def checked_disturbance(given: object) -> dict[str, tuple[DisturbanceTerm, ...]]:
+def checked_disturbance(given: object) -> dict[str, tuple[Disturbing, ...]]:
     """Return the field `disturbance` of a robot as {name: terms}; None or {} removes it.
 
-    The value of a name is three numbers, a table of `DisturbanceTerm`, or a list of these.
+    The value of a torque or force is three numbers, a table of `DisturbanceTerm`, or a list of
+    these. The value of "plate" is a table of `FlatPlate`, or a list of these.
     """
     if given is None:
         return {}
@@ -87,10 +95,16 @@ def checked_disturbance(given: object) -> dict[str, tuple[DisturbanceTerm, ...]]
         raise InputError(
             f"disturbance is {given!r}, expected a table such as {{'tau_b': [2e-5, 0, 0]}}"
         )
-    require_known("disturbance", given, UNITS)
-    terms = {}
+    require_known("disturbance", given, (*UNITS, PLATE))
+    terms: dict[str, tuple[Disturbing, ...]] = {}
     for name, value in given.items():
         items: Sequence[object] = [value]
+        if name == PLATE:
+            if isinstance(value, list | tuple):
+                items = value
+            label = f"disturbance '{name}'"
+            terms[name] = tuple(checked_plate(label, item) for item in items)
+            continue
         if isinstance(value, list | tuple) and any(map(_is_term, value)):
             items = value
         terms[name] = tuple(_term(f"disturbance '{name}'", item) for item in items)
@@ -143,5 +157,11 @@ def _term(label: str, value: object) -> DisturbanceTerm:
 
 
 def terms_of(given: DisturbanceTerms) -> list[tuple[str, DisturbanceTerm]]:
-    """Return all terms, each as a pair (name, term)."""
-    return [(name, term) for name, terms in given.items() for term in terms]
+    """Return all terms of torques and forces, each as a pair (name, term)."""
+    pairs = [(name, term) for name, terms in given.items() for term in terms]
+    return [(name, term) for name, term in pairs if isinstance(term, DisturbanceTerm)]
+
+
+def plates_of(given: DisturbanceTerms) -> list[FlatPlate]:
+    """Return the flat plates of a disturbance."""
+    return [plate for plate in given.get(PLATE, ()) if isinstance(plate, FlatPlate)]

@@ -166,7 +166,19 @@ class Robot(RobotData):
               base axes, and the force in inertial axes, or in orbital axes in orbit. In orbit,
               inertial axes are parallel to the orbital axes at t = 0.
 
-            A list of such mappings is their sum. None removes all disturbances.
+            A list of such mappings is their sum. The key ``plate`` is a mapping, or a list of
+            mappings, of flat plates on which drag and solar pressure act, see (11.7) and (11.8):
+
+            - ``area`` [m^2], ``normal`` (3,) and ``position`` (3,) [m] of the centre of pressure,
+              in base axes; ``two_sided``: whether both faces are exposed, False by default;
+            - for drag: ``density`` [kg/m^3], ``drag_coefficient`` (2.2 by default), and
+              ``velocity`` (3,) [m/s] relative to the atmosphere, in inertial axes. In orbit, by
+              default, it is the velocity of the orbit;
+            - for solar pressure: ``sun`` (3,), the direction to the sun in inertial axes, and the
+              reflected fractions ``specular`` and ``diffuse`` (0 by default). ``solar_pressure``
+              is 4.54e-6 N/m^2 by default.
+
+            None removes all disturbances.
         passive : sequence of str
             Names of joints without a motor. Their torques are removed from the inputs.
         wheel_joints : sequence of str

@@ -13,30 +13,37 @@ from fflin.base import html
 from fflin.base.errors import InputError
 from fflin.base.names import by_name, input_keys
 from fflin.base.process import in_one_thread
+from fflin.base.rotation import rotation_matrix
 from fflin.base.tables import folded, grid
 from fflin.base.validation import (
     Array,
     FrozenArrays,
     Mask,
+    Values,
     dimension,
     instance,
     number,
     positive,
+    truth,
     vector,
 )
 from fflin.control.data_sheet import output_keys
 from fflin.control.gain import Gain
 from fflin.control.margins import ClosedLoop, delayed_model, law_in_loop
 from fflin.control.policy import Policy, System
+from fflin.dynamics.disturbance import phasors_of
+from fflin.dynamics.state import StateMap
 from fflin.dynamics.state_rows import attitude_rotations
 from fflin.linear.model import LinearModel
+from fflin.robot.disturbance import BASE
 from fflin.robot.inputs import BaseForce, BaseTorque, Input
+from fflin.robot.joints import ROOT
 from fflin.simulation.motion import Motion
 
 if TYPE_CHECKING:
     from fflin.robot.robot import Robot
 
-Kind = Literal["noise", "constant", "periodic"]
+Kind = Literal["noise", "constant", "periodic", "simulated"]
 
 # States of the attitude, and the name of its errors in the budget.
 _ATTITUDE = ("q_b.x", "q_b.y", "q_b.z")
@@ -52,6 +59,9 @@ _ARCSEC = 3600.0
 # Errors of at most this size are rounding errors, and shown as a dot.
 _ZERO = 1e-12
 
+# Name of the part of the simulated errors that the other causes do not explain.
+_NOT_SUPERPOSED = "simulated minus superposed"
+
 # Fraction of a motion from which its errors are counted.
 _LATE = 0.5
 
@@ -63,10 +73,11 @@ class Contribution(NamedTuple):
     ----------
     cause : str
         Name of the cause, such as "noise of q_b" or "constant tau_b".
-    kind : {"noise", "constant", "periodic"}
+    kind : {"noise", "constant", "periodic", "simulated"}
     size : ndarray (n,)
         Standard deviation for noise, magnitude for a constant cause, amplitude for a periodic one;
-        for each of `ErrorBudget.names`.
+        for each of `ErrorBudget.names`. "simulated" is the standard deviation of a motion that the
+        other causes do not explain.
 
     Examples
     --------
@@ -170,6 +181,7 @@ class ErrorBudget(FrozenArrays, html.Reported):
             "noise": "standard deviation",
             "constant": "constant",
             "periodic": "amplitude",
+            "simulated": "standard deviation",
         }
         rows = [["cause", f"[{unit}]", "x", "y", "z"]]
         for part in self.contributions:
@@ -200,12 +212,14 @@ def error_budget(
     noise: Mapping[str, float] | None = None,
     bias: Mapping[str, float] | None = None,
     disturbance: Mapping[str, object] | None = None,
-    periodic: Mapping[str, tuple[float, float]] | None = None,
+    periodic: Mapping[str, tuple[object, float]] | None = None,
     force_noise: Mapping[str, float] | None = None,
     delay: float | None = None,
     sample: float | None = None,
     factor: float = 3.0,
     motion: Motion | None = None,
+    robot: Robot | None = None,
+    limit_cycle: bool = False,
 ) -> ErrorBudget:
     r"""Return the errors of the loop of a linear policy and a model, for each cause.
 
@@ -239,7 +253,8 @@ def error_budget(
     disturbance : mapping, optional
         Constant generalised forces {input, ``tau_b`` or ``F_b``: value} [N m or N].
     periodic : mapping, optional
-        Sinusoidal forces {name: (amplitude, frequency [Hz])}.
+        Sinusoidal forces {name: (amplitude, frequency [Hz])}. The amplitude of ``tau_b`` or ``F_b``
+        may also be a vector, whose components have the same phase.
     force_noise : mapping, optional
         White noise of forces {name: square root of the intensity [N m sqrt(s) or N sqrt(s)]}.
     delay : float, optional
@@ -251,6 +266,16 @@ def error_budget(
         Number of standard deviations in the total.
     motion : Motion, optional
         Simulated motion whose attitude errors are compared with the budget.
+    robot : Robot, optional
+        Robot whose field `disturbance` contains further causes, at the attitude of `lin`. In orbit,
+        constants in inertial axes are sinusoids with the rate of the orbit. Flat plates are left
+        out.
+    limit_cycle : bool
+        Whether the part of the errors of `motion` that the linear superposition does not explain is
+        a further cause, "simulated minus superposed". The motion must contain the same causes. Its
+        size is the square root of the difference of the variances, if this is positive. The part is
+        an estimate of the limit cycle of thruster pulses and deadbands, but it also contains all
+        other effects that the linear loop lacks, such as limits and the rest of the initial error.
 
     Returns
     -------
@@ -286,7 +311,10 @@ def error_budget(
         *_given("periodic", periodic),
         *_given("force_noise", force_noise),
     ]
+    phasors = _disturbances(robot, lin)
+    forces += [name for name, _ in phasors]
     loop = DisturbedLoop(law, lin, delay, sample, forces)
+    acting = [loop.phasor(*key, value) for key, value in phasors.items()]
     causes: list[Contribution] = []
     for key, values in _given("noise", noise).items():
         size = _size("noise", key, values)
@@ -300,19 +328,21 @@ def error_budget(
     for key, values in _given("force_noise", force_noise).items():
         size = _size("force_noise", key, values)
         causes.append(loop.force_noise(key, size))
+    causes += acting
+    if truth("limit_cycle", limit_cycle):
+        causes.append(_not_superposed(motion, loop.signals, causes))
     if not causes:
         raise InputError(
-            "no cause of errors is given; give noise, bias, disturbance, periodic or force_noise"
+            "no cause of errors is given; give noise, bias, disturbance, periodic, force_noise or "
+            "a robot with a disturbance"
         )
     variance = np.zeros(len(loop.signals))
     constant = np.zeros(len(loop.signals))
     for part in causes:
         if part.kind == "constant":
             constant = constant + part.size
-        elif part.kind == "noise":
-            variance = variance + part.size**2
         else:
-            variance = variance + 0.5 * part.size**2
+            variance = variance + _variance(part)
     deviation = np.sqrt(variance)
     mean, spread = _simulated(motion)
     return ErrorBudget(
@@ -349,15 +379,79 @@ def _size(argument: str, key: str, value: object) -> float:
     return size
 
 
-def _sinusoid(key: str, value: object) -> tuple[float, float]:
+def _sinusoid(key: str, value: object) -> tuple[object, float]:
     """Return the amplitude and the frequency [rad/s] of a sinusoidal force."""
-    expected = "an amplitude and a frequency [Hz]"
-    amplitude, frequency = vector(f"periodic '{key}'", value, 2, expected)
+    label = f"periodic '{key}'"
+    if not isinstance(value, Sequence) or len(value) != 2:
+        raise InputError(
+            f"{label} is {value!r}, expected an amplitude and a frequency [Hz]"
+        )
+    amplitude, frequency = value
+    frequency = number(f"frequency of {label}", frequency)
     if not frequency > 0.0:
         raise InputError(
-            f"periodic '{key}' has the frequency {frequency:g} Hz, expected more than 0"
+            f"{label} has the frequency {frequency:g} Hz, expected more than 0"
         )
-    return float(amplitude), 2.0 * math.pi * float(frequency)
+    return amplitude, 2.0 * math.pi * frequency
+
+
+def _disturbances(
+    robot: Robot | None, lin: LinearModel
+) -> dict[tuple[str, float], Values]:
+    """Return {(name, rate [rad/s]): phasor (3,)} of a robot's disturbances in the axes of `lin`."""
+    from fflin.robot.robot import Robot
+
+    if robot is None:
+        return {}
+    instance("robot", robot, Robot, "a Robot")
+    state = StateMap(robot, reference=lin.reference, frame=lin.frame)
+    root = robot.model.jointPlacements[ROOT].rotation
+    attitude = root @ rotation_matrix(lin.q[3:7])
+    axes = {BaseTorque.GROUP: state.axes[0], BaseForce.GROUP: state.axes[1]}
+    total: dict[tuple[str, float], Values] = {}
+    for name, given_axes, given, rate in phasors_of(robot, state.field):
+        value = given if given_axes == BASE else given @ attitude
+        if axes[name]:
+            value = state.rotation(lin.q) @ value
+        key = name, rate
+        total[key] = total.get(key, np.zeros(3, complex)) + value
+    return total
+
+
+def _variance(part: Contribution) -> Array:
+    """Return the variances of a cause that is not constant."""
+    if part.kind == "periodic":
+        return 0.5 * part.size**2
+    return part.size**2
+
+
+def _not_superposed(
+    motion: Motion | None, names: Sequence[str], causes: Sequence[Contribution]
+) -> Contribution:
+    """Return the part of the errors of a motion that the causes do not explain."""
+    if motion is None:
+        raise InputError(
+            "limit_cycle needs a simulated motion, because the linear loop has no limit cycle; "
+            "give motion="
+        )
+    deviations = dict(zip(_AXES, _simulated(motion)[1].tolist(), strict=True))
+    late = _late(motion)
+    for name, values in zip(motion.state_names, motion.x.T, strict=True):
+        deviations.setdefault(name, float(values[late].std()))
+    simulated = np.array([deviations[name] for name in names])
+    variance = simulated**2
+    for part in causes:
+        if part.kind != "constant":
+            variance = variance - _variance(part)
+    return Contribution(
+        _NOT_SUPERPOSED, "simulated", np.sqrt(np.maximum(variance, 0.0))
+    )
+
+
+def _late(motion: Motion) -> Mask:
+    """Return which rows of a motion are in the part from which its errors are counted."""
+    late: Mask = motion.t >= motion.t[0] + _LATE * (motion.t[-1] - motion.t[0])
+    return late
 
 
 def _simulated(motion: Motion | None) -> tuple[Array, Array]:
@@ -368,7 +462,7 @@ def _simulated(motion: Motion | None) -> tuple[Array, Array]:
     if not motion.target.size:
         raise InputError("the motion has no target, so it has no attitude errors")
     errors = np.degrees(attitude_rotations(motion.x, motion.target))
-    late = errors[motion.t >= motion.t[0] + _LATE * (motion.t[-1] - motion.t[0])]
+    late = errors[_late(motion)]
     return late.mean(axis=0), late.std(axis=0)
 
 
@@ -468,10 +562,30 @@ class DisturbedLoop(ClosedLoop):
         G = self._held(inputs, 0.0).real
         return Contribution(f"constant {key}", "constant", self._constants(G))
 
-    def periodic(self, key: str, amplitude: float, w: float) -> Contribution:
+    def periodic(self, key: str, amplitude: object, w: float) -> Contribution:
         """Return the effect of sinusoidal forces with a frequency [rad/s]."""
         at = self._signals("force", key, self._forces)
-        G = self._held(amplitude * self._force_inputs[:, at], w)
+        label = f"amplitude of periodic '{key}'"
+        inputs = self._force_inputs[:, at]
+        if dimension(label, amplitude):
+            values = vector(label, amplitude, len(at), "one value for each force")
+            inputs = inputs @ values[:, None]
+        else:
+            inputs = inputs * number(label, amplitude)
+        return self._sinusoid(key, inputs, w)
+
+    def phasor(self, key: str, w: float, value: Values) -> Contribution:
+        """Return the effect of forces (k,) with complex amplitudes; constants have w = 0."""
+        at = self._signals("force", key, self._forces)
+        inputs = self._force_inputs[:, at] @ value[:, None]
+        if w:
+            return self._sinusoid(key, inputs, w)
+        G = self._held(inputs.real, 0.0).real
+        return Contribution(f"constant {key}", "constant", self._constants(G))
+
+    def _sinusoid(self, key: str, inputs: Values, w: float) -> Contribution:
+        """Return the effect of independent sinusoidal forces, whose amplitudes are columns."""
+        G = self._held(inputs, w)
         point = np.exp(1j * w * self.dt) if self.dt else 1j * w
         response = np.linalg.solve(point * np.eye(len(self.F)) - self.F, G)
         amplitudes = np.linalg.norm(response, axis=1)
@@ -502,7 +616,7 @@ class DisturbedLoop(ClosedLoop):
         law = self.law
         return np.vstack((B @ law.D, law.B + law.B @ D @ law.D))
 
-    def _held(self, inputs: Array, w: float) -> Array:
+    def _held(self, inputs: Values, w: float) -> Values:
         """Return the matrix from forces (nx, k) to the states of the loop.
 
         In a sampled loop, it is the effect of e^(j w t) over a sample.

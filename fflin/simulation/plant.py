@@ -131,7 +131,7 @@ class Plant(Aba):
             begin, h = self.step
             within = min(max(t, begin * ROUNDED_UP), (begin + h) * ROUNDED_DOWN)
             disturbed = self.disturbing(within, q, v)
-        if self.on_base.waves:
+        if self.on_base.acts:
             on_base = np.zeros(self.robot.nv)
             on_base[:6] = self.on_base.wrench(t, q)
             disturbed = on_base if disturbed is None else disturbed + on_base
@@ -230,7 +230,7 @@ class Plant(Aba):
         base = driven and (self._columns[:6].any() or self.actuation.carried)
         outside = (
             self.disturbance is not None,
-            self.on_base.waves,
+            self.on_base.acts,
             any(self.robot.gravity),
             self.robot.orbit,
             self.constrained is not None and self.constrained.outside,

@@ -53,3 +53,70 @@ def test_a_drawn_torque_adds_to_the_disturbance_of_the_robot(engine):
 def test_an_unknown_disturbance_is_refused():
     with pytest.raises(fflin.UnknownNameError, match="disturbance to disperse"):
         campaign_of(BODY, {"tau_c.disturbance": 0.3}, "python")
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_drawn_factors_multiply_the_amplitudes_of_each_component(engine):
+    wave = {"amplitude": (0.01, 0.0, -0.02), "frequency": 0.3, "axes": "inertial"}
+    push = {"amplitude": (0.1, 0.2, 0.3), "frequency": 0.7, "constant": (0.1, 0, 0)}
+    robot = BODY.replace(disturbance={"tau_b": [WAVE, wave], "F_b": [push]})
+    spreads = {"tau_b.amplitude": 0.3, "F_b.y.amplitude": (0.5, 1.0)}
+    if engine == "compiled":
+        spreads["F_b.x.disturbance"] = 0.1
+    campaign = campaign_of(robot, spreads, engine)
+    # The amplitude about y is zero, so that no factor is drawn for it.
+    names = ["tau_b.x.amplitude", "tau_b.z.amplitude", "F_b.y.amplitude"]
+    assert [x for x in campaign.names if x.endswith("amplitude")] == names
+    columns = [campaign.names.index(name) for name in names]
+    for run, drawn in enumerate(campaign.drawn):
+        x, z, y = (1.0 + drawn[columns]).tolist()
+        assert min(abs(x - 1.0), abs(z - 1.0)) > 1e-3 and y >= 1.5
+        more = 0.0
+        if engine == "compiled":
+            more = float(drawn[campaign.names.index("F_b.x.disturbance")])
+        total = {
+            "tau_b": [
+                {**WAVE, "amplitude": (0.0, 0.0, 0.02 * z)},
+                {**wave, "amplitude": (0.01 * x, 0.0, -0.02 * z)},
+            ],
+            "F_b": [
+                {**push, "amplitude": (0.1, 0.2 * y, 0.3)},
+                (more, 0.0, 0.0),
+            ],
+        }
+        alone = fflin.simulate(
+            BODY.replace(disturbance=total), duration=DURATION, dt=0.1, engine="python"
+        )
+        assert campaign.q[run] == pytest.approx(alone.q[-1], abs=1e-12)
+        assert np.array_equal(campaign.replay(run).q[-1], campaign.q[run])
+
+
+def test_an_amplitude_of_no_periodic_disturbance_is_refused():
+    with pytest.raises(fflin.InputError, match="has no periodic disturbance"):
+        campaign_of(BODY, {"tau_b.amplitude": 0.3}, "python")
+    robot = BODY.replace(disturbance={"tau_b": [WAVE]})
+    with pytest.raises(fflin.UnknownNameError, match="amplitude to disperse"):
+        campaign_of(robot, {"tau_b.x.amplitude": 0.3}, "python")
+    with pytest.raises(fflin.InputError, match="expected more than -1"):
+        campaign_of(robot, {"tau_b.amplitude": (-2.0, -1.5)}, "python")
+
+
+def test_a_quantity_names_its_components_as_in_the_filter():
+    robot = fflin.load(
+        "cubesat",
+        inputs=[fflin.BaseTorque()],
+        outputs=[fflin.BasePose(), fflin.Gyroscope("base")],
+    )
+    lin = fflin.linearize(robot).discretize(0.5)
+    noise = {"q_b": 1e-9, "r_b": 1e-4, "gyroscope": 1e-9}
+    estimator = fflin.kalman(lin, {"omega_b": 1e-9}, noise)
+    law = fflin.OutputFeedback(lin, fflin.lqg(fflin.lqr(lin), estimator))
+    options = {"runs": 2, "duration": 1.0, "dt": 0.25, "engine": "python"}
+    named, listed = (
+        fflin.monte_carlo(
+            robot, law, {f"{key}.noise": 1e-4, f"{key}.sensor": 1e-3}, **options
+        )
+        for key in ("gyroscope", "*.gyroscope.*")
+    )
+    assert named.names == listed.names and len(named.names) == 1 + 2 * 3
+    assert np.array_equal(named.q, listed.q)

@@ -252,8 +252,18 @@ def test_a_simulation_reports_the_margins_of_its_loop(capsys):
     text = capsys.readouterr().out
     assert "margins of the linear loop" in text
     lin = fflin.linearize(fflin.load("planar_detumble"))
-    sampled = lin.discretize(0.2)
-    expected = fflin.margins(fflin.lqr(sampled), sampled, delay=0.2).disk
+    late = lin.discretize(0.2, delay=0.2)
+    expected = fflin.margins(fflin.lqr(late), late).disk
     assert f"(disk margin {expected:.3g})" in " ".join(text.split())
     assert main(["simulate", *loop, "--free"]) == 0
     assert "margins of the linear loop" not in capsys.readouterr().out
+
+
+def test_none_switches_off_the_integrals_of_the_robot_file(tmp_path, capsys):
+    file = tmp_path / "robot.toml"
+    file.write_text('urdf = "planar_detumble"\n[weights]\nintegral = ["q_b.z"]\n')
+    found = []
+    for options in ((), ("--integral", "none"), ("--integral", "q_b.z")):
+        assert main(["lqr", str(file), *options, "--json"]) == 0
+        found.append(json.loads(capsys.readouterr().out)["integrals"])
+    assert found == [["integral.q_b.z"], [], ["integral.q_b.z"]]

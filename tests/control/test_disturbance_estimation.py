@@ -8,6 +8,7 @@ from scipy.stats import chi2
 
 import fflin
 from fflin.control.lqg import require_one_integrator
+from fflin.control.optimal.riccati import rates_of
 from fflin.control.rejection import rejection
 from tests.support.c_code import needs_compiler
 from tests.support.marks import exhaustive
@@ -632,3 +633,39 @@ def test_the_exported_law_equals_python_over_ten_thousand_samples(tmp_path):
         largest = max(largest, np.abs(one).max())
     assert difference < 1e-12 * max(largest, 1.0)
     assert largest > 1e-3
+
+
+def test_a_bias_that_settles_far_slower_than_the_loop_is_noted(tmp_path):
+    robot = fflin.load(
+        "cubesat",
+        inputs=[fflin.BaseTorque()],
+        outputs=[fflin.BasePose(), fflin.Gyroscope("base")],
+    )
+    lin = fflin.linearize(robot).discretize(0.25)
+    gain = fflin.lqr(lin)
+    loop = -rates_of(gain.poles, 0.25).real.min()
+    noise = {"q_b": 1e-10, "r_b": 1e-4, "gyroscope": 1e-10}
+
+    def compensator(bias):
+        estimator = fflin.kalman(
+            lin, {"omega_b": 1e-12}, noise, bias_noise={"gyroscope.x": bias}
+        )
+        return estimator, fflin.lqg(gain, estimator)
+
+    estimator, slow = compensator(1e-18)
+    # The bias is the only slow state of the filter.
+    decay = (-rates_of(estimator.poles, 0.25).real).min()
+    assert 0.0 < 10.0 * decay < loop
+    expected = f"settles with a time constant of {1.0 / decay:.3g} s"
+    assert slow.slow_bias.startswith("the estimate of bias.")
+    assert expected in slow.slow_bias and "gyroscope.x" in slow.slow_bias
+    assert expected in " ".join(str(slow).split())
+    slow.save(tmp_path / "law.json")
+    assert fflin.Compensator.load(tmp_path / "law.json").slow_bias == slow.slow_bias
+    policy = fflin.OutputFeedback(lin, slow)
+    motion = fflin.simulate(robot, policy, duration=1.0)
+    assert slow.slow_bias in motion.notes
+    fast = compensator(1e-11)[1]
+    assert not fast.slow_bias and not fflin.OutputFeedback(lin, fast).notes
+    without = fflin.lqg(gain, fflin.kalman(lin, {"omega_b": 1e-12}, noise))
+    assert not without.slow_bias

@@ -212,7 +212,6 @@ def test_signals_that_are_not_regulated_are_refused(satellite):
     ("given", "kind"),
     [
         (["q_c"], fflin.UnknownNameError),
-        ([], fflin.InputError),
         ({"q_b": -1.0}, fflin.InputError),
         (np.eye(2), fflin.InputError),
     ],
@@ -531,3 +530,29 @@ def test_the_worst_loops_of_a_law_with_integrals_are_those_of_its_gain(arm):
     compensator = fflin.lqg(fflin.lqr(lin), fflin.kalman(lin, 1e-3, 1e-4))
     with pytest.raises(fflin.InputError, match="LinearController"):
         uncertain.worst(compensator)
+
+
+def test_an_empty_list_switches_the_integrals_of_the_robot_off(arm):
+    robot = fflin.load("planar_detumble", weights={"integral": ["q_b"]})
+    lin = fflin.linearize(robot)
+    assert fflin.lqr(lin).integrals
+    plain = fflin.lqr(arm[1])
+    for given in ({"integral_action": []}, {"weights": {"integral": []}}):
+        gain = fflin.lqr(lin, **given)
+        assert not gain.integrals and np.array_equal(gain.K, plain.K)
+    explicit = fflin.lqr(lin, 1.0, 1.0, integral_action={})
+    assert np.array_equal(explicit.K, fflin.lqr(arm[1], 1.0, 1.0).K)
+
+
+def test_a_quantity_names_its_components_as_in_the_filter():
+    outputs = [fflin.FramePose("hand"), fflin.Gyroscope("base")]
+    lin = fflin.linearize(fflin.load("planar_detumble", outputs=outputs))
+    named = fflin.lqr(lin, integral_action=["rotation"])
+    listed = fflin.lqr(lin, integral_action=["*.rotation.*"])
+    assert len(named.integrals) == 3 and named.integrals == listed.integrals
+    assert np.array_equal(named.K, listed.K)
+    weighted = fflin.lqr(lin, integral_action={"rotation": 1e-3})
+    assert np.allclose(weighted.Q[-3:, -3:], 1e-3 * np.eye(3))
+    # A regulated attitude has no constant rate, so that a rate cannot be integrated.
+    with pytest.raises(fflin.StabilizabilityError, match=r"base\.gyroscope"):
+        fflin.lqr(lin, integral_action=["gyroscope"])

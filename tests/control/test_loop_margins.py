@@ -1,7 +1,9 @@
 """Margins of linear loops equal those of brute-force searches and of closed forms."""
 
 import itertools
+import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -500,7 +502,7 @@ def test_loops_without_gain_and_delays_of_many_samples_are_refused():
 
 def test_a_model_without_delay_gets_the_delay_of_the_law(tmp_path):
     """The margins belong to the loop that `simulate` flies, unless a delay is given."""
-    _, lin = satellite()
+    robot, lin = satellite()
     late = lin.discretize(0.25, delay={"tau_b.x": 0.1, "tau_b.y": 0.25, "tau_b.z": 0.4})
     gain = fflin.lqr(late)
     expected = fflin.margins(gain, late)
@@ -511,13 +513,32 @@ def test_a_model_without_delay_gets_the_delay_of_the_law(tmp_path):
             found = fflin.margins(law, model)
             assert found.delay == pytest.approx(0.4)
             assert found.disk == pytest.approx(expected.disk, rel=1e-9)
-    # A gain from a file does not know how long the delay is.
-    gain.save(tmp_path / "gain.npz")
-    loaded = fflin.Gain.load(tmp_path / "gain.npz")
+    gain.save(tmp_path / "gain.json")
+    loaded = fflin.Gain.load(tmp_path / "gain.json")
+    assert np.array_equal(loaded.delay, late.delay)
+    assert fflin.margins(loaded, lin).disk == pytest.approx(expected.disk, rel=1e-9)
+    # A file of an earlier version does not contain the delay.
+    record = json.loads((tmp_path / "gain.json").read_text())
+    for entry in ("delay", "sha256"):
+        del record[entry]
+    (tmp_path / "old.json").write_text(json.dumps(record))
+    old = fflin.Gain.load(tmp_path / "old.json")
     with pytest.raises(fflin.InputError, match="designed for delayed inputs"):
-        fflin.margins(loaded, lin)
-    assert fflin.margins(loaded, late).disk == pytest.approx(expected.disk, rel=1e-9)
-    assert fflin.margins(loaded, lin, delay=0.4).stable
+        fflin.margins(old, lin)
+    with pytest.raises(fflin.InputError, match="by an earlier version"):
+        fflin.write_c(old, tmp_path / "c", robot=robot)
+    assert fflin.StateFeedback(late, old).input_delays == law.input_delays
+    assert fflin.margins(old, late).disk == pytest.approx(expected.disk, rel=1e-9)
+    assert fflin.margins(old, lin, delay=0.4).stable
+
+
+def test_a_gain_of_another_delay_or_of_a_negative_one_is_refused():
+    _, lin = satellite()
+    gain = fflin.lqr(lin.discretize(0.25, delay=0.3))
+    with pytest.raises(fflin.InputError, match="another delay"):
+        fflin.StateFeedback(lin.discretize(0.25, delay=0.35), gain)
+    with pytest.raises(fflin.InputError, match="at least 0 s"):
+        replace(gain, delay=-gain.delay)
 
 
 def test_the_margins_of_an_allocation_are_those_of_its_inner_policy():

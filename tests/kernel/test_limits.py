@@ -16,6 +16,9 @@ CONSTRAINED = CUBESAT.replace(constraints=[fflin.Weld("base")])
 CONSTRAINED_IN_ORBIT = fflin.load(
     "dual_arm", orbit=500e3, constraints=[fflin.Weld("tool_left", "tool_right")]
 )
+WITH_PLATE = CUBESAT.replace(
+    disturbance={"plate": {"area": 0.1, "normal": (0, 0, 1), "sun": (0, 0, 1)}}
+)
 
 
 def with_displaced_root():
@@ -51,6 +54,7 @@ TASKS = {
     "the constraints of 'dual_arm' are simulated in orbit": Task(
         robots=(CONSTRAINED_IN_ORBIT,), simulated=True
     ),
+    "the flat plates of 'cubesat'": Task(robots=(WITH_PLATE,), simulated=True),
     "its sample time differs": Task(robots=(CUBESAT,), own_sample_time=True),
     "noise is evaluated at every stage": Task(robots=(CUBESAT,), noise_at_stages=True),
     "no frame": Task(robots=(CUBESAT,), measurements="no frame"),

@@ -1,12 +1,16 @@
 """Error budgets equal closed forms, brute-force recursions and simulated motions."""
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from scipy.linalg import expm
 from scipy.stats import chi2
 
 import fflin
 from fflin.base.errors import InputError, UnknownNameError
+from fflin.dynamics.disturbance import BaseDisturbance, phasors_of
+from fflin.dynamics.orbital import OrbitField
+from fflin.dynamics.state_rows import attitude_rotations
 
 DEGREES = np.degrees(1.0)
 
@@ -277,3 +281,117 @@ def test_a_measured_quantity_names_its_components_as_in_the_filter():
     listed = fflin.error_budget(policy, model, noise={"*.gyroscope.*": 1e-5})
     assert named.total.tolist() == listed.total.tolist()
     assert named.total[0] > 0.0
+
+
+def test_phasors_are_the_disturbance_of_the_orbit_at_every_time():
+    """Inertial vectors rotate in the orbital frame; their products are sums of sinusoids."""
+    terms = [
+        {"constant": (1.0, -2.0, 0.5), "axes": "inertial"},
+        {"amplitude": (0.3, 1.0, -2.0), "frequency": 1e-3, "phase": 0.7},
+        {
+            "amplitude": (0.3, 1.0, -2.0),
+            "frequency": 5e-3,
+            "phase": 0.7,
+            "axes": "inertial",
+        },
+        {"amplitude": (2.0, 1.0, 3.0), "frequency": 2e-5, "axes": "inertial"},
+    ]
+    disturbance = {"tau_b": terms, "F_b": [(0.0, 3.0, 1.0)]}
+    robot = fflin.load("cubesat").replace(orbit=700e3, disturbance=disturbance)
+    field = OrbitField(robot, "lvlh")
+    on_base = BaseDisturbance(robot, field)
+    q = fflin.configuration(robot, rpy=(20.0, -10.0, 70.0))
+    R = pin.XYZQUATToSE3(q[:7]).rotation
+    phasors = phasors_of(robot, field)
+    assert min(phasor.rate for phasor in phasors) >= 0.0
+    for t in (0.0, 123.0, 4000.0):
+        expected = on_base.wrench(t, q)
+        total = np.zeros(6)
+        for name, axes, value, rate in phasors:
+            real = (value * np.exp(1j * rate * t)).real
+            rows = slice(0, 3) if name == "F_b" else slice(3, 6)
+            total[rows] += real if axes == "base" else real @ R
+        np.testing.assert_allclose(total, expected, rtol=0, atol=1e-11)
+
+
+@pytest.mark.exhaustive
+def test_the_disturbance_of_a_robot_gives_the_errors_of_its_simulation():
+    """The linear error of a small constant and a sinusoid equals the simulated one."""
+    h, f = 0.25, 0.05
+    disturbance = {
+        "tau_b": [
+            {"constant": (2e-7, 0.0, -1e-7), "axes": "inertial"},
+            {"amplitude": (0.0, 3e-7, 1e-7), "frequency": f, "axes": "inertial"},
+        ]
+    }
+    robot = fflin.load("cubesat", inputs=[fflin.BaseTorque()])
+    q = fflin.configuration(robot, rpy=(0.0, 0.0, 50.0))
+    lin = fflin.linearize(robot, q)
+    sampled = lin.discretize(h, delay=0.3)
+    policy = fflin.StateFeedback(sampled, fflin.lqr(sampled))
+    pushed = robot.replace(disturbance=disturbance)
+    # The motion settles in 200 s. The second half contains whole periods of the sinusoid.
+    motion = fflin.simulate(pushed, policy, q0=q, duration=400.0, dt=0.05)
+    budget = fflin.error_budget(policy, lin, robot=pushed, motion=motion)
+    causes = [part.cause for part in budget.contributions]
+    assert causes == ["constant tau_b", "tau_b at 0.05 Hz"]
+    late = motion.t >= 200.0
+    mean = 2.0 * DEGREES * motion.x[late, :3].mean(axis=0)
+    spread = 2.0 * DEGREES * motion.x[late, :3].std(axis=0)
+    np.testing.assert_allclose(budget.constant[:3], np.abs(mean), rtol=1e-3, atol=1e-9)
+    np.testing.assert_allclose(budget.deviation[:3], spread, rtol=1e-2, atol=1e-9)
+    # The linear loop explains this motion, so that almost nothing is left.
+    rest = fflin.error_budget(
+        policy, lin, robot=pushed, motion=motion, limit_cycle=True
+    ).contributions[-1]
+    assert rest.kind == "simulated" and rest.cause == "simulated minus superposed"
+    assert (rest.size[:3] <= 0.15 * spread + 1e-9).all()
+
+
+def test_the_limit_cycle_is_the_part_of_the_motion_that_is_not_superposed(satellite):
+    """Pulses of thrusters keep the satellite moving; no linear cause does."""
+    robot, lin, gain = satellite
+    motion = fflin.simulate(
+        robot,
+        fflin.StateFeedback(lin, gain.K),
+        duration=10.0,
+        disturbance=lambda t, q, v: {"tau_b.z": 1e-6 * np.sign(np.sin(0.5 * t))},
+    )
+    given = {"motion": motion, "limit_cycle": True}
+    alone = fflin.error_budget(gain, lin, **given)
+    (part,) = alone.contributions
+    np.testing.assert_allclose(part.size[:3], motion_deviation(motion), rtol=1e-12)
+    np.testing.assert_allclose(alone.total, 3.0 * part.size, rtol=1e-12)
+    noise = {"tau_b.z": 1e-7}
+    budget = fflin.error_budget(gain, lin, force_noise=noise, **given)
+    white, rest = (x.size[2] for x in budget.contributions)
+    assert np.hypot(white, rest) == pytest.approx(part.size[2], rel=1e-12)
+    assert "simulated minus superposed" in str(budget)
+    # A cause that is larger than the motion leaves nothing.
+    noise = {"tau_b.z": 1.0}
+    budget = fflin.error_budget(gain, lin, force_noise=noise, **given)
+    assert budget.contributions[-1].size[2] == 0.0
+    with pytest.raises(InputError, match="needs a simulated motion"):
+        fflin.error_budget(gain, lin, limit_cycle=True)
+
+
+def motion_deviation(motion):
+    """Return the standard deviations [deg] of the attitude in the second half of a motion."""
+    late = motion.t >= 0.5 * motion.t[-1]
+    return np.degrees(attitude_rotations(motion.x, motion.target))[late].std(axis=0)
+
+
+def test_an_amplitude_may_be_a_vector_with_one_phase():
+    robot = fflin.load("cubesat", inputs=[fflin.BaseTorque()])
+    lin = fflin.linearize(robot)
+    gain = fflin.lqr(lin)
+    budgets = [
+        fflin.error_budget(gain, lin, periodic={"tau_b": (amplitude, 0.02)})
+        for amplitude in ((1e-5, 0.0, 0.0), (0.0, 1e-5, 0.0), (1e-5, -1e-5, 0.0), 1e-5)
+    ]
+    x, y, both, group = (budget.contributions[0].size for budget in budgets)
+    assert (both <= x + y + 1e-18).all() and (both >= np.abs(x - y) - 1e-18).all()
+    assert (group >= np.hypot(x, y) - 1e-18).all()
+    for wrong in (1.0, (1.0, 2.0, 3.0), ((1.0, 2.0), 0.1)):
+        with pytest.raises(InputError, match="periodic 'tau_b'"):
+            fflin.error_budget(gain, lin, periodic={"tau_b": wrong})

@@ -162,6 +162,8 @@ def light(folder):
             "sample": 0.1,
             "factor": 3.0,
             "motion": None,
+            "robot": robot,
+            "limit_cycle": False,
         },
         "gramians": {"lin": filtered_model, "duration": 1.0},
         "grid": {"robot": robot, "axes": {joint: [0.0, 1.0]}, "base": None},

@@ -1,0 +1,69 @@
+"""The error budget of `fflin simulate`, and the errors of its sensors."""
+
+import json
+
+import numpy as np
+import pytest
+
+import fflin
+from fflin.commands.cli import main
+from tests.support.commands import refused, run
+
+FILE = """urdf = "cubesat"
+[disturbance]
+tau_b = [2e-7, 0, 0]
+"""
+
+
+@pytest.fixture
+def satellite(tmp_path, monkeypatch):
+    """Write a robot file with a disturbance into the working directory; return its name."""
+    monkeypatch.chdir(tmp_path)
+    inputs = '[[input]]\ntype = "base_torque"\nmax = 1e-3\n'
+    text = FILE + inputs
+    (tmp_path / "satellite.toml").write_text(text)
+    return "satellite.toml"
+
+
+LOOP = ("--sample", 0.5, "--duration", 60, "--dt", 0.25)
+
+
+def test_simulate_reports_the_errors_by_cause(satellite, capsys):
+    options = [*map(str, LOOP), "--noise", "q_b=1e-6", "--bias", "omega_b.y=1e-6"]
+    assert main(["simulate", satellite, *options, "--budget", "--json"]) == 0
+    budget = json.loads(capsys.readouterr().out)["budget"]
+    causes = [part["cause"] for part in budget["contributions"]]
+    assert causes == [
+        "noise of q_b",
+        "bias of omega_b.y",
+        "constant tau_b",
+        "simulated minus superposed",
+    ]
+    robot = fflin.load(satellite)
+    lin = fflin.linearize(robot).discretize(0.5)
+    policy = fflin.StateFeedback(lin, fflin.lqr(lin))
+    given = {"noise": {"q_b": 1e-6}, "bias": {"omega_b.y": 1e-6}, "robot": robot}
+    expected = fflin.error_budget(policy, lin, **given)
+    for part, found in zip(
+        expected.contributions, budget["contributions"], strict=False
+    ):
+        np.testing.assert_allclose(found["size"], part.size, rtol=1e-12)
+    # The simulation contains the bias and the torque, so that its mean shows both.
+    mean = np.abs(budget["simulated_mean"])
+    np.testing.assert_allclose(mean[:2], expected.constant[:2], rtol=0.1)
+    assert budget["simulated_deviation"][2] > 0.2 * expected.deviation[2]
+
+
+def test_what_has_no_budget_is_refused(satellite, tmp_path):
+    for options in (("--free",), ("--mpc", "--sample", 0.5, "--horizon", 4)):
+        message = refused(
+            *("simulate", satellite, *options, "--duration", 2, "--budget"),
+            cwd=tmp_path,
+        )
+        assert "linear regulator about a point" in message
+    for options in (("--noise", "q_b=1e-6"), ("--free", "--bias", "q_b=1e-6")):
+        refused("simulate", satellite, *options, "--duration", 2, cwd=tmp_path)
+    code, _, err = run(
+        *("simulate", satellite, *LOOP, "--noise", "gyro=1"), cwd=tmp_path
+    )
+    assert code == 2 and "gyro" in err
