@@ -53,15 +53,14 @@ class Following(Policy):
     noise: Noise | None = None
 
     def __post_init__(self) -> None:
-        robot = instance(
-            "trajectory", self.trajectory, Trajectory, "a fflin.Trajectory"
-        ).robot
+        instance("trajectory", self.trajectory, Trajectory, "a fflin.Trajectory")
         if not self.law.sample_time:
             raise InputError(
                 f"the {self.law.kind} is continuous, expected a sampled law to follow a "
                 "trajectory; design it for lin.discretize(dt)"
             )
-        self._require_fit(robot)
+        self.trajectory = _with_inputs_of(self.lin, self.trajectory)
+        self._require_fit(self.trajectory.robot)
         displacement = np.concatenate((self.lin.x0[:6], self.lin.v[:6]))
         if np.abs(displacement).max() > _ROUNDING:
             raise InputError(
@@ -273,6 +272,28 @@ class Following(Policy):
         if noise is None or self.senses_outputs:
             return noise
         return lambda t: path.S.T @ np.asarray(noise(t))
+
+
+def _with_inputs_of(lin: LinearModel, trajectory: Trajectory) -> Trajectory:
+    """Return a trajectory with the inputs of a model; inputs that it lacks are zero.
+
+    For example, a plan for wheels alone becomes a plan for wheels and a base torque.
+    """
+    robot = lin._robot
+    names = trajectory.actuation.names
+    known = lin.input_names
+    if robot is None or names == known or not set(names) <= set(known):
+        return trajectory
+    u = trajectory.u @ selection(names, known)
+    return Trajectory(
+        robot,
+        trajectory.t,
+        trajectory.q,
+        trajectory.v,
+        u,
+        hold=trajectory.hold,
+        frame=trajectory.frame,
+    )
 
 
 class _Path:

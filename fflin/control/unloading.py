@@ -9,7 +9,7 @@ import numpy as np
 from scipy.linalg import null_space
 
 from fflin.base.errors import InputError, listed
-from fflin.base.validation import Array, instance, number
+from fflin.base.validation import Array, frozen, instance, number
 from fflin.control.loops import NOT_CORRECTED
 from fflin.control.policies import LinearLaw, StateFeedback
 from fflin.dynamics.state import selection
@@ -46,8 +46,8 @@ def unload_wheels(law: LawT, design: Robot, rate: float) -> LawT:
     ----------
     law : StateFeedback, OutputFeedback or LinearController
         Law for a robot whose inputs include the wheels. An output feedback must measure the wheel
-        speeds, for example by ``JointVelocities("wheel_*")``. `lqr` and `kalman` must leave out the
-        wheel speeds, as they do by default without an external torque.
+        speeds, for example by ``JointVelocities(("wheel_*",))``. `lqr` and `kalman` must leave out
+        the wheel speeds, as they do by default without an external torque.
     design : Robot
         Robot of the law with an additional external torque, such as ``BaseTorque()``.
     rate : float
@@ -77,7 +77,9 @@ def unload_wheels(law: LawT, design: Robot, rate: float) -> LawT:
     >>> fflin.simulate(design, unloading, duration=1.0).u.shape[1]
     6
     """
-    instance("law", law, LinearLaw, "a StateFeedback, OutputFeedback or LinearController")
+    instance(
+        "law", law, LinearLaw, "a StateFeedback, OutputFeedback or LinearController"
+    )
     instance("design", design, Robot, "a fflin.Robot")
     rate = number("rate", rate)
     if rate <= 0.0:
@@ -85,7 +87,9 @@ def unload_wheels(law: LawT, design: Robot, rate: float) -> LawT:
     lin, continuous = _models(law, design)
     speeds = [f"qdot_m.{name}" for name in lin.wheels]
     if not speeds:
-        raise InputError(f"'{design.name}' has no wheels, expected ReactionWheel inputs")
+        raise InputError(
+            f"'{design.name}' has no wheels, expected ReactionWheel inputs"
+        )
     _require_unregulated(law, speeds)
     null = _null_feedback(continuous, speeds)
 
@@ -93,7 +97,7 @@ def unload_wheels(law: LawT, design: Robot, rate: float) -> LawT:
     rows = selection(law.lin.input_names, lin.input_names)
     columns = selection(law.system.inputs, sensors)
     of_speeds = selection(speeds, sensors)
-    A, B, C, D = law.system[:4]
+    _, B, C, D = law.system[:4]
     unloading = copy(law)
     unloading.lin = lin
     unloading.system = law.system._replace(
@@ -104,10 +108,11 @@ def unload_wheels(law: LawT, design: Robot, rate: float) -> LawT:
         outputs=lin.input_names,
     )
     unloading.windup = _windup(law, continuous, rows)
-    if isinstance(law, StateFeedback):
+    if isinstance(unloading, StateFeedback):
         states = selection(law.lin.state_names, lin.state_names)
-        unloading.K = rows.T @ law.K @ states
-        unloading.K += rate * null @ selection(speeds, lin.state_names)
+        attitude = rows.T @ unloading.K @ states
+        wheels = null @ selection(speeds, lin.state_names)
+        unloading.K = frozen(attitude + rate * wheels)
     return unloading
 
 
@@ -139,8 +144,8 @@ def _models(law: LinearLaw, design: Robot) -> tuple[LinearModel, LinearModel]:
     missing = [x for x in lin.input_names if x not in continuous.input_names]
     if missing:
         raise InputError(
-            f"{made}, whose inputs {listed(missing)} '{design.name}' lacks; give a robot with "
-            "these inputs and an additional external torque"
+            f"the law commands {listed(missing)}, expected inputs of '{design.name}'; give the "
+            "robot of the law with an additional external torque"
         )
     if not lin.dt:
         return continuous, continuous
@@ -154,10 +159,10 @@ def _require_unregulated(law: LinearLaw, speeds: list[str]) -> None:
     if unmeasured:
         raise InputError(
             f"the law does not measure {listed(unmeasured)}; add the output "
-            'JointVelocities("wheel_*")'
+            'JointVelocities(("wheel_*",))'
         )
-    used = np.vstack((law.system.D, law.system.B)).any(axis=0)
-    fed_back = [name for name in speeds if used[sensors.index(name)]]
+    matrices = np.vstack((law.system.D, law.system.B))
+    fed_back = [name for name in speeds if matrices[:, sensors.index(name)].any()]
     if fed_back:
         raise InputError(
             f"the law already feeds back {listed(fed_back)}; design it with wheel_speeds=False, "
