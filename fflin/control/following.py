@@ -248,13 +248,13 @@ class Following(Policy):
         """Return the matrices and the reference of each sample for the compiled loop."""
         if self.noise is not None and not self.senses_outputs:
             return None
-        path = _Path(self, robot)
+        path = ReferencePath(self, robot)
         return OutputForm(self._loop(robot), path.terms, self.samples)
 
     def _loop(self, robot: Robot) -> Loop:
         """Return the command of the law for a robot."""
         self._require_fit(robot)
-        path = _Path(self, robot)
+        path = ReferencePath(self, robot)
         windup = (lambda _: self.terms.E) if self.terms.E.size else None
         return Loop(
             path.state,
@@ -266,7 +266,7 @@ class Following(Policy):
             windup=windup,
         )
 
-    def _noise_for(self, path: _Path) -> Noise | None:
+    def _noise_for(self, path: ReferencePath) -> Noise | None:
         """Return the errors of the measured values: outputs, or the full state of a robot."""
         noise = self.noise
         if noise is None or self.senses_outputs:
@@ -296,7 +296,7 @@ def _with_inputs_of(lin: LinearModel, trajectory: Trajectory) -> Trajectory:
     )
 
 
-class _Path:
+class ReferencePath:
     """Reference of a law for a robot: the sample matrices and the measurements at each time."""
 
     def __init__(self, law: Following, robot: Robot) -> None:
