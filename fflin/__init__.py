@@ -57,6 +57,7 @@ _PUBLIC = {
         "control.gain": "Gain",
         "control.margins": "margins Margins ChannelMargins",
         "control.plan": "plan",
+        "control.unloading": "unload_wheels",
         "control.mpc": "mpc",
         "control.tvlqr": "tvlqr GainSchedule FilterSchedule",
         "control.tvkalman": "tvkalman",

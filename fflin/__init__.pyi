@@ -99,6 +99,7 @@ from fflin.control.margins import ChannelMargins as ChannelMargins
 from fflin.control.lqr import acceleration_lqr as acceleration_lqr
 from fflin.control.weights import sampled_cost as sampled_cost
 from fflin.control.plan import plan as plan
+from fflin.control.unloading import unload_wheels as unload_wheels
 from fflin.control.mpc import mpc as mpc
 from fflin.control.tvlqr import tvlqr as tvlqr
 from fflin.control.tvlqr import GainSchedule as GainSchedule

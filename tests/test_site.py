@@ -204,6 +204,8 @@ SOUGHT = {
     "gain margin": {"guide/lqr_kalman"},
     "thrust allocation": {"guide/inputs"},
     "noise": {"guide/lqr_kalman"},
+    "attitude control": {"guide/attitude_control", "tutorials/attitude_control"},
+    "momentum unloading": {"guide/attitude_control"},
     "orbit": {"guide/orbits"},
     "docking": {"guide/capture"},
     "flexible": {"guide/flexible"},

@@ -29,11 +29,12 @@ def first_robot(page):
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if page != "own_urdf"])
-def test_a_tutorial_begins_without_a_warning(page):
+def test_a_tutorial_begins_without_a_warning(page, tmp_path, monkeypatch):
     # The page about one's own URDF shows what its file makes fflin warn of.
     module = first_robot(page)
     assert module is not None
     names = {}
+    monkeypatch.chdir(tmp_path)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         exec(compile(module, page, "exec"), names)

@@ -297,7 +297,7 @@ def delayed_model(
             "the gain was designed for delayed inputs, but lin has no delay; give the model "
             "of the gain, lin.discretize(dt, delay=...), or give delay="
         )
-    model = policy._lin if isinstance(policy, Gain) else known
+    model = known._lin if isinstance(known, Gain) else known
     has_lags = model is not None and bool(model.lag.any() or model.output_lag.any())
     source = lin.generator if lin.dt else lin
     if (

@@ -85,7 +85,8 @@ def plan(
     goal : LinearModel, (q, v) or array_like (nx,)
         End of the motion: the operating point of a model, a configuration and velocity in
         Pinocchio's order, or a state of `StateMap` in frame "hybrid". In (q, v), q=None means the
-        neutral configuration, and v=None means rest. Wheels may end at any angle.
+        neutral configuration, and v=None means rest. Wheels may end at any angle and, with v=None,
+        at any speed, which the momentum determines. If `free` contains omega_b, they end at rest.
     duration : float
         Duration of the motion [s].
     x0, q0, v0 : array_like, optional
@@ -183,6 +184,9 @@ def plan(
             "R has nonzero off-diagonal entries, expected a diagonal weight; give its diagonal"
         )
     left = {*shooting.wheels, *chosen("state", free, state.names)}
+    rates = range(*state.groups.omega_b.indices(state.nx))
+    if _without_velocity(goal) and left.isdisjoint(rates):
+        left |= {state.names.index(f"qdot_m.{name}") for name in wheels}
     asked = np.array([i not in left for i in range(state.nx)])
     bounds = np.array([acting.get(name, (-np.inf, np.inf)) for name in state.names]).T
     _require_within(shooting, bounds, "start", start, np.full(state.nx, True))
@@ -253,6 +257,11 @@ def _goal_point(
     if isinstance(goal, tuple) and len(goal) == 2:
         return points.point_of(state, None, *goal, at_rest)
     return points.point_of(state, goal, None, None, at_rest)
+
+
+def _without_velocity(goal: object) -> bool:
+    """Return whether a goal is a configuration without a velocity."""
+    return isinstance(goal, tuple) and len(goal) == 2 and goal[1] is None
 
 
 def _knot_weights(shooting: Shooting) -> Array:

@@ -15,6 +15,7 @@ from fflin.base.errors import InputError
 from fflin.base.validation import Array, frozen, instance, shaped
 from fflin.control.channel import Law
 from fflin.control.delayed import is_delayed, law_with_memory
+from fflin.control.following import Following
 from fflin.control.gain import Gain
 from fflin.control.loops import (
     NOT_CORRECTED,
@@ -269,6 +270,44 @@ class LinearLaw(Feedback):
         if self.senses_outputs:
             terms = sensed(terms, timing_of_robot(state, self.sample_time))
         return lin, PredictedLaw(terms, lambda e, u: y0 + C @ e + D @ (u - lin.u0))
+
+    def follow(self, trajectory: Trajectory) -> Following:
+        """Return the law that follows a trajectory: u = u*(t) + law(y - y*(t)).
+
+        The law must be sampled, and is designed about a point at rest. u*(t) are the inputs of the
+        trajectory, and y*(t) its outputs, or its states for a `StateFeedback`. Positions and
+        attitudes are measured relative to the base pose of the trajectory, so a slew may have any
+        angle. Each command u* is the mean input of the trajectory during the sample in which it
+        acts.
+
+        After the end of the trajectory, the law holds its last configuration at rest. Only wheels
+        keep their speeds. If the inputs are delayed, the robot waits at the start for the longest
+        delay, so that each input of the trajectory acts at its time.
+
+        The matrices of the law remain those about its point. They fit a trajectory if its rates are
+        small compared with the bandwidth of the law, and if the joints stay near the point. For
+        other trajectories, use `tvlqr` and `tvkalman`.
+
+        Parameters
+        ----------
+        trajectory : Trajectory
+            Trajectory for the same states, inputs and outputs as the model of the law, such as the
+            result of `plan`.
+
+        Returns
+        -------
+        Policy
+            Policy for `simulate` and campaigns. In Python and in compiled code, it keeps the
+            estimates, integrals and earlier commands of the law.
+
+        Raises
+        ------
+        InputError
+            If the law is continuous, its base is displaced or moves at the operating point, the
+            robot of the trajectory has other signals, or no inputs hold the robot at the end. Also
+            if inputs are delayed and the base moves at the start of the trajectory.
+        """
+        return Following(self, self.terms(), trajectory, self.noise)
 
     def _measured(self, lin: LinearModel) -> tuple[Array, Array, Array]:
         """Return C, D and y0 of the values that the law measures of a model."""

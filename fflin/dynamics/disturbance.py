@@ -96,9 +96,7 @@ class Plate:
     frame in orbit, and otherwise inertial.
     """
 
-    def __init__(
-        self, plate: FlatPlate, robot: Robot, field: OrbitField | None
-    ) -> None:
+    def __init__(self, plate: FlatPlate, field: OrbitField | None) -> None:
         self._plate = plate
         self._field = field
         self._normal = np.array(plate.normal) / np.linalg.norm(plate.normal)
@@ -107,15 +105,12 @@ class Plate:
         self._velocity = np.array(plate.velocity)
         # Whether the velocity is given in inertial axes. By default, it is the orbital velocity.
         self._is_inertial = bool(self._velocity.any())
-        if field is not None and robot.orbit and not self._is_inertial:
-            speed = robot.orbit.mean_motion * robot.orbit.radius
-            self._velocity = speed * field.axes[:, 1]
 
     def _in_world(self, vector: Array, t: float) -> Array:
         """Return an inertial vector in the axes of the world at time t [s]."""
         if self._field is None:
             return vector
-        turned: Array = pin.exp3(-t * self._field.rate) @ vector
+        turned: Array = self._field.turned(t).T @ vector
         return turned
 
     def wrench(self, t: float, R: Array) -> Array:
@@ -129,6 +124,8 @@ class Plate:
             velocity = self._velocity
             if self._is_inertial:
                 velocity = self._in_world(velocity, t)
+            elif self._field is not None:
+                velocity = self._field.velocity
             speed = float(np.linalg.norm(velocity))
             direction = (velocity / speed) @ R
             cosine, _ = self._facing(direction)
@@ -168,7 +165,7 @@ class BaseDisturbance:
             self.waves = [wave for wave in self.waves if not wave.rate]
         self.periodic = any(wave.rate for wave in self.waves)
         plates = plates_of(robot.disturbance)
-        self.plates = [Plate(plate, robot, field) for plate in plates]
+        self.plates = [Plate(plate, field) for plate in plates]
         self._root = robot.model.jointPlacements[ROOT].rotation
         self._field = field
 

@@ -96,6 +96,15 @@ class OrbitField:
         if self.elliptic:
             self._set(_state_at(self.robot.orbit, t))
 
+    @property
+    def velocity(self) -> Array:
+        """Inertial velocity (3,) [m/s] of the frame's origin, in the axes of the frame."""
+        now = self._now
+        # The gradient mu / r^3 changes by -3 mu / r^4 dr/dt.
+        climb = -now.gradient_change / now.gradient * now.radius / 3.0
+        velocity: Array = self.axes @ (climb, now.radius * now.rate, 0.0)
+        return velocity
+
     def turned(self, t: float) -> Array:
         """Return the rotation (3, 3) of the orbital axes from t = 0 to time t [s]."""
         rotation = t * self.rate

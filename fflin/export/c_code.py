@@ -24,7 +24,7 @@ from fflin.base.errors import FileError, InputError, MissingPackageError, listed
 from fflin.base.record import content_digest, reading
 from fflin.base.validation import Array, frozen
 from fflin.base.writing import as_path, failing, read_file, write_atomically
-from fflin.control.loops import Loop, Measure, next_sample
+from fflin.control.loops import Loop, Measure, Step, next_sample
 from fflin.control.policy import BoundLaw, Command, Policy
 from fflin.dynamics.coordinates import Frame, frame_of
 from fflin.dynamics.outputs import Measuring
@@ -257,7 +257,8 @@ class CLaw(Policy):
         self.origin = (
             None if placement is None else pin.XYZQUATToSE3(np.array(placement))
         )
-        if self._about["kind"] == "output" and placement is None:
+        known = placement is not None or "points" in self._about
+        if self._about["kind"] == "output" and not known:
             raise InputError(
                 "the C code was written from a Compensator, which does not contain the model and "
                 "its outputs; write the C code from an OutputFeedback"
@@ -315,17 +316,7 @@ class CLaw(Policy):
             require_same(made, state, kind, tuple(names), tuple(units))
         require_configuration_size(made, self._about["nq"], robot)
         if self._about["kind"] == "output":
-            q, v = map(np.array, self._about["point"])
-            measuring = Measuring(state, q)
-            x = state.read(q, v)
-            sizes = (self._about["memory"], 0)
-            return Loop(
-                state,
-                self.dt,
-                sizes,
-                lambda t: (partial(self._output_step, t), measuring, x),
-                start=np.array(self._about["y0"]) if "y0" in self._about else None,
-            )
+            return self._output_loop(state)
         world = StateMap(robot, frame=state.frame)
         n = robot.n
         # C has no empty arrays. So the C arrays for the joints have one entry if there is no joint.
@@ -335,17 +326,44 @@ class CLaw(Policy):
             for size in (13 + 2 * room, len(self._about["u0"]))
         )
         at = [*range(7 + n), *range(7 + room, 13 + n + room)]
-        samples = self._about["kind"] == "samples"
         if self._about["memory"]:
             return _Remembering(self, world, given, at, u)
 
         def policy(t: float, q: Array, v: Array) -> Array:
             given[at] = measured(world, q, v)
-            sample = (ctypes.c_ulong(round(t / self.dt)),) if samples else ()
-            self._call(t, *sample, given.ctypes, u.ctypes)
+            self._call(t, *self._sample(t), given.ctypes, u.ctypes)
             return u.astype(float)
 
         return policy
+
+    def _output_loop(self, state: StateMap) -> Loop:
+        """Return the command of an output law, which measures relative to its reference."""
+        sizes = (self._about["memory"], 0)
+
+        def at_point(t: float) -> tuple[Step, Measuring, Array]:
+            return partial(self._output_step, t), measuring, x
+
+        def along(t: float) -> tuple[Step, Measuring, Array]:
+            row = min(round(t / self.dt), len(q) - 1)
+            relative = state.about(state.origin * pin.XYZQUATToSE3(q[row, :7]))
+            x = relative.read(q[row], v[row])
+            return partial(self._output_step, t), Measuring(relative, q[row]), x
+
+        if "points" in self._about:
+            q, v = (np.array(self._about["points"][key]) for key in "qv")
+            return Loop(state, self.dt, sizes, along)
+        q, v = map(np.array, self._about["point"])
+        measuring = Measuring(state, q)
+        x = state.read(q, v)
+        start = np.array(self._about["y0"]) if "y0" in self._about else None
+        return Loop(state, self.dt, sizes, at_point, start=start)
+
+    def _sample(self, t: float) -> tuple[object, ...]:
+        """Return the number of the sample at time t [s], if the code needs it."""
+        numbered = self._about["kind"] == "samples" or "points" in self._about
+        if numbered or self._about.get("period", 1) > 1:
+            return (ctypes.c_ulong(round(t / self.dt)),)
+        return ()
 
     def _output_step(self, t: float, z: Array, measure: Measure) -> tuple[Array, Array]:
         """Return the command u of a sample, and the next controller state.
@@ -355,14 +373,11 @@ class CLaw(Policy):
         for the second call are measured under the command from the first call.
         """
         u = np.array(self._about["u0"])
-        sample: tuple[object, ...] = ()
-        if self._about.get("period", 1) > 1:
-            sample = (ctypes.c_ulong(round(t / self.dt)),)
         for _ in range(2):
             memory = np.append(z, 0.0).astype(self._real)
             out = np.zeros(len(u), self._real)
             y = measure(u).astype(self._real)
-            self._call(t, memory.ctypes, *sample, y.ctypes, out.ctypes)
+            self._call(t, memory.ctypes, *self._sample(t), y.ctypes, out.ctypes)
             u = out.astype(float)
         return u, memory[:-1].astype(float)
 
@@ -390,7 +405,10 @@ class _Remembering(BoundLaw):
         """Return the inputs (nu,) of a sample, and advance the memory."""
         self._last = next_sample(t, self._last, self._law.dt)
         self._given[self._at] = measured(self._world, q, v)
-        self._law._call(t, self._memory.ctypes, self._given.ctypes, self._u.ctypes)
+        sample = self._law._sample(t)
+        self._law._call(
+            t, self._memory.ctypes, *sample, self._given.ctypes, self._u.ctypes
+        )
         command: Array = self._u.astype(float)
         return command
 
@@ -426,15 +444,11 @@ def _compiled(source: Path, compiler: str) -> ctypes.CDLL:
 
 def _texts(law: Law, name: str, real: str) -> tuple[str, dict[str, str]]:
     """Return the title of a law, and the texts of its four files as {file ending: text}."""
-    state, lin, tables, robot = law.state, law.lin, law.tables, law.robot
+    state, tables, robot = law.state, law.tables, law.robot
     names, units = law.inputs
     kind = "state" if state else "output"
     title = f"{law.title} of '{robot.name}'"
-    frame = ""
-    if state:
-        frame = state.frame
-    elif lin:
-        frame = lin.frame
+    frame = _frame_of(law)
     # Largest rounding error that the test program accepts, relative to `Case.scale`, the sum of the
     # magnitudes of the terms. In single precision, the error is the unit roundoff 2^-24 times the
     # number of operations.
@@ -470,7 +484,7 @@ def _texts(law: Law, name: str, real: str) -> tuple[str, dict[str, str]]:
         "tolerances": _listed("u", names, sizes),
         "inputs": len(names),
         "input_list": _listed("u", names, units),
-        "row": "0",
+        **_sample_words(len(tables["u0"])),
         f"{kind}_list": _listed(signal, *law.signals),
         "vectors": "{\n" + ",\n".join(vectors) + "}",
         "ins": len(law.cases[0].given),
@@ -491,20 +505,48 @@ def _texts(law: Law, name: str, real: str) -> tuple[str, dict[str, str]]:
         words |= _memory_words(words, law.memory, str(words["sample_given"]))
     else:
         nz = law.memory
-        words |= {"states": nz, "states_max": max(nz, 1), "outputs": len(tables["y0"])}
+        outputs = tables["y0"].shape[1]
+        words |= {"states": nz, "states_max": max(nz, 1), "outputs": outputs}
+        if law.points:
+            words["sample_comment"] = (
+                f"\n *{words['sample_comment']}\n * Attitudes and positions in y are relative to "
+                "the base pose of the trajectory at\n * this sample, which "
+                f"{name}.json lists."
+            )
     words["interface"] = _filled(f"{kind}_interface.h", words)
     words["limiting"] = _filled("limiting.c", words).rstrip()
     words["run"] = _filled(f"{kind}_run.c", words)
     header, source = _filled("header.h", words), _filled(f"{kind}_law.c", words)
+    about = _about(law, title, real, frame)
+    about["sha256"] = digest_of(about, header.encode(), source.encode())
+    code = {".h": header, ".c": source, "_test.c": _filled("test.c", words)}
+    return title, {**code, ".json": json.dumps(about, indent=1) + "\n"}
+
+
+def _frame_of(law: Law) -> str:
+    """Return the frame of a law; empty if it is not known."""
+    if law.state:
+        return law.state.frame
+    if law.lin:
+        return law.lin.frame
+    return "local" if law.points else ""
+
+
+def _about(law: Law, title: str, real: str, frame: str) -> dict[str, object]:
+    """Return the description of a law that `CLaw` reads, without its SHA-256."""
+    state, lin, robot = law.state, law.lin, law.robot
+    kind = "state" if state else "output"
+    u0 = law.tables["u0"]
+    initial = u0[0] if law.initial is None else law.initial
     about: dict[str, object] = {
         "title": title,
         "real": real,
         "frame": frame,
         "dt": law.dt,
-        "kind": "samples" if len(tables["u0"]) > 1 else kind,
+        "kind": "samples" if state and len(u0) > 1 else kind,
         "signals": {"input": law.inputs, kind: law.signals},
         "nq": robot.nq,
-        "u0": tables["u0"][0].tolist(),
+        "u0": initial.tolist(),
         "memory": law.memory,
         "reference": None,
         "point": None,
@@ -516,18 +558,20 @@ def _texts(law: Law, name: str, real: str) -> tuple[str, dict[str, str]]:
         if lin.delay.any():
             about["delay"] = lin.delay.tolist()
     if not state:
-        about |= {"period": law.period, "y0": tables["y0"].tolist()}
-    about["sha256"] = digest_of(about, header.encode(), source.encode())
-    code = {".h": header, ".c": source, "_test.c": _filled("test.c", words)}
-    return title, {**code, ".json": json.dumps(about, indent=1) + "\n"}
+        about |= {"period": law.period, "y0": law.tables["y0"][0].tolist()}
+    if law.delay:
+        about["delay"] = list(law.delay)
+    if law.points:
+        q, v = law.points
+        about["points"] = {"q": q.tolist(), "v": v.tolist()}
+    return about
 
 
 def _period_words(period: int) -> dict[str, object]:
     """Return {placeholder: text} for an output law with a table for each sample of a period."""
     words: dict[str, object] = dict.fromkeys(
-        ("sample_argument", "sample_given", "sample_comment"), ""
+        ("tables", "table", "table_row", "table_comment"), ""
     )
-    words |= dict.fromkeys(("tables", "table", "table_row", "table_comment"), "")
     if period > 1:
         words |= {
             "sample_argument": "unsigned long sample, ",
@@ -559,30 +603,39 @@ def _vector(case: Case, law: Law, error: float, array: Callable[[Array], str]) -
     return f"{{{case.sample}UL, {', '.join(numbers)}, {int(cut.any())}}}"
 
 
+def _sample_words(rows: int) -> dict[str, object]:
+    """Return {placeholder: text} for the number of the sample of a law with rows for samples."""
+    words: dict[str, object] = {
+        "rows": rows,
+        "row": "0",
+        **dict.fromkeys(("sample_argument", "sample_given", "sample_comment"), ""),
+    }
+    if rows > 1:
+        last = rows - 1
+        words |= {
+            "row": f"(sample < {last}UL ? sample : {last}UL)",
+            "sample_argument": "unsigned long sample, ",
+            "sample_given": "given->sample, ",
+            "sample_comment": f" sample counts from 0; the last row applies from {last} on.",
+        }
+    return words
+
+
 def _state_words(law: Law, state: StateMap) -> dict[str, object]:
     """Return {placeholder: text} for placeholders that occur only in templates of state laws."""
     n = state.robot.n
-    rows = len(law.tables["u0"])
     points = law.tables.get("axis_points")
     words: dict[str, object] = {
         "joints": n,
         "joints_max": max(n, 1),
         "states": state.nx,
-        "rows": rows,
         "gains": len(law.tables["K"]),
         "joint_list": _listed("joints", state.names[6 : 6 + n], state.units[6 : 6 + n]),
-        **dict.fromkeys(("gains_between", "sample_argument", "sample_given"), ""),
-        "sample_comment": "",
+        "gains_between": "",
         "feedback": "feed_back(0, 1, x, u);",
     }
-    if rows > 1:
-        words |= {
-            "sample_argument": "unsigned long sample, ",
-            "sample_given": "given->sample, ",
-            "sample_comment": f" sample counts from 0; the last row applies from {rows - 1} on.",
-            "row": f"(sample < {rows - 1}UL ? sample : {rows - 1}UL)",
-            "feedback": "feed_back((int)row, 1, x, u);",
-        }
+    if len(law.tables["K"]) > 1:
+        words["feedback"] = "feed_back((int)row, 1, x, u);"
     if points is not None:
         axes, room = points.shape
         joints = ", ".join(

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -13,6 +13,7 @@ from fflin.base.errors import FflinError, InputError
 from fflin.base.rotation import conjugate, quaternion_product
 from fflin.base.validation import Array, Indices, instance
 from fflin.control.compensator import Compensator
+from fflin.control.following import Following, ReferencePath
 from fflin.control.gain import Gain, model_of, sampled_for
 from fflin.control.loops import NOT_CORRECTED, Sample
 from fflin.control.multirate_feedback import MultirateFeedback
@@ -53,9 +54,13 @@ class Law:
 
     A state law is ``u = u0 - K (x - x0)``. Its tables K, x0, u0 and `reference` have one row for
     all samples, or one row for each sample. If there is a table `axis_points`, it contains a grid
-    of joint positions. K then has one row for each grid point, and is interpolated. An output law
-    is ``u = u0 + C z + D (y - y0)``. The next controller state z is ``A z + B (y - y0)``. A state
-    law with memory has ``C z`` as a further term, and the next z is ``A z + B (x - x0)``.
+    of joint positions. K then has one row for each grid point, and is interpolated. A state law
+    with memory has ``C z`` as a further term, and the next z is ``A z + B (x - x0)``. Its K has one
+    row.
+
+    An output law is ``u = u0 + C z + D (y - y0)``. The next controller state z is
+    ``A z + B (y - y0)``. Its tables u0 and y0 have one row for all samples, or one row for each
+    sample.
     """
 
     title: str
@@ -69,6 +74,12 @@ class Law:
     # gain of the anti-windup, which may be empty.
     tables: dict[str, Array]
     memory: int  # number of entries of the memory z
+    # q (N, nq) and v (N, nv) at all samples of an output law that follows a trajectory. Its
+    # attitudes and positions are relative to the base poses in q.
+    points: tuple[Array, Array] | None = None
+    delay: tuple[float, ...] = ()  # delay [s] of each input; empty without delays
+    # inputs (nu,) until the first command arrives, if they are not the first row of u0
+    initial: Array | None = None
     # bound on the number of rounded operations between an argument and a result
     operations: float
     cases: list[Case]
@@ -172,6 +183,8 @@ def _law_of(given: Design, robot: Robot) -> Law:
         if (gain.integrals or gain.delay.any()) and not model.dt:
             model = sampled_for(gain, model)
         policy = StateFeedback(model, law)
+    if isinstance(policy, Following):
+        return _following_law(title, policy, robot)
     form = policy.form(robot)
     if isinstance(form, StateForm) and policy.model:
         dt = given.dt if isinstance(given, Gain) else policy.sample_time
@@ -223,6 +236,35 @@ def _memory_law(title: str, policy: Policy, terms: Sample, robot: Robot) -> Law:
         dt=policy.sample_time,
         terms=terms,
     )
+
+
+def _following_law(title: str, policy: Following, robot: Robot) -> Law:
+    """Convert a law that follows a trajectory, with one row of the tables for each sample."""
+    lin = policy.lin
+    path = ReferencePath(policy, robot)
+    times = policy.sample_time * np.arange(policy.samples)
+    rows = [path.terms(t) for t in times]
+    u0 = np.array([row.u0 for row in rows])
+    q, v, _ = map(np.array, zip(*map(policy.reference, times), strict=True))
+    if policy.senses_outputs:
+        law = _output_law(
+            title,
+            [rows[0]],
+            inputs=(lin.input_names, lin.input_units),
+            signals=(lin.output_names, lin.output_units),
+            dt=policy.sample_time,
+            robot=robot,
+            lin=None,
+            rows=(u0, np.array([row.y0 for row in rows])),
+        )
+        law = replace(law, points=(q, v))
+    else:
+        tables = _references(path.state, q, v) | {"u0": u0, "K": -rows[0].D[None]}
+        law = _law_of_states(
+            title, policy, path.state, tables, {}, robot, terms=rows[0]
+        )
+    delay = tuple(policy.input_delays.values())
+    return replace(law, delay=delay, initial=policy.reference(0.0)[2])
 
 
 def _law_about_point(
@@ -299,8 +341,7 @@ def _law_of_states(
     else:
         _require_sampled(dt)
         memory = len(terms.A)
-        offset = tables["u0"][0] + tables["K"][0] @ terms.y0
-        command = readout(state, tables["K"][0], offset, terms.y0)
+        command = _gain_alone(state, tables, dt)
         tables |= {key: getattr(terms, key) for key in "ABCE"}
     cases = list(_state_cases(state, command, dt, tables, axes, terms))
     tables["in_reference_axes"] = np.array(state.axes)
@@ -326,6 +367,26 @@ def _law_of_states(
         cases=cases,
         memory=memory,
     )
+
+
+def _chart(state: StateMap, tables: Mapping[str, Array], row: int) -> StateMap:
+    """Return the state map about the reference in a row of the tables of a law."""
+    if len(tables["reference"]) == 1:
+        return state
+    return state.about(pin.XYZQUATToSE3(tables["reference"][row]))
+
+
+def _gain_alone(state: StateMap, tables: Mapping[str, Array], dt: float) -> Command:
+    """Return the command of a law with memory whose memory is zero."""
+    [K] = tables["K"]
+
+    def command(t: float, q: Array, v: Array) -> Array:
+        row = round(t / dt)
+        x0, u0 = tables["x0"][row], tables["u0"][row]
+        law = readout(_chart(state, tables, row), K, u0 + K @ x0, x0)
+        return np.asarray(law(t, q, v))
+
+    return command
 
 
 def _state_cases(
@@ -380,14 +441,15 @@ def _state_cases(
         given = measured(world, q, v)
         given[7 : 7 + n] += 2.0 * np.pi * turns
         u = np.asarray(policy(row * dt, q, v))
-        displaced = state.read(q, v, near=x0)
+        displaced = _chart(state, tables, row).read(q, v, near=x0)
         # The next lines sum the magnitudes of the terms in each entry of x - x0.
         omega, v = given[7 + n : 10 + n], given[10 + n : 13 + n]
         pose = [1.0] * 3 + [float(norm(given[4:7]) + norm(about[:3]))] * 3
         rates = np.repeat((norm(omega), norm(v)), 3)
         joints = np.abs(given[7 : 7 + n]), np.abs(given[13 + n :])
         size = np.abs(x0) + np.hstack((pose, joints[0], rates, joints[1]))
-        K = np.abs(tables["K"]).max(axis=0) if axes else np.abs(tables["K"][row])
+        gains = np.abs(tables["K"])
+        K = gains.max(axis=0) if axes else gains[row % len(gains)]
         case = Case(row, given, u, np.abs(u0) + K @ size)
         if terms is not None:
             dx = displaced - x0
@@ -408,17 +470,20 @@ def _samples(policy: TrajectoryFeedback, state: StateMap) -> dict[str, Array]:
     times = dt * np.arange(int(policy.over / dt) + 3)
     times = times[: np.searchsorted(times, policy.over, side="right") + 1]
     q, v, u0 = map(np.array, zip(*map(policy.commanded, times), strict=True))
+    gains = np.array([*map(policy.gain, times)])
+    return _references(state, q, v) | {"u0": u0, "K": gains}
+
+
+def _references(state: StateMap, q: Array, v: Array) -> dict[str, Array]:
+    """Return the tables of base poses and states at points q (N, nq) and v (N, nv)."""
     attitudes = [
         quaternion_product(state.origin_quaternion, quaternion)
         for quaternion in q[:, 3:7]
     ]
+    joints = state.joint_positions(q), state.velocities(v)
     return {
         "reference": np.hstack((state.positions(q), attitudes)),
-        "x0": np.hstack(
-            (np.zeros((len(q), 6)), state.joint_positions(q), state.velocities(v))
-        ),
-        "u0": u0,
-        "K": np.array([*map(policy.gain, times)]),
+        "x0": np.hstack((np.zeros((len(q), 6)), *joints)),
     }
 
 
@@ -464,18 +529,23 @@ def _output_law(
     dt: float,
     robot: Robot,
     lin: LinearModel | None,
+    rows: tuple[Array, Array] | None = None,
 ) -> Law:
-    """Return the law of a controller, with `terms` for each sample of a period."""
+    """Return the law of a controller, with `terms` for each sample of a period.
+
+    `rows` contains u0 and y0 for each sample of a trajectory, if the law follows one.
+    """
     first = terms[0]
     if len(first.A):
         _require_sampled(dt)
     angles = {f"q_m.{joint.name}" for joint in robot.joints if joint.unbounded}
     continuous = np.array([name in angles for name in signals[0]])
-    tables = {key: getattr(first, key) for key in ("A", "B", "C", "D", "E", "y0")}
+    u0, y0 = rows or (first.u0[None], first.y0[None])
+    tables = {key: getattr(first, key) for key in "ABCDE"}
     if len(terms) > 1:
-        for key in ("A", "B", "E"):
+        for key in "ABE":
             tables[key] = np.array([getattr(term, key) for term in terms])
-    tables |= {"u0": first.u0[None], "continuous": continuous}
+    tables |= {"u0": u0, "y0": y0, "continuous": continuous}
     return Law(
         title=title,
         state=None,
@@ -487,19 +557,25 @@ def _output_law(
         tables=tables,
         operations=float(len(first.A) + len(signals[0]) + 16),
         memory=len(first.A),
-        cases=list(_output_cases(terms, np.flatnonzero(continuous))),
+        cases=list(_output_cases(terms, u0, y0, np.flatnonzero(continuous))),
         period=len(terms),
     )
 
 
-def _output_cases(terms: list[Sample], turning: Indices) -> Iterator[Case]:
+def _output_cases(
+    terms: list[Sample], inputs: Array, outputs: Array, turning: Indices
+) -> Iterator[Case]:
     """Yield test cases at random controller states z and outputs y of the robot.
 
-    The results of a case are u and the next z. `terms` contains the law at each sample of a period.
+    `terms` contains the law at each sample of a period; `inputs` and `outputs` contain u0 and y0 of
+    each sample of a trajectory. The results of a case are u and the next z.
     """
     random, (nz, ny) = np.random.default_rng(0), terms[0].B.shape
+    samples = max(len(terms), len(inputs))
     for number in range(CASES):
-        sample = terms[number % len(terms)]
+        index = number % samples
+        row = index % len(inputs)
+        sample = terms[index % len(terms)]._replace(u0=inputs[row], y0=outputs[row])
         size = 10.0 ** random.uniform(-4, 0)
         z, dy = random.normal(scale=size, size=nz), random.normal(scale=size, size=ny)
         turns = np.zeros(ny)
@@ -515,7 +591,7 @@ def _output_cases(terms: list[Sample], turning: Indices) -> Iterator[Case]:
         scale = np.abs(sample.u0) + np.abs(sample.C) @ of_z + np.abs(sample.D) @ of_y
         after = np.abs(sample.A) @ of_z + np.abs(sample.B) @ of_y
         yield Case(
-            number if len(terms) > 1 else 0,
+            index,
             np.append(z, y + turns),
             np.append(u, next_z),
             np.append(scale, after),

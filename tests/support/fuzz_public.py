@@ -70,6 +70,15 @@ def _objects():
     return robot, lin, gain, filtered, {"t": t} | rows, along
 
 
+def _wheels():
+    """Law of a satellite with wheels, and its robot with a base torque."""
+    wheel = fflin.ReactionWheel((0, 0, 1), inertia=1e-6)
+    robot = fflin.load("cubesat", inputs=[wheel])
+    lin = fflin.linearize(robot)
+    law = fflin.StateFeedback(lin, np.zeros(lin.B.shape[::-1]))
+    return {"law": law, "design": robot.replace(inputs=[fflin.BaseTorque(), wheel])}
+
+
 def light(folder):
     """Calls that need no compiled code and no second, by the names of the functions."""
     robot, lin, gain, filtered, knots, along = _objects()
@@ -90,6 +99,7 @@ def light(folder):
     slow_filter = fflin.kalman(slow, 1.0, 1.0)
     slow_law = fflin.lqg(fflin.lqr(slow), slow_filter)
     return {
+        "unload_wheels": _wheels() | {"rate": 0.1},
         "Accelerometer": {"frame": "base"} | sensor,
         "Allocation": {"policy": fflin.StateFeedback(lin, gain.K), "design": robot},
         "BaseForce": {"max": 1.0, "min": (-1.0, -1.0, 0.0), "lag": 0.1},

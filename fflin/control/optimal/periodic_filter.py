@@ -78,7 +78,9 @@ def periodic_filter(
     discrete-time algebraic Riccati equations, Int. J. Control 77(8), 2004.
     """
     # The covariance runs forward in time as the cost of the dual regulator runs backward.
-    P = periodic_cost(over_period(_dual(A, C[row], W, V[np.ix_(row, row)]) for row in used))
+    P = periodic_cost(
+        over_period(_dual(A, C[row], W, V[np.ix_(row, row)]) for row in used)
+    )
     for _ in range(_NEWTON_STEPS):
         P = _newton_step(A, C, W, V, used, P)
     covariances, gains = [], []

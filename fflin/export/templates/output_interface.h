@@ -11,8 +11,8 @@ typedef struct {
 void ${name}_start(${name}_memory *memory);
 
 /* Write the inputs u of this sample and advance the memory to the next sample:
- * u = u0 + C z + D (y - y0), then z = A z + B (y - y0)$windup_comment.$sample_comment If the status is INVALID, u
- * is u0 within the limits, and z is unchanged.
+ * u = u0 + C z + D (y - y0), then z = A z + B (y - y0)$windup_comment. If the status is INVALID, u
+ * is u0 within the limits, and z is unchanged.$sample_comment
  * Call once every sample time with the measured outputs y. The attitude in an output q_b is the
  * vector part of the quaternion relative to the reference, with scalar part >= 0.
  * The angle of a continuous joint may be given with any number of turns.

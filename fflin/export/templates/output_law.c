@@ -18,8 +18,8 @@ $output_list
 static const ${name}_real C[${NAME}_INPUTS][${NAME}_MEMORY_MAX] = $C;
 static const ${name}_real D[${NAME}_INPUTS][${NAME}_OUTPUTS] = $D;
 
-static const ${name}_real u0[1][${NAME}_INPUTS] = $u0;
-static const ${name}_real y0[${NAME}_OUTPUTS] = $y0;
+static const ${name}_real u0[$rows][${NAME}_INPUTS] = $u0;
+static const ${name}_real y0[$rows][${NAME}_OUTPUTS] = $y0;
 static const ${name}_real low[${NAME}_INPUTS] = $low;
 static const ${name}_real high[${NAME}_INPUTS] = $high;
 $windup
@@ -42,11 +42,12 @@ void ${name}_start(${name}_memory *memory)
 int ${name}_step(${name}_memory *memory, ${sample_argument}const ${name}_real y[${NAME}_OUTPUTS],
                  ${name}_real u[${NAME}_INPUTS])
 {
+    const unsigned long row = $row;
     ${name}_real dy[${NAME}_OUTPUTS], next[${NAME}_MEMORY_MAX];
 ${table_row}    int i, j, status = ${NAME}_OK;
 
     for (i = 0; i < ${NAME}_OUTPUTS; i++) {
-        dy[i] = y[i] - y0[i];
+        dy[i] = y[i] - y0[row][i];
         if (continuous[i]) {
             const ${name}_real half = (${name}_real)0.5, turns = dy[i] / TWO_PI;
             if (turns > (${name}_real)-1e6 && turns < (${name}_real)1e6) {
@@ -57,7 +58,7 @@ ${table_row}    int i, j, status = ${NAME}_OK;
         }
     }
     for (i = 0; i < ${NAME}_INPUTS; i++) {
-        u[i] = u0[0][i];
+        u[i] = u0[row][i];
         for (j = 0; j < ${NAME}_MEMORY; j++) {
             u[i] += C[i][j] * memory->z[j];
         }
