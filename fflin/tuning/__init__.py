@@ -1,0 +1,1 @@
+"""Controllers of a given structure, tuned to requirements over uncertain models."""

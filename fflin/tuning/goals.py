@@ -1,0 +1,386 @@
+"""Goals of a tuned law: gains, margins, decay rates, damping, variances and step responses."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar, Literal, TypeAlias
+
+import numpy as np
+
+from fflin.base.errors import InputError
+from fflin.base.validation import number, positive, truth
+from fflin.tuning.weights import Weight, weight_of
+
+if TYPE_CHECKING:
+    from fflin.tuning.structures import Names
+
+# Signals with sizes: names, or {name, group or pattern: size}.
+Sized: TypeAlias = "Names | Mapping[str, float]"
+
+# Largest disk margin of a loop.
+_LARGEST_DISK = 2.0
+
+
+class Goal(ABC):
+    """Goal of `tune`.
+
+    The value of a goal is 1 or less if the goal holds. A hard goal is a constraint: the other goals
+    are improved only as long as all hard goals hold.
+    """
+
+    hard: bool
+    _LABEL: ClassVar[str] = ""
+
+    @property
+    def label(self) -> str:
+        """Short text for the report."""
+        return self._LABEL
+
+
+def _band(band: object) -> tuple[float, float]:
+    """Return the ends of a band of frequencies [rad/s]."""
+    if not isinstance(band, Sequence) or len(band) != 2:
+        raise InputError(f"band is {band!r}, expected (least, largest) in rad/s")
+    low = number("band", band[0])
+    high = math.inf
+    if band[1] != math.inf:
+        high = number("band", band[1])
+    if not 0.0 <= low < high:
+        raise InputError(
+            f"band is {low:g} to {high:g} rad/s, expected 0 <= least < largest"
+        )
+    return low, high
+
+
+def shown(signals: Sized) -> str:
+    """Return signals as a short text."""
+    if isinstance(signals, str):
+        return signals
+    return ", ".join(map(str, signals))
+
+
+@dataclass(frozen=True, eq=False)
+class MaxGain(Goal):
+    """Bound of the largest gain from inputs to outputs over frequency.
+
+    The gain is the largest singular value. Signals are named as in the model:
+
+    - an input of the robot, such as "tau_b.x": as input of the goal, a disturbance that is added
+      to the command; as output of the goal, the command of the law;
+    - a measured output, such as "q_b.x": as input of the goal, an error of its sensor; as output of
+      the goal, its true value. ``"error.NAME"`` is the measured value, the true value and the error
+      of the sensor, which is also the tracking error for a reference of the opposite sign;
+    - a state of the model, only as output of the goal.
+
+    Parameters
+    ----------
+    inputs, outputs : str, sequence of str, or mapping
+        Names, groups or patterns. A mapping ``{name: size}`` divides each signal by its size.
+    below : float or weight
+        Bound of the gain: a number, or a transfer function of frequency, as ``(numerator,
+        denominator)`` or as a SciPy or python-control system with one input and one output. All its
+        poles and zeros must be stable, and its degrees equal.
+    band : (float, float)
+        Frequencies [rad/s] at which the bound holds; all by default.
+    hard : bool
+
+    Raises
+    ------
+    InputError
+        If the bound is not positive, or is not a stable transfer function with stable zeros.
+
+    Examples
+    --------
+    >>> goal = fflin.MaxGain({"tau_b": 0.01}, {"q_b": 1e-3}, below=1.0)
+    >>> rising = fflin.MaxGain("q_b", "error.q_b", below=([2.0, 0.01], [1.0, 0.5]))
+    """
+
+    inputs: Sized
+    outputs: Sized
+    below: object = 1.0
+    band: tuple[float, float] = (0.0, math.inf)
+    hard: bool = False
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "band", _band(self.band))
+        truth("hard", self.hard)
+        self.weight()
+
+    def weight(self) -> Weight:
+        """Return the inverse of the bound."""
+        return weight_of("below", self.below).inverse()
+
+    @property
+    def label(self) -> str:
+        """Short text for the report."""
+        return f"gain {shown(self.inputs)} to {shown(self.outputs)}"
+
+
+@dataclass(frozen=True, eq=False)
+class RollOff(Goal):
+    """Bound of the largest gain from inputs to outputs above a frequency.
+
+    Parameters
+    ----------
+    inputs, outputs : str, sequence of str, or mapping
+        Signals as in `MaxGain`.
+    above : float
+        Frequency [rad/s] above which the bound holds.
+    below : float
+        Bound of the gain.
+    hard : bool
+
+    Raises
+    ------
+    InputError
+        If a number is not positive.
+
+    Examples
+    --------
+    >>> goal = fflin.RollOff("q_b", "tau_b", above=20.0, below=50.0)
+    """
+
+    inputs: Sized
+    outputs: Sized
+    above: float
+    below: float
+    hard: bool = False
+
+    def __post_init__(self) -> None:
+        positive("above", self.above, "rad/s")
+        positive("below", self.below)
+        truth("hard", self.hard)
+
+    @property
+    def band(self) -> tuple[float, float]:
+        """Frequencies [rad/s] at which the bound holds."""
+        return self.above, math.inf
+
+    def weight(self) -> Weight:
+        """Return the inverse of the bound."""
+        return weight_of("below", self.below).inverse()
+
+    @property
+    def label(self) -> str:
+        """Short text for the report."""
+        return f"gain {shown(self.inputs)} to {shown(self.outputs)} above {self.above:g} rad/s"
+
+
+@dataclass(frozen=True, eq=False)
+class Margin(Goal):
+    """Least disk margin for changes of all channels at once; see `margins`.
+
+    The channels are scaled by constant factors, which the search chooses. The disk margin of
+    `margins` uses the best factors at each frequency, so it is at least as large.
+
+    Parameters
+    ----------
+    disk : float
+        Least disk margin, between 0 and 2. A margin of 0.75 allows for gains of 0.45 to 2.2, and
+        for a phase of 41 deg.
+    at : {"inputs", "outputs"}
+        Whether the inputs or the measured outputs are changed.
+    hard : bool
+
+    Raises
+    ------
+    InputError
+        If the margin is not between 0 and 2.
+
+    Examples
+    --------
+    >>> goal = fflin.Margin(0.75, hard=True)
+    """
+
+    disk: float
+    at: Literal["inputs", "outputs"] = "inputs"
+    hard: bool = False
+
+    def __post_init__(self) -> None:
+        disk = positive("disk", self.disk)
+        if disk >= _LARGEST_DISK:
+            raise InputError(f"disk is {disk:g}, expected a margin between 0 and 2")
+        if self.at not in ("inputs", "outputs"):
+            raise InputError(f"at is {self.at!r}, expected 'inputs' or 'outputs'")
+        truth("hard", self.hard)
+
+    @property
+    def label(self) -> str:
+        """Short text for the report."""
+        return f"disk margin at the {self.at}"
+
+
+@dataclass(frozen=True, eq=False)
+class Decay(Goal):
+    """Least decay rate of all poles of the closed loop.
+
+    Parameters
+    ----------
+    rate : float
+        Least decay rate [1/s]: the real parts of all poles are below -rate.
+    hard : bool
+
+    Raises
+    ------
+    InputError
+        If the rate is not positive.
+
+    Examples
+    --------
+    >>> goal = fflin.Decay(0.05)
+    """
+
+    rate: float
+    hard: bool = False
+    _LABEL = "decay rate"
+
+    def __post_init__(self) -> None:
+        positive("rate", self.rate, "1/s")
+        truth("hard", self.hard)
+
+
+@dataclass(frozen=True, eq=False)
+class Damping(Goal):
+    """Least damping ratio of the poles of the closed loop.
+
+    Parameters
+    ----------
+    ratio : float
+        Least damping ratio, between 0 and 1.
+    band : (float, float)
+        Magnitudes [rad/s] of the poles to which the goal applies; all by default.
+    hard : bool
+
+    Raises
+    ------
+    InputError
+        If the ratio is not between 0 and 1, or the band is empty.
+
+    Examples
+    --------
+    >>> goal = fflin.Damping(0.5, band=(0.0, 1.0))
+    """
+
+    ratio: float
+    band: tuple[float, float] = (0.0, math.inf)
+    hard: bool = False
+    _LABEL = "damping ratio"
+
+    def __post_init__(self) -> None:
+        ratio = positive("ratio", self.ratio)
+        if ratio > 1.0:
+            raise InputError(f"ratio is {ratio:g}, expected a damping ratio up to 1")
+        object.__setattr__(self, "band", _band(self.band))
+        truth("hard", self.hard)
+
+
+@dataclass(frozen=True, eq=False)
+class Variance(Goal):
+    r"""Bounds of standard deviations under white noise.
+
+    Parameters
+    ----------
+    inputs : mapping
+        Noise ``{name: density}`` at the signals of `MaxGain`. In continuous time, the density is
+        the square root of the intensity W of ``E[w(t) w(t')] = W \delta(t - t')``, as in `kalman`.
+        For a sampled model, it is the standard deviation of each sample.
+    outputs : mapping
+        Largest standard deviation of each signal, ``{name: largest}``.
+    hard : bool
+
+    Raises
+    ------
+    InputError
+        If a number is not positive.
+
+    Examples
+    --------
+    >>> goal = fflin.Variance({"tau_b": 1e-3}, {"q_b": 1e-4})
+    """
+
+    inputs: Mapping[str, float]
+    outputs: Mapping[str, float]
+    hard: bool = False
+
+    def __post_init__(self) -> None:
+        for key in ("inputs", "outputs"):
+            if not isinstance(getattr(self, key), Mapping):
+                raise InputError(
+                    f"{key} are {getattr(self, key)!r}, expected {{name: standard deviation}}"
+                )
+        truth("hard", self.hard)
+
+    @property
+    def label(self) -> str:
+        """Short text for the report."""
+        return f"variance of {shown(self.outputs)}"
+
+
+@dataclass(frozen=True, eq=False)
+class Track(Goal):
+    """Step response of an output to its reference within a template.
+
+    The law receives the measured output minus the reference.
+
+    Parameters
+    ----------
+    output : str
+        Name of a measured output.
+    settling : float
+        Time [s] after which the error stays within `within`.
+    within : float
+        Largest error after the settling time, relative to the step.
+    overshoot : float
+        Largest overshoot, relative to the step.
+    duration : float, optional
+        Duration [s] that is examined; three settling times by default.
+    hard : bool
+
+    Raises
+    ------
+    InputError
+        If a number is not positive, or the duration is not longer than the settling time.
+
+    Examples
+    --------
+    >>> goal = fflin.Track("q_b.x", settling=60.0, within=0.05, overshoot=0.3)
+    """
+
+    output: str
+    settling: float
+    within: float = 0.05
+    overshoot: float = 0.2
+    duration: float | None = None
+    hard: bool = False
+
+    def __post_init__(self) -> None:
+        settling = positive("settling", self.settling, "s")
+        positive("within", self.within)
+        positive("overshoot", self.overshoot)
+        duration = self.examined
+        if not positive("duration", duration, "s") > settling:
+            raise InputError(
+                f"duration is {duration:g} s, expected more than the settling time of "
+                f"{settling:g} s"
+            )
+        truth("hard", self.hard)
+
+    @property
+    def examined(self) -> float:
+        """Duration [s] that is examined."""
+        return 3.0 * self.settling if self.duration is None else self.duration
+
+    @property
+    def label(self) -> str:
+        """Short text for the report."""
+        return f"step of {self.output}"
+
+    def bounds(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the least and the largest error y - 1 of a unit step at times [s]."""
+        settled = times >= self.settling
+        low = np.where(settled, -self.within, -1.0)
+        high = np.where(settled, min(self.within, self.overshoot), self.overshoot)
+        return low, high

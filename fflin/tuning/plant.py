@@ -1,0 +1,134 @@
+"""Plants of a search: matrices of linear models with their signals, in continuous time.
+
+A model sampled at dt is transformed to continuous time by s = (2/dt) (z - 1)/(z + 1). A continuous
+law closes the loop with this plant exactly as its Tustin discretisation does with the sampled model.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from fflin.base.validation import Array
+from fflin.linear.model import LinearModel
+
+# A response of the plant below this fraction of the largest counts as zero.
+_ROUNDING = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Signals:
+    """Names and units of measured outputs and inputs, and the matrices between them."""
+
+    outputs: tuple[str, ...]
+    inputs: tuple[str, ...]
+    output_units: tuple[str, ...]
+    input_units: tuple[str, ...]
+    A: Array
+    B: Array
+    C: Array
+
+    @cached_property
+    def _markov(self) -> list[Array]:
+        """Products C A^k B, the initial derivatives of the impulse responses."""
+        products = []
+        states = self.B
+        for _ in range(4):
+            products.append(self.C @ states)
+            states = self.A @ states
+        return products
+
+    def response(self, output: int, command: int) -> tuple[float, int]:
+        """Return the gain g and order r of the fast response g / s^r of an output to an input."""
+        for order, product in enumerate(self._markov, 1):
+            gain = float(product[output, command])
+            if abs(gain) > _ROUNDING * np.abs(product).max(initial=0.0):
+                return gain, order
+        return 0.0, 1
+
+
+@dataclass(frozen=True, eq=False)
+class Plant:
+    """Plant ``x' = A x + B u, y = C x + D u``; the rows of C are outputs and then states.
+
+    `dt` is the sample time [s] of the model before the transformation, or 0.
+    """
+
+    A: Array
+    B: Array
+    C: Array
+    D: Array
+    ny: int
+    dt: float
+
+    def time(self, frequency: float) -> float:
+        """Return the frequency [rad/s] in the time of the model."""
+        if not self.dt:
+            return frequency
+        return 2.0 * math.atan(0.5 * self.dt * frequency) / self.dt
+
+    def warped(self, frequency: float) -> float:
+        """Return the frequency of the plant for a frequency [rad/s] in the time of the model."""
+        angle = 0.5 * self.dt * frequency
+        if not self.dt or math.isinf(frequency):
+            return frequency
+        if angle >= 0.5 * math.pi:
+            return math.inf
+        return math.tan(angle) * 2.0 / self.dt
+
+
+def signals_of(lin: LinearModel) -> Signals:
+    """Return the measured outputs and the inputs of a model, for its continuous time."""
+    source = lin.generator if lin.dt else lin
+    model = lin if source is None else source
+    return Signals(
+        lin.output_names,
+        lin.input_names,
+        lin.output_units,
+        lin.input_units,
+        model.A,
+        model.B,
+        model.C,
+    )
+
+
+def joined(A: Array, B: Array, C: Array) -> Array:
+    """Return the indices of the states that an input reaches and that affect an output."""
+    links = np.abs(A) > _ROUNDING * np.abs(A).max(initial=0.0)
+    reached = np.abs(B).max(axis=1, initial=0.0) > _ROUNDING * np.abs(B).max(initial=0.0)
+    seen = C.any(axis=0)
+    for _ in A:
+        reached = reached | links[:, reached].any(axis=1)
+        seen = seen | links[seen].any(axis=0)
+    return np.flatnonzero(reached & seen)
+
+
+def plant_of(matrices: tuple[Array, Array, Array, Array], dt: float, used: Array) -> Plant:
+    """Return the plant of a model.
+
+    `used` (ny + nx,) marks the outputs and states that a law or a goal uses. States without an
+    effect on them, and states that no input reaches, are left out.
+    """
+    A, B, C, D = matrices
+    ny, nx = len(C), len(A)
+    C = np.vstack((C, np.eye(nx)))
+    D = np.vstack((D, np.zeros((nx, B.shape[1]))))
+    kept = joined(A, B, C[used])
+    A, B, C = A[np.ix_(kept, kept)], B[kept], C[:, kept]
+    if not dt:
+        return Plant(A, B, C, D, ny, 0.0)
+    rate = 2.0 / dt
+    unit = np.eye(len(A))
+    inverse = np.linalg.inv(A + unit)
+    factor = math.sqrt(2.0 * rate)
+    return Plant(
+        rate * inverse @ (A - unit),
+        factor * inverse @ B,
+        factor * C @ inverse,
+        D - C @ inverse @ B,
+        ny,
+        dt,
+    )

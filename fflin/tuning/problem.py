@@ -1,0 +1,203 @@
+"""Problem of a search: parameters, plants and goals as functions of one vector."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fflin.base.validation import Array
+from fflin.tuning.channels import Channel, Ends, channel_of
+from fflin.tuning.closed_loop import ClosedLoop
+from fflin.tuning.criteria import Piece, abscissa_pieces, pieces_of
+from fflin.tuning.goals import Goal, Margin
+from fflin.tuning.law import Law
+from fflin.tuning.plant import Plant
+from fflin.tuning.search import Term
+from fflin.tuning.structures import Structured
+
+# Values of goals below this one are left out of the search.
+_LEAST = 1e-9
+
+# Hard goals are tighter by this factor (in the logarithm), so that they hold after rounding.
+_TIGHT = 1e-6
+
+# Bound of the logarithm of the scaling of a channel.
+_SCALING = math.log(1e6)
+
+
+@dataclass(frozen=True, eq=False)
+class Measure:
+    """Goal with its inputs and outputs."""
+
+    goal: Goal
+    ends: Ends | None
+
+
+class Case:
+    """Plant with the channels of all goals."""
+
+    def __init__(self, plant: Plant, measures: Sequence[Measure]) -> None:
+        self.plant = plant
+        self.channels: list[Channel | None] = [
+            None if m.ends is None else channel_of(m.goal, m.ends, plant)
+            for m in measures
+        ]
+
+    def loops(self, law: Law) -> list[ClosedLoop] | None:
+        """Return the closed loop of each goal, or None if one of them is unstable."""
+        main = ClosedLoop(self.plant, law)
+        if not main.is_stable:
+            return None
+        loops = []
+        for channel in self.channels:
+            loop = main
+            if channel is not None and channel.plant is not self.plant:
+                loop = ClosedLoop(channel.plant, law)
+            loops.append(loop)
+        return loops
+
+
+class Problem:
+    """Goals of a structured law for several plants.
+
+    The vector x contains the coordinates of the free parameters, and then the logarithms of the
+    scalings of the channels of each margin, without the first channel.
+    """
+
+    def __init__(
+        self, structured: Structured, measures: Sequence[Measure], cases: list[Case]
+    ) -> None:
+        self.structured = structured
+        self.measures = measures
+        self.cases = cases
+        parameters = structured.parameters
+        self.free = [i for i, is_free in enumerate(structured.free) if is_free]
+        self.scalings: list[slice | None] = []
+        size = len(self.free)
+        for measure in measures:
+            place = None
+            if isinstance(measure.goal, Margin) and measure.ends is not None:
+                more = len(measure.ends.sources) - 1
+                place = slice(size, size + more)
+                size += more
+            self.scalings.append(place)
+        self.size = size
+        low = np.full(size, -_SCALING)
+        high = np.full(size, _SCALING)
+        for place, index in enumerate(self.free):
+            low[place], high[place] = parameters[index].bounds
+        self.bounds = low, high
+
+    def start(self, rng: np.random.Generator | None = None) -> Array:
+        """Return the start values, or random ones."""
+        x = np.zeros(self.size)
+        for place, index in enumerate(self.free):
+            parameter = self.structured.parameters[index]
+            if rng is None:
+                x[place] = parameter.coordinate(parameter.value)
+            else:
+                x[place] = parameter.drawn(rng)
+        started: Array = np.clip(x, *self.bounds)
+        return started
+
+    def values(self, x: Array) -> tuple[Array, Array]:
+        """Return the values of all parameters, and the derivatives of the free ones."""
+        parameters = self.structured.parameters
+        values = np.array([parameter.value for parameter in parameters])
+        rates = np.zeros(len(self.free))
+        for place, index in enumerate(self.free):
+            values[index], rates[place] = parameters[index].at(float(x[place]))
+        return values, rates
+
+    def law(self, x: Array) -> Law:
+        """Return the law at a point."""
+        return self.structured.law(self.values(x)[0])
+
+    def scaling(self, x: Array, index: int) -> Array:
+        """Return the logarithms of the scalings of the channels of a goal."""
+        place = self.scalings[index]
+        if place is None:
+            return np.zeros(0)
+        return np.concatenate(([0.0], x[place]))
+
+    def pieces(self, x: Array, case: Case) -> list[list[Piece]] | None:
+        """Return the pieces of each goal for a plant, or None if the loop is unstable."""
+        loops = case.loops(self.law(x))
+        if loops is None:
+            return None
+        return [
+            pieces_of(
+                measure.goal, measure.ends, channel, loop, self.scaling(x, index)
+            )
+            for index, (measure, channel, loop) in enumerate(
+                zip(self.measures, case.channels, loops, strict=True)
+            )
+        ]
+
+    def evaluate(self, x: Array) -> list[Term] | None:
+        """Return the logarithms of the values of all goals, or None if a loop is unstable.
+
+        If all goals are hard, they are treated as objectives.
+        """
+        rates = self.values(x)[1]
+        all_hard = all(measure.goal.hard for measure in self.measures)
+        terms: list[Term] = []
+        for number, case in enumerate(self.cases):
+            pieces = self.pieces(x, case)
+            if pieces is None:
+                return None
+            for index, of_goal in enumerate(pieces):
+                hard = self.measures[index].goal.hard and not all_hard
+                for piece in of_goal:
+                    if not math.isfinite(piece.value):
+                        return None
+                    if piece.value > _LEAST:
+                        key = (number, index)
+                        terms.append(self._term(piece, hard, key, rates))
+        return terms or None
+
+    def _term(
+        self, piece: Piece, hard: bool, key: tuple[int, int], rates: Array
+    ) -> Term:
+        place = self.scalings[key[1]]
+
+        def gradient() -> Array:
+            of_parameters, of_scaling = piece.gradient()
+            result = np.zeros(self.size)
+            result[: len(self.free)] = of_parameters[self.free] * rates
+            if place is not None and len(of_scaling):
+                result[place] = of_scaling[1:]
+            return result / piece.value
+
+        where = math.log(piece.where) if piece.where > 0.0 else piece.where
+        value = math.log(piece.value) + (_TIGHT if hard else 0.0)
+        return Term(value, hard, key, where, gradient)
+
+    def abscissas(self, x: Array) -> list[Term] | None:
+        """Return the real parts of the poles of all plants."""
+        rates = self.values(x)[1]
+        law = self.law(x)
+        terms = []
+        for number, case in enumerate(self.cases):
+            loop = ClosedLoop(case.plant, law)
+            if not loop.well_posed or not np.isfinite(loop.A).all():
+                return None
+            for piece in abscissa_pieces(loop):
+
+                def gradient(piece: Piece = piece) -> Array:
+                    result = np.zeros(self.size)
+                    of_parameters = piece.gradient()[0]
+                    result[: len(self.free)] = of_parameters[self.free] * rates
+                    return result
+
+                where = math.log(piece.where) if piece.where > 0.0 else piece.where
+                terms.append(Term(piece.value, False, number, where, gradient))
+        return terms
+
+    def is_stable(self, x: Array) -> bool:
+        """Return whether the loops of all plants are stable."""
+        law = self.law(x)
+        return all(case.loops(law) is not None for case in self.cases)

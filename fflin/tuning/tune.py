@@ -1,0 +1,439 @@
+"""Tuning of a law of a given structure to goals, over one model, several, or uncertain ones."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fflin.base.errors import InputError
+from fflin.base.process import Progress, in_one_thread
+from fflin.base.validation import Array, ArrayLike, count, instance, whole
+from fflin.linear.model import Delay
+from fflin.tuning.channels import ends_of
+from fflin.tuning.criteria import Piece
+from fflin.tuning.goals import Goal
+from fflin.tuning.plant import Plant, Signals, plant_of, signals_of
+from fflin.tuning.points import Point, Points, points_of
+from fflin.tuning.problem import Case, Measure, Problem
+from fflin.tuning.search import Minimum, Term, minimise
+from fflin.tuning.structures import Structure, Structured
+from fflin.tuning.tuned import GoalValue, Tuned, is_active
+from fflin.tuning.verification import second_value
+
+# Steps of the search for a stable loop, and its real part of the poles relative to the slowest.
+_STABILISING = 150
+
+# Rounds in which worst models are added.
+_ROUNDS = 12
+
+# A model is worse if a goal exceeds its value in the search, or its limit, by this factor.
+_WORSE = 1.0 + 1e-4
+
+# Random models that are examined in all rounds but the last.
+_FEW = 24
+
+# A pole of the plant is fixed if a test of Hautus has a smaller singular value.
+_FIXED = 1e-9
+
+
+@in_one_thread
+def tune(
+    plant: object,
+    structure: Structure,
+    goals: Goal | Sequence[Goal],
+    *,
+    dt: float | None = None,
+    delay: Delay = 0.0,
+    q: ArrayLike | None = None,
+    starts: int = 3,
+    steps: int = 300,
+    seed: int = 0,
+) -> Tuned:
+    """Tune the parameters of a law of a given structure to goals.
+
+    The search minimises the largest value of the soft goals, while the hard goals hold. It is local:
+    it starts several times, and stops at points where no small change improves all active goals.
+
+    Parameters
+    ----------
+    plant : LinearModel, sequence of LinearModel, or Uncertain
+        Model or models for which the goals must hold. For an `Uncertain`, the search begins with the
+        nominal model. It adds the worst of the corners and of 200 random points of the ranges, until
+        none of them is worse.
+    structure : Structure
+        Structure of the law: `PD`, `PID`, `StaticGain`, `StateSpaceLaw`, `CustomLaw`, filters, sums
+        and series.
+    goals : Goal or sequence of Goal
+        `MaxGain`, `RollOff`, `Margin`, `Decay`, `Damping`, `Variance` and `Track`.
+    dt : float, optional
+        Sample time of the law [s]: the plant is sampled with held inputs, and the law by Tustin's
+        method. By default, the law is continuous, or has the sample time of the model.
+    delay : float or mapping, optional
+        Delay of the inputs [s] with `dt`; see `LinearModel.discretize`.
+    q : array_like (nq,), optional
+        Configuration of an `Uncertain`; neutral by default.
+    starts : int
+        Number of starts; the first one begins at the values of the structure.
+    steps : int
+        Largest number of steps of each search.
+    seed : int
+        The same seed gives the same law, bit for bit.
+
+    Returns
+    -------
+    Tuned
+        Law with the values of its parameters and the report.
+
+    Raises
+    ------
+    InputError
+        If one of these conditions is true:
+
+        - a signal of a goal or of the structure does not exist;
+        - no start reaches a stable loop, for example because no law can move an unstable pole;
+        - the variance of a goal is infinite, because noise reaches its output without a lag.
+
+    References
+    ----------
+    P. Apkarian and D. Noll, Nonsmooth H-infinity synthesis, IEEE Transactions on Automatic Control
+    51(1), 2006.
+
+    Examples
+    --------
+    >>> lin = fflin.linearize(fflin.load("planar_detumble"))
+    >>> law = fflin.PD("q_b", "tau_b", rates="omega_b")
+    >>> goals = [fflin.MaxGain({"tau_b": 0.01}, {"q_b": 0.05}), fflin.Margin(0.8, hard=True)]
+    >>> tuned = fflin.tune(lin, law, goals, starts=1)
+    >>> tuned.met
+    True
+    """
+    started = time.process_time()
+    instance("structure", structure, Structure, "a structure of a law, such as fflin.PD")
+    every = [goals] if isinstance(goals, Goal) else goals
+    if not isinstance(every, Sequence) or not every:
+        raise InputError(f"goals are {goals!r}, expected one goal or more")
+    for goal in every:
+        instance("goal", goal, Goal, "a goal, such as fflin.MaxGain")
+    starts = count("starts", starts, largest=1000)
+    steps = count("steps", steps, largest=100_000)
+    seed = whole("seed", seed, 0)
+    at = None if q is None else np.asarray(q, float)
+    points = points_of(plant, dt, delay, seed, at)
+    task = _Task(structure, every, points)
+    bar = Progress()
+    problem, x, minimum, values = task.first(starts, steps, seed, bar)
+    problem, minimum = task.with_worst(problem, x, minimum, steps, bar)
+    bar.close()
+    return task.result(problem, minimum, values, time.process_time() - started)
+
+
+@dataclass(frozen=True, eq=False)
+class _Worst:
+    """Largest value of a goal, the model where it occurs, and its piece."""
+
+    value: float
+    point: Point
+    case: Case
+    piece: Piece | None
+
+
+class _Task:
+    """Search of a structure, goals and models."""
+
+    def __init__(
+        self, structure: Structure, goals: Sequence[Goal], points: Points
+    ) -> None:
+        self.points = points
+        lin = points.nominal
+        self.lin = lin
+        self.signals: Signals = signals_of(lin)
+        self.structured = Structured(structure, self.signals)
+        measured, commanded = self.structured.used
+        self.measures = [
+            Measure(
+                goal,
+                ends_of(goal, self.signals, lin.state_names, measured, commanded),
+            )
+            for goal in goals
+        ]
+        for measure in self.measures:
+            if lin.dt and measure.ends is not None:
+                _require_slow(measure, lin.dt)
+        ny = len(lin.output_names)
+        self.used = np.zeros(ny + len(lin.state_names), bool)
+        self.used[list(measured)] = True
+        for measure in self.measures:
+            if measure.ends is not None:
+                for kind, index in (*measure.ends.sinks, *measure.ends.sources):
+                    if kind in ("output", "error", "sensor"):
+                        self.used[index] = True
+        self.cases: dict[int, Case] = {}
+        self.chosen: list[Point] = list(points.fixed)
+
+    def case(self, point: Point) -> Case:
+        """Return the plant of a model with the channels of the goals."""
+        key = id(point)
+        if key not in self.cases:
+            self.cases[key] = Case(self.plant(point), self.measures)
+        return self.cases[key]
+
+    def plant(self, point: Point) -> Plant:
+        """Return the plant of a model."""
+        used = self.used
+        more = len(point.matrices[0]) + len(point.matrices[2]) - len(used)
+        used = np.append(used, np.zeros(max(more, 0), bool))
+        return plant_of(point.matrices, self.lin.dt, used)
+
+    def problem(self) -> Problem:
+        """Return the problem of the models that are chosen."""
+        cases = [self.case(point) for point in self.chosen]
+        return Problem(self.structured, self.measures, cases)
+
+    def first(
+        self, starts: int, steps: int, seed: int, bar: Progress
+    ) -> tuple[Problem, Array, Minimum, tuple[float, ...]]:
+        """Search from several starts, and return the best result and the values of all."""
+        problem = self.problem()
+        best: Minimum | None = None
+        values = []
+        for number in range(starts):
+            rng = np.random.default_rng([seed, number]) if number else None
+            x = self.stabilised(problem, problem.start(rng))
+            value = math.inf
+            if x is not None:
+                minimum = minimise(problem.evaluate, x, problem.bounds, steps=steps)
+                value = _level(minimum)
+                if best is None or _is_better(minimum, best):
+                    best = minimum
+            values.append(value)
+            bar(number + 1, starts, "search")
+        if best is None:
+            raise InputError(self._why_unstable(problem))
+        return problem, best.x, best, tuple(values)
+
+    def stabilised(self, problem: Problem, x: Array) -> Array | None:
+        """Return a point whose loops are all stable, found from x; None if there is none."""
+        if problem.evaluate(x) is not None:
+            return x
+        if problem.abscissas(x) is None:
+            return None
+
+        def is_stable(terms: list[Term]) -> bool:
+            return max(term.value for term in terms) < 0.0
+
+        minimum = minimise(
+            problem.abscissas, x, problem.bounds, steps=_STABILISING, is_done=is_stable
+        )
+        if problem.evaluate(minimum.x) is None:
+            return None
+        return minimum.x
+
+    def with_worst(
+        self, problem: Problem, x: Array, minimum: Minimum, steps: int, bar: Progress
+    ) -> tuple[Problem, Minimum]:
+        """Add the worst models until none is worse, and return the last problem and result."""
+        if not self.points.candidates:
+            return problem, minimum
+        few = self.points.candidates[: self.points.corners + _FEW]
+        for number in range(_ROUNDS):
+            bar(number + 1, _ROUNDS, "worst models")
+            added = self._worse(problem, minimum.x, few)
+            if not added:
+                added = self._worse(problem, minimum.x, self.points.candidates)
+            if not added:
+                break
+            self.chosen += added
+            problem = self.problem()
+            start = self.stabilised(problem, minimum.x)
+            if start is None:
+                raise InputError(
+                    "no law of this structure was found that stabilises all models; give narrower "
+                    "ranges, or another structure"
+                )
+            minimum = minimise(problem.evaluate, start, problem.bounds, steps=steps)
+        return problem, minimum
+
+    def _worse(
+        self, problem: Problem, x: Array, candidates: Sequence[Point]
+    ) -> list[Point]:
+        """Return the worst model of each goal among candidates, if it is worse than all chosen."""
+        known = [worst.value for worst in self.worst(problem, x, self.chosen)]
+        soft = [
+            value
+            for value, measure in zip(known, self.measures, strict=True)
+            if not measure.goal.hard
+        ]
+        level = max(soft, default=0.0)
+        added = []
+        others = [point for point in candidates if point not in self.chosen]
+        if not others:
+            return []
+        for worst, measure in zip(
+            self.worst(problem, x, others), self.measures, strict=True
+        ):
+            limit = 1.0 if measure.goal.hard else level
+            if worst.value > limit * _WORSE and worst.point not in added:
+                added.append(worst.point)
+        return added
+
+    def worst(
+        self, problem: Problem, x: Array, points: Sequence[Point]
+    ) -> list[_Worst]:
+        """Return the largest value of each goal over models."""
+        results: list[_Worst | None] = [None] * len(self.measures)
+        for point in points:
+            case = self.case(point)
+            pieces = problem.pieces(x, case)
+            for index in range(len(self.measures)):
+                value, piece = math.inf, None
+                if pieces is not None:
+                    piece = pieces[index][0]
+                    value = piece.value
+                known = results[index]
+                if known is None or value > known.value:
+                    results[index] = _Worst(value, point, case, piece)
+        return [result for result in results if result is not None]
+
+    def result(
+        self,
+        problem: Problem,
+        minimum: Minimum,
+        starts: tuple[float, ...],
+        seconds: float,
+    ) -> Tuned:
+        """Return the tuned law with its report."""
+        every = [*self.chosen, *self.points.candidates]
+        distinct = list({id(point): point for point in every}.values())
+        worst = self.worst(problem, minimum.x, distinct)
+        law = problem.law(minimum.x)
+        soft = [w.value for w, m in zip(worst, self.measures, strict=True) if not m.goal.hard]
+        level = max(soft, default=max(w.value for w in worst))
+        goals = []
+        for index, (found, measure) in enumerate(zip(worst, self.measures, strict=True)):
+            check, where = math.nan, math.nan
+            loops = found.case.loops(law)
+            if loops is not None and found.piece is not None:
+                channel = found.case.channels[index]
+                second = second_value(measure.goal, measure.ends, channel, loops[index])
+                check = math.nan if second is None else second
+                where = found.piece.where
+            hard = measure.goal.hard
+            active = is_active(found.value, hard, level)
+            goals.append(
+                GoalValue(
+                    measure.goal.label,
+                    hard,
+                    found.value,
+                    check,
+                    where,
+                    dict(found.point.parameters),
+                    active,
+                )
+            )
+        values = problem.values(minimum.x)[0].tolist()
+        parameters = self.structured.parameters
+        factor = max(goal.worst for goal in goals)
+        conflict: tuple[str, ...] = ()
+        if not all(goal.met for goal in goals):
+            factor, conflict = self._contradiction(problem, minimum)
+        return Tuned(
+            law,
+            self.lin,
+            parameters={p.name: v for p, v in zip(parameters, values, strict=True)},
+            units={p.name: p.unit for p in parameters},
+            goals=tuple(goals),
+            factor=factor,
+            conflict=conflict,
+            stationarity=minimum.stationarity,
+            points=tuple(dict(point.parameters) for point in self.chosen),
+            examined=len(distinct),
+            starts=starts,
+            seconds=seconds,
+            history=np.exp(np.array(minimum.history).reshape(-1, 2)),
+        )
+
+    def _contradiction(
+        self, problem: Problem, minimum: Minimum
+    ) -> tuple[float, tuple[str, ...]]:
+        """Return the least factor by which all goals would hold, and the goals that limit it."""
+        relaxed = minimum
+        if any(measure.goal.hard for measure in self.measures):
+
+            def evaluate(x: Array) -> list[Term] | None:
+                terms = problem.evaluate(x)
+                if terms is None:
+                    return None
+                return [term._replace(is_constraint=False) for term in terms]
+
+            relaxed = minimise(evaluate, minimum.x, problem.bounds, steps=_STABILISING)
+        weights: dict[int, float] = {}
+        for key, weight in relaxed.weights.items():
+            index = key[1] if isinstance(key, tuple) else 0
+            weights[index] = weights.get(index, 0.0) + weight
+        largest = sorted(weights, key=lambda index: -weights[index])[:2]
+        labels = tuple(
+            self.measures[index].goal.label
+            for index in largest
+            if weights[index] > 1e-3
+        )
+        return math.exp(relaxed.objective), labels
+
+    def _why_unstable(self, problem: Problem) -> str:
+        """Return why no start was stable."""
+        plant = problem.cases[0].plant
+        poles = np.linalg.eigvals(plant.A)
+        measured, commanded = self.structured.used
+        for pole in poles[poles.real > -1e-9 * np.abs(poles).max(initial=0.0)]:
+            inner = plant.A - pole * np.eye(len(plant.A))
+            size = np.abs(plant.A).max(initial=1.0)
+            tests = {
+                "the inputs of the structure cannot move": np.hstack(
+                    (inner, plant.B[:, list(commanded)])
+                ),
+                "the measured outputs do not contain": np.vstack(
+                    (inner, plant.C[list(measured)])
+                ).T,
+            }
+            for reason, matrix in tests.items():
+                scales = np.linalg.norm(matrix, axis=0)
+                scaled = matrix / np.where(scales > 0.0, scales, 1.0)
+                if np.linalg.svd(scaled, compute_uv=False)[-1] < _FIXED * size:
+                    return (
+                        f"no law of this structure is stable: {reason} the pole {pole:.3g} of the "
+                        "plant; give other inputs or outputs, or goals without the states of this "
+                        "pole"
+                    )
+        return (
+            "no start reached a stable loop; give start values (fflin.Tunable), more starts, or "
+            "another structure"
+        )
+
+
+def _require_slow(measure: Measure, dt: float) -> None:
+    """Raise `InputError` if a goal is about frequencies above half the sample rate."""
+    assert measure.ends is not None
+    low = measure.ends.band[0]
+    if low >= math.pi / dt:
+        raise InputError(
+            f"the goal '{measure.goal.label}' begins at {low:g} rad/s, but the law is sampled at "
+            f"{dt:g} s, half of whose rate is {math.pi / dt:.3g} rad/s; give a lower frequency"
+        )
+
+
+def _level(minimum: Minimum) -> float:
+    """Return the largest value of the goals."""
+    return math.exp(max(minimum.objective, minimum.violation))
+
+
+def _is_better(minimum: Minimum, other: Minimum) -> bool:
+    """Return whether a result is better; one that violates hard goals less is better."""
+    least = 1e-6
+    if minimum.violation > least or other.violation > least:
+        if abs(minimum.violation - other.violation) > least:
+            return minimum.violation < other.violation
+    return minimum.objective < other.objective
+

@@ -1,0 +1,268 @@
+"""Result of a search: the tuned law with its report."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from fflin.base import html
+from fflin.base.record import write_record
+from fflin.base.tables import cut, folded, grid
+from fflin.base.validation import Array
+from fflin.base.writing import as_path
+from fflin.control.linear_controller import LinearController
+from fflin.linear.model import LinearModel
+from fflin.tuning.law import Law
+
+# A goal whose value is this near to the largest one is active.
+_ACTIVE = 1e-2
+
+
+@dataclass(frozen=True)
+class GoalValue:
+    """Value of a goal for a tuned law.
+
+    Attributes
+    ----------
+    label : str
+        The goal in words.
+    hard : bool
+    value : float
+        Value at the worst model; the goal holds if it is at most 1.
+    check : float
+        The same value by a second method; NaN for poles.
+    frequency : float
+        Frequency [rad/s] of the peak, magnitude [rad/s] of the pole, or time [s] of a step response;
+        NaN for variances.
+    parameters : mapping
+        Uncertain parameters at which the value occurs; empty for the nominal model.
+    active : bool
+        Whether this goal limits the others: its value is the largest, or that of a hard goal that
+        just holds.
+
+    Examples
+    --------
+    >>> lin = fflin.linearize(fflin.load("planar_detumble"))
+    >>> law = fflin.PD("q_b", "tau_b", rates="omega_b")
+    >>> tuned = fflin.tune(lin, law, [fflin.Decay(0.1)], starts=1)
+    >>> tuned.goals[0].met, tuned.goals[0].label
+    (True, 'decay rate')
+    """
+
+    label: str
+    hard: bool
+    value: float
+    check: float
+    frequency: float
+    parameters: Mapping[str, float]
+    active: bool
+
+    @property
+    def worst(self) -> float:
+        """The larger of both values."""
+        if math.isnan(self.check):
+            return self.value
+        return max(self.value, self.check)
+
+    @property
+    def met(self) -> bool:
+        """Whether both values are at most 1."""
+        return self.worst <= 1.0
+
+
+class Tuned(LinearController):
+    """Law that `tune` found; a linear policy.
+
+    It is a `LinearController`: `simulate` and `monte_carlo` fly it, `margins` computes its margins,
+    `write_c` writes its C code, and `save` writes its matrices.
+
+    Attributes
+    ----------
+    parameters : mapping
+        Values of the parameters of the structure, {name: value}.
+    units : mapping
+        Units of the parameters; empty for entries of a state-space law.
+    goals : tuple of GoalValue
+        Values of the goals in the order in which they were given.
+    factor : float
+        Largest value of all goals. If some goals do not hold, all would hold if their limits were
+        larger by this factor.
+    conflict : tuple of str
+        The two goals that limit each other most if some goals do not hold; empty otherwise.
+    stationarity : float
+        Norm of the convex combination of the gradients of the active goals in the logarithms of the
+        parameters; near 0 at a local minimum.
+    points : tuple of mapping
+        Uncertain parameters of all models that the search used.
+    examined : int
+        Number of models at which the goals were evaluated at the end.
+    starts : tuple of float
+        Largest value of the goals at the end of each start; infinite if no stable loop was found.
+    seconds : float
+        CPU time of the search [s].
+    history : ndarray (k, 2)
+        Largest value of the soft and of the hard goals after each step of the last search.
+
+    Examples
+    --------
+    >>> lin = fflin.linearize(fflin.load("planar_detumble"))
+    >>> law = fflin.PD("q_b", "tau_b", rates="omega_b")
+    >>> tuned = fflin.tune(lin, law, [fflin.Decay(0.1), fflin.Damping(0.7)], starts=1)
+    >>> tuned.met, len(tuned.parameters)
+    (True, 6)
+    """
+
+    parameters: Mapping[str, float]
+    units: Mapping[str, str]
+    goals: tuple[GoalValue, ...]
+    factor: float
+    conflict: tuple[str, ...]
+    stationarity: float
+    points: tuple[Mapping[str, float], ...]
+    examined: int
+    starts: tuple[float, ...]
+    seconds: float
+    history: Array
+
+    def __init__(self, law: Law, lin: LinearModel, **results: object) -> None:
+        super().__init__(matrices_of(law, lin.dt), lin)
+        self.__dict__.update(results)
+
+    @property
+    def met(self) -> bool:
+        """Whether all goals hold."""
+        return all(goal.met for goal in self.goals)
+
+    def __str__(self) -> str:
+        return self.report()
+
+    def _repr_html_(self) -> str:
+        parts = [html.paragraph(self._verdict()), html.table(self._goal_rows(), "lrrrrl")]
+        parts.append(html.table(self._parameter_rows(), "lrl"))
+        return html.result_card(self, *parts)
+
+    def _verdict(self) -> str:
+        """Return whether the goals hold, and what limits them."""
+        if self.met:
+            return (
+                f"{self.lin.robot}: all goals hold at {_counted(self.examined)}; the largest value "
+                f"is {self.factor:.4g} of its limit"
+            )
+        names = [goal.label for goal in self.goals if not goal.met]
+        text = (
+            f"{self.lin.robot}: {', '.join(names)} not met; all goals would hold if their limits "
+            f"were larger by the factor {self.factor:.4g}"
+        )
+        if len(self.conflict) == 2:
+            text += f". {self.conflict[0]} and {self.conflict[1]} contradict each other"
+        return text
+
+    def _goal_rows(self) -> list[list[str]]:
+        """Return the table of the goals."""
+        rows = [["goal", "value/limit", "second method", "at", "", "model"]]
+        for goal in self.goals:
+            kind = "hard" if goal.hard else ""
+            if goal.active:
+                kind = f"{kind}, active" if kind else "active"
+            label = f"{goal.label} ({kind})" if kind else goal.label
+            check = "" if math.isnan(goal.check) else f"{goal.check:.6g}"
+            where = "" if math.isnan(goal.frequency) else f"{goal.frequency:.4g}"
+            unit = "s" if goal.label.startswith("step") else "rad/s"
+            model = ", ".join(
+                f"{key} {value:.4g}" for key, value in goal.parameters.items()
+            )
+            rows.append(
+                [
+                    label,
+                    f"{goal.value:.6g}",
+                    check,
+                    where,
+                    unit if where else "",
+                    model or "nominal",
+                ]
+            )
+        return rows
+
+    def _parameter_rows(self) -> list[list[str]]:
+        """Return the table of the parameters."""
+        rows = [["parameter", "value", "unit"]]
+        for name, value in self.parameters.items():
+            rows.append([name, f"{value:.6g}", self.units.get(name, "")])
+        return rows
+
+    def report(self) -> str:
+        """Return the report: goals with their values, parameters and figures of the search."""
+        finite = [value for value in self.starts if math.isfinite(value)]
+        near = sum(value <= 1.01 * min(finite) for value in finite) if finite else 0
+        search = (
+            f"{len(self.starts)} starts, of which {near} reached the best value within 1 %; "
+            f"stationarity {self.stationarity:.1e}; "
+            f"{_counted(len(self.points))} in the search, {_counted(self.examined)} examined"
+        )
+        return "\n\n".join(
+            (
+                folded([self._verdict()]),
+                grid(cut(self._goal_rows(), "see goals"), "lrrrl"),
+                grid(cut(self._parameter_rows(), "see parameters"), "lr"),
+                folded([search]),
+            )
+        )
+
+    def save(self, path: str | Path) -> None:
+        """Write the law to a file, which `LinearController` and other tools read.
+
+        Parameters
+        ----------
+        path : str or Path
+            Path that ends in .npz, .mat or .json.
+
+        Raises
+        ------
+        FileError
+            If the path has another ending or the file cannot be written.
+        """
+        system = self.system
+        record = {
+            "kind": "Tuned",
+            "A": system.A,
+            "B": system.B,
+            "C": system.C,
+            "D": system.D,
+            "dt": self.dt,
+            "input_names": system.inputs,
+            "output_names": system.outputs,
+            "parameters": dict(self.parameters),
+        }
+        write_record(as_path(path), record, checksummed=self.lin.verified)
+
+
+def _counted(number: int) -> str:
+    return "1 model" if number == 1 else f"{number} models"
+
+
+def matrices_of(law: Law, dt: float) -> tuple[Array, Array, Array, Array, float]:
+    """Return the matrices of a law, sampled by Tustin's method if dt [s] is not 0."""
+    A, B, C, D = law[:4]
+    if not dt:
+        return A, B, C, D, 0.0
+    rate = 2.0 / dt
+    unit = rate * np.eye(len(A))
+    inverse = np.linalg.inv(unit - A)
+    factor = math.sqrt(2.0 * rate)
+    return (
+        (unit + A) @ inverse,
+        factor * inverse @ B,
+        factor * C @ inverse,
+        D + C @ inverse @ B,
+        dt,
+    )
+
+
+def is_active(value: float, hard: bool, level: float) -> bool:
+    """Return whether a goal limits the others; `level` is the largest value of the soft goals."""
+    limit = 1.0 if hard else level
+    return value >= limit * (1.0 - _ACTIVE)
