@@ -144,5 +144,5 @@ class ContactSolver:
         """Return dnu/dt (3.2) from the accelerations c without gravity."""
         rate = c.copy()
         rate[LINEAR] += self._state.gravity(q)
-        rate[LINEAR] -= np.cross(nu[ANGULAR], nu[LINEAR])
+        rate[LINEAR] -= skew(nu[ANGULAR]) @ nu[LINEAR]
         return rate

@@ -1,5 +1,6 @@
 """Linear models of robots with constraints: closed forms, independent computations, refusals."""
 
+import pickle
 from dataclasses import replace
 from functools import partial
 
@@ -191,12 +192,12 @@ def test_random_constraints_agree_with_both_computations(seed, frame):
 @pytest.mark.parametrize("seed", range(100, 140))
 def test_many_random_constraints_agree_with_both_computations(seed):
     rng = np.random.default_rng(seed)
-    robot, q, v, u = random_constraints(rng, count=1 + seed % 3)
-    options = {"frame": FRAMES[seed % 3], "reference": random_pose(rng, 60.0)}
     try:
+        robot, q, v, u = random_constraints(rng, count=1 + seed % 3)
+        options = {"frame": FRAMES[seed % 3], "reference": random_pose(rng, 60.0)}
         lin = fflin.linearize(robot, q, v, u, **options)
     except fflin.ConstraintError as error:
-        assert "singular" in str(error)
+        assert "singular" in str(error) or "no effect" in str(error)
         return
     check = fflin.check(robot, lin)
     assert check.ok, check
@@ -296,6 +297,7 @@ def test_a_linearizer_keeps_its_coordinates_at_all_points():
         q = fflin.closed(robot, fflin.configuration(robot, guess))
         names.add(linearizer(q).state_names)
     assert len(names) == 1
+    assert pickle.loads(pickle.dumps(linearizer))(q).state_names in names
 
 
 def test_a_model_in_reduced_states_is_restored_from_its_file(tmp_path):
