@@ -12,7 +12,6 @@ from fflin.robot.joints import ROOT
 
 CUBESAT = fflin.load("cubesat")
 IN_ORBIT = CUBESAT.replace(orbit=500e3)
-CONSTRAINED = CUBESAT.replace(constraints=[fflin.Weld("base")])
 
 
 def with_displaced_root():
@@ -43,7 +42,6 @@ TASKS = {
     "the root joint of 'displaced'": Task(
         robots=(with_displaced_root(),), simulated=True
     ),
-    "the constraints of 'cubesat' are": Task(robots=(CONSTRAINED,)),
     "its sample time differs": Task(robots=(CUBESAT,), own_sample_time=True),
     "noise is evaluated at every stage": Task(robots=(CUBESAT,), noise_at_stages=True),
     "no frame": Task(robots=(CUBESAT,), measurements="no frame"),
@@ -58,7 +56,6 @@ def test_each_limit_has_a_task_whose_reason_it_is(monkeypatch):
         met.append(next(i for i, limit in enumerate(LIMITS) if limit.subject(task)))
     assert reason_against(Task(robots=(CUBESAT,), simulated=True)) == ""
     assert reason_against(Task(robots=(with_displaced_root(),))) == ""
-    assert reason_against(Task(robots=(CONSTRAINED,), simulated=True)) == ""
     monkeypatch.setattr(limits, "numba_is_there", lambda: False)
     assert "numba" in reason_against(Task(robots=(CUBESAT,)))
     assert sorted([0, *met]) == list(range(len(LIMITS)))
