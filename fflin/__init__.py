@@ -18,6 +18,7 @@ _PUBLIC = {
         "dynamics.points": "configuration velocity effort",
         "dynamics.closure": "closed",
         "dynamics.impact": "capture Capture jam Impact",
+        "dynamics.latching": "latch",
     },
     "Inputs": {
         "robot.inputs": "BaseTorque BaseForce JointTorque Thruster ReactionWheel",

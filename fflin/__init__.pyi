@@ -22,6 +22,7 @@ from fflin.dynamics.impact import capture as capture
 from fflin.dynamics.impact import Capture as Capture
 from fflin.dynamics.impact import jam as jam
 from fflin.dynamics.impact import Impact as Impact
+from fflin.dynamics.latching import latch as latch
 
 # Inputs
 from fflin.robot.inputs import BaseTorque as BaseTorque

@@ -31,6 +31,7 @@ from fflin.campaign.runs import (
 )
 from fflin.control.tracking import TrajectoryFeedback, prepared
 from fflin.control.tvlqr import GainSchedule
+from fflin.dynamics.coordinates import refuse_constraints
 from fflin.dynamics.points import point_of, start_of
 from fflin.dynamics.state import StateMap
 from fflin.dynamics.state_rows import moved_by, moving_error
@@ -392,6 +393,7 @@ def funnel(
     2
     """
     validation.instance("robot", robot, Robot, "a fflin.Robot")
+    refuse_constraints(robot, "funnels")
     expected = "a GainSchedule or a TrajectoryFeedback"
     validation.instance(
         "schedule", schedule, (GainSchedule, TrajectoryFeedback), expected

@@ -24,6 +24,7 @@ from fflin.base.validation import (
 from fflin.batch.run import Execution, Progress
 from fflin.campaign.runs import expect, notes_on_engine
 from fflin.campaign.settling import OUTCOMES, PATIENCE, Loop, settle
+from fflin.dynamics.coordinates import refuse_constraints
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
 from fflin.simulation.report import TRUSTED
@@ -252,6 +253,7 @@ def validity(
     (True, 4)
     """
     loop = Loop(robot, lin, gain)
+    refuse_constraints(robot, "ranges of validity")
     largest = _checked_displacement(loop.lin, attitude, position, joint)
     samples = count("samples", samples)
     seed = whole("seed", seed, 0)

@@ -85,10 +85,6 @@ def _has_displaced_root(robot: Robot) -> bool:
     return not robot.model.jointPlacements[ROOT].isIdentity(0.0)
 
 
-def _has_constraints(robot: Robot) -> bool:
-    return bool(robot.constraints)
-
-
 def _has_constraints_in_orbit(robot: Robot) -> bool:
     return bool(robot.constraints) and robot.orbit is not None
 
@@ -118,10 +114,6 @@ LIMITS = (
     Limit(
         lambda task: task.simulated and task.first(_has_displaced_root),
         "the root joint of '{}' is not at the origin of the world",
-    ),
-    Limit(
-        lambda task: not task.simulated and task.first(_has_constraints),
-        "the constraints of '{}' are linearised in Python",
     ),
     Limit(
         lambda task: task.first(_has_constraints_in_orbit),

@@ -12,7 +12,6 @@ from fflin.robot.joints import ROOT
 
 CUBESAT = fflin.load("cubesat")
 IN_ELLIPSE = CUBESAT.replace(orbit={"perigee": 500e3, "eccentricity": 0.1})
-CONSTRAINED = CUBESAT.replace(constraints=[fflin.Weld("base")])
 CONSTRAINED_IN_ORBIT = fflin.load(
     "dual_arm", orbit=500e3, constraints=[fflin.Weld("tool_left", "tool_right")]
 )
@@ -50,7 +49,6 @@ TASKS = {
     "the root joint of 'displaced'": Task(
         robots=(with_displaced_root(),), simulated=True
     ),
-    "the constraints of 'cubesat' are": Task(robots=(CONSTRAINED,)),
     "the constraints of 'dual_arm' are simulated in orbit": Task(
         robots=(CONSTRAINED_IN_ORBIT,), simulated=True
     ),
@@ -69,7 +67,6 @@ def test_each_limit_has_a_task_whose_reason_it_is(monkeypatch):
         met.append(next(i for i, limit in enumerate(LIMITS) if limit.subject(task)))
     assert reason_against(Task(robots=(CUBESAT,), simulated=True)) == ""
     assert reason_against(Task(robots=(with_displaced_root(),))) == ""
-    assert reason_against(Task(robots=(CONSTRAINED,), simulated=True)) == ""
     monkeypatch.setattr(limits, "numba_is_there", lambda: False)
     assert "numba" in reason_against(Task(robots=(CUBESAT,)))
     assert sorted([0, *met]) == list(range(len(LIMITS)))

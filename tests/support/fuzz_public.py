@@ -191,6 +191,12 @@ def light(folder):
             "bias_noise": None,
             "disturbance_frequency": {"tau_b.x": [0.01]},
         },
+        "latch": {
+            "robot": robot,
+            "constraints": fflin.Weld("hand", "base"),
+            "q": q,
+            "v": v,
+        },
         "linearize": result | place | {"independent": ["q_b"]},
         "linearize_trajectory": knots
         | {"robot": robot, "strict": False, "hold": "previous", "frame": "world"},

@@ -1,0 +1,110 @@
+"""Latches: constraints that close in motion, and the new velocities."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from fflin.base.errors import InputError
+from fflin.base.validation import Array, instance
+from fflin.dynamics.closure import Closure
+from fflin.dynamics.impact import Impact, inertia_at, momentum_of
+from fflin.dynamics.state import StateMap
+from fflin.robot.constraints import Constraint, checked_constraints
+from fflin.robot.robot import Robot
+
+# Unit of each component of the impulse on a constraint's frame.
+_UNITS = ("N s",) * 3 + ("N m s",) * 3
+
+
+def latch(
+    robot: Robot,
+    constraints: Constraint | Sequence[Constraint],
+    *,
+    q: Array | None = None,
+    v: Array | None = None,
+) -> Impact:
+    r"""Close constraints in motion, instantly: a second grasp, a latch or a berthing.
+
+    The joints are free during the impact. The velocity just after the impact is the velocity that
+    all constraints permit and that is nearest to the velocity before, in kinetic energy:
+
+    .. math:: \nu_+ = \nu - M^{-1} J^T (J M^{-1} J^T)^+ J \nu
+
+    If the constraints connect frames of the robot, linear and angular momentum are conserved. If
+    one of them holds a frame in inertial space, its impulse changes the momentum.
+
+    To open constraints again, simulate the robot without them from the last row of a motion, with
+    ``robot.replace(constraints=[])``, and join both motions by `Motion.then`.
+
+    Parameters
+    ----------
+    robot : Robot
+        Robot before the impact. Its own constraints remain closed.
+    constraints : Weld, Hinge, Spherical, or a sequence of them
+        Constraints that close. A constraint without a placement holds its frames in the pose that
+        they have at q.
+    q, v : array_like (nq,), (nv,), optional
+        Configuration and velocity just before the impact; neutral and at rest by default. With a
+        placement, the frames must be within 1e-6 m and rad of it.
+
+    Returns
+    -------
+    Impact
+        Result of the impact. `Impact.robot` has all constraints. `Impact.impulse` contains, for
+        each closed constraint, the impulse on its `frame`: linear (3,) [N s], then angular (3,)
+        [N m s], in the axes of its placement. If constraints are redundant, it is the smallest one.
+
+    Raises
+    ------
+    ConstraintError
+        If the frames are too far from the placement, or the constraints of the robot are violated.
+    InputError
+        If an argument has a wrong size or value, or no constraint is given.
+
+    Examples
+    --------
+    >>> robot = fflin.load("dual_arm")
+    >>> spin = fflin.velocity(robot, {"left_1": 0.1})
+    >>> latched = fflin.latch(robot, fflin.Weld("tool_left", "tool_right"), v=spin)
+    >>> bool(abs(latched.momentum_after - latched.momentum).max() < 1e-12)
+    True
+    >>> latched.event, latched.energy_lost > 0
+    ('tool_left/tool_right latched', True)
+    """
+    instance("robot", robot, Robot, "a fflin.Robot").require_unchanged()
+    closing = checked_constraints(constraints)
+    if not closing:
+        raise InputError(
+            "no constraint is given, expected Weld, Hinge or Spherical objects that close"
+        )
+    q = robot.neutral() if q is None else robot.checked_configuration(q)
+    v = np.zeros(robot.nv) if v is None else robot.checked_velocity(v)
+    before = (robot, q, v)
+    if robot.constraints:
+        v = Closure(StateMap(robot)).velocity(q, v)
+    whole = robot.replace(constraints=[*robot.constraints, *closing])
+    state = StateMap(whole)
+    closure = Closure(state)
+    q = closure.configuration(q)
+    space = closure.tangent(q)
+    nu = state.velocities(v)
+    kept = closure.kept(space, q, nu)
+    jump = state.spread(nu - kept)
+    M = inertia_at(whole, q)
+    multipliers = np.linalg.lstsq(space.jacobian.T, state.forces(-(M @ jump)), None)[0]
+    pairs = closure.constraints.pairs[-len(closing) :]
+    impulses = [pair.selected.T @ multipliers[pair.rows] for pair in pairs]
+    titles = ", ".join(item.title for item in closing)
+    v = state.spread(kept)
+    return Impact(
+        robot=whole,
+        q=q,
+        v=v,
+        impulse=np.concatenate(impulses),
+        energy_lost=0.5 * float(jump @ M @ jump),
+        momentum=momentum_of(*before),
+        momentum_after=momentum_of(whole, q, v),
+        event=f"{titles} latched",
+        _before=before,
+        _units=_UNITS * len(closing),
+    )
