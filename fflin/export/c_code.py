@@ -67,7 +67,9 @@ def write_c(
     - For an output feedback, the arguments are the outputs y, and the controller memory, which the
       caller allocates. A state feedback with integral action also has this memory. If the inputs
       saturate at `limits`, the integrals are corrected as in `simulate`.
-    - For gains along a trajectory, the sample number is an additional argument.
+    - For gains along a trajectory, and for a law that follows one, the sample number is an
+      additional argument. Attitudes and positions in the outputs y are then relative to the base
+      poses of the trajectory, which ``NAME.json`` lists.
 
     Parameters
     ----------
