@@ -67,8 +67,10 @@ def write_c(
     - For an output feedback, the arguments are the outputs y, and the controller memory, which the
       caller allocates. A state feedback with integral action also has this memory. If the inputs
       saturate at `limits`, the integrals are corrected as in `simulate`.
-    - For gains along a trajectory, and for outputs that are measured at different rates, the sample
-      number is an additional argument.
+    - For gains along a trajectory, for a law that follows one, and for outputs that are measured at
+      different rates, the sample number is an additional argument. The attitudes and positions in
+      the outputs y of a law that follows a trajectory are relative to the base poses of the
+      trajectory, which ``NAME.json`` lists.
 
     Parameters
     ----------
