@@ -18,7 +18,8 @@ _PUBLIC = {
         "dynamics.impact": "capture Capture jam Impact",
     },
     "Inputs": {
-        "robot.inputs": "BaseTorque BaseForce JointTorque Thruster ReactionWheel",
+        "robot.inputs": "BaseTorque BaseForce JointTorque Thruster ReactionWheel "
+        "Magnetorquer",
         "robot.loading": "load_inputs",
     },
     "Outputs": {
@@ -69,6 +70,7 @@ _PUBLIC = {
     "Policies": {
         "control.policy": "Policy StateForm",
         "control.policies": "StateFeedback Allocation",
+        "control.bdot": "BDot",
         "control.tracking": "TrajectoryFeedback TrajectoryOutputFeedback",
         "control.linear_controller": "OutputFeedback LinearController",
         "batch.gains": "ScheduledFeedback",
@@ -79,6 +81,7 @@ _PUBLIC = {
     "Simulation": {
         "simulation.simulate": "simulate",
         "simulation.motion": "Motion",
+        "simulation.detumbling": "detumbling_time",
         "simulation.pointing": "Pointing PointingError",
         "simulation.error_budget": "error_budget ErrorBudget Contribution",
         "view.visualize": "visualize",
