@@ -21,7 +21,8 @@ _PUBLIC = {
         "dynamics.latching": "latch",
     },
     "Inputs": {
-        "robot.inputs": "BaseTorque BaseForce JointTorque Thruster ReactionWheel",
+        "robot.inputs": "BaseTorque BaseForce JointTorque Thruster ReactionWheel "
+        "Magnetorquer",
         "robot.loading": "load_inputs",
     },
     "Outputs": {
@@ -76,6 +77,7 @@ _PUBLIC = {
     "Policies": {
         "control.policy": "Policy StateForm",
         "control.policies": "StateFeedback Allocation",
+        "control.bdot": "BDot",
         "control.tracking": "TrajectoryFeedback TrajectoryOutputFeedback",
         "control.linear_controller": "OutputFeedback LinearController",
         "control.multirate_feedback": "MultirateFeedback",
@@ -87,6 +89,7 @@ _PUBLIC = {
     "Simulation": {
         "simulation.simulate": "simulate",
         "simulation.motion": "Motion",
+        "simulation.detumbling": "detumbling_time",
         "simulation.pointing": "Pointing PointingError",
         "simulation.error_budget": "error_budget ErrorBudget Contribution",
         "view.visualize": "visualize",

@@ -30,6 +30,7 @@ from fflin.robot.inputs import BaseForce as BaseForce
 from fflin.robot.inputs import JointTorque as JointTorque
 from fflin.robot.inputs import Thruster as Thruster
 from fflin.robot.inputs import ReactionWheel as ReactionWheel
+from fflin.robot.inputs import Magnetorquer as Magnetorquer
 from fflin.robot.loading import load_inputs as load_inputs
 
 # Outputs
@@ -124,6 +125,7 @@ from fflin.uncertainty.lft import LFT as LFT
 from fflin.control.policy import Policy as Policy
 from fflin.control.policy import StateForm as StateForm
 from fflin.control.policies import StateFeedback as StateFeedback
+from fflin.control.bdot import BDot as BDot
 from fflin.control.tracking import TrajectoryFeedback as TrajectoryFeedback
 from fflin.control.policies import Allocation as Allocation
 from fflin.control.linear_controller import OutputFeedback as OutputFeedback
@@ -139,6 +141,7 @@ from fflin.export.c_code import CLaw as CLaw
 # Simulation
 from fflin.simulation.simulate import simulate as simulate
 from fflin.simulation.motion import Motion as Motion
+from fflin.simulation.detumbling import detumbling_time as detumbling_time
 from fflin.simulation.pointing import Pointing as Pointing
 from fflin.simulation.pointing import PointingError as PointingError
 from fflin.simulation.error_budget import error_budget as error_budget

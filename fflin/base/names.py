@@ -9,7 +9,7 @@ from fflin.base.errors import InputError, UnknownNameError, unknown
 T = TypeVar("T")
 
 _GROUPS = ("tau_b", "F_b", "tau_m")
-_OF_UNIT = {"N": "thrust", "N m": "wheel"}
+_OF_UNIT = {"N": "thrust", "N m": "wheel", "A m^2": "dipole"}
 
 
 def undotted(name: str) -> str:
@@ -49,7 +49,7 @@ def input_keys(model: Any) -> tuple[str, ...]:
     """Return the names GROUP.ENTRY of the inputs of a model.
 
     The model is any object with the attributes `input_names` and `input_units`. An input without a
-    known group gets the group "thrust" or "wheel" of its unit, or the group "input".
+    known group gets the group "thrust", "wheel" or "dipole" of its unit, or the group "input".
     """
     keys = []
     for name, unit in zip(model.input_names, model.input_units, strict=True):

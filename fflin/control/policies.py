@@ -748,22 +748,22 @@ class AllocatedPolicy(BoundLaw):
         state = self._design.state
         chart = state.unchecked_chart(q)
         command = self._design.in_base_axes(chart, self._command(t, q, v))
-        force = self._design.columns(self._data, q) @ command
-        columns = self._columns(self._robot, chart, q)
+        force = self._design.columns(self._data, q, _flux(self._design, t)) @ command
+        columns = self._columns(self._robot, chart, q, t)
         M = state.project(pin.crba(state.robot.model, self._design_data, q).T)
         # With M = L L', the length of d is the Euclidean norm of L^-1 d.
         L = np.linalg.cholesky(M)
         scaled = np.linalg.solve(L, np.column_stack((columns, force)))
         allocated = nearest(scaled[:, :-1], scaled[:, -1], *self._limits)
         if self.correct:
-            asked = np.linalg.solve(L, self._columns(self._design, chart, q))
+            asked = np.linalg.solve(L, self._columns(self._design, chart, q, t))
             self._shortfall = allocated, scaled, asked
         return allocated
 
-    def _columns(self, actuation: Actuation, chart: Chart, q: Array) -> Array:
+    def _columns(self, actuation: Actuation, chart: Chart, q: Array, t: float) -> Array:
         """Return the generalised forces (6 + n, k) of unit inputs, in the axes of the inputs."""
         # For inputs u in reference axes, the force is B_u R' u = (R B_u')' u.
-        B = actuation.columns(self._data, q)
+        B = actuation.columns(self._data, q, _flux(actuation, t))
         return chart.to_reference(actuation.held, B.T).T
 
     def _correct(self, difference: Array) -> None:
@@ -777,3 +777,8 @@ class AllocatedPolicy(BoundLaw):
         assert self._inner is not None
         assert self._inner.correct is not None
         self._inner.correct(nearest_unbounded(asked, lack))
+
+
+def _flux(actuation: Actuation, t: float) -> Array | None:
+    """Return the magnetic flux density (3,) [T] at time t [s], or None without magnetorquers."""
+    return actuation.flux(t) if actuation.torquers else None

@@ -146,7 +146,13 @@ class PathForm(NamedTuple):
     policy: Any  # a `tracking.TrajectoryFeedback`
 
 
-Form: TypeAlias = StateForm | OutputForm | PathForm
+class BDotForm(NamedTuple):
+    """Data of a law that feeds back the derivative of the magnetic flux density in base axes."""
+
+    gain: Array  # (nu, 3) [A m^2 s/T]; the command is its product with the derivative
+
+
+Form: TypeAlias = StateForm | OutputForm | PathForm | BDotForm
 
 
 class Policy(ABC):

@@ -36,6 +36,7 @@ class Aba:
         # M^-1 in base axes, which the last call of `slopes` computed by ABA.
         self.inverse: Array = np.zeros((6 + robot.n, 6 + robot.n))
         self.field = state.field
+        self.t = 0.0  # time [s] at which the magnetic field is evaluated
         self._resists = bool(np.any(robot.springs))
         self._none = pin.StdVec_Force(robot.model.njoints, pin.Force.Zero())
         self._constraints: ClassicalConstraints | None = None
@@ -51,6 +52,8 @@ class Aba:
         generalised force in Pinocchio's order.
         """
         forces = self.actuation.fixed @ u
+        if self.actuation.torquers:
+            forces += self._magnetic_columns(q) @ u
         if self._resists:
             forces += self._passive_force(q, v)
         if tau is not None:
@@ -177,11 +180,19 @@ class Aba:
             by_q += by_force @ state.forces(state.columns(field.slopes(self._data)))
             field.add_turning(*given_point, by_q, by_v)
         by_u = []
-        for unit, forces in zip(np.eye(len(u)), self.actuation.fixed.T, strict=True):
+        columns = self.actuation.fixed
+        if self.actuation.torquers:
+            columns = columns + self._magnetic_columns(given_point[0])
+        for unit, forces in zip(np.eye(len(u)), columns.T, strict=True):
             wrenches = self.actuation.wrenches(unit) or self._none
             rate = self._accelerate(self._weightless, q, at_rest, forces, wrenches)
             by_u.append(state.velocities(rate))
         return by_q, by_v, np.column_stack(by_u)
+
+    def _magnetic_columns(self, q: Array) -> Array:
+        """Return the generalised forces (6 + n, nu) of magnetorquers for unit inputs."""
+        flux = self.actuation.flux(self.t)
+        return self.actuation.magnetic_columns(self._data, q, flux)
 
     def _wrenches(self, q: Array, v: Array, u: Array) -> pin.StdVec_Force:
         """Return the wrench on each link from inputs, gyroscopic torques and gravity gradient."""

@@ -11,6 +11,7 @@ from fflin.base.errors import FflinWarning, InputError
 from fflin.base.rotation import rotation_matrices, skew
 from fflin.base.validation import Array, Mask
 from fflin.dynamics.coordinates import ANGULAR, LINEAR, PIN_ANGULAR, PIN_LINEAR
+from fflin.dynamics.magnetic import MagneticField
 from fflin.robot.joints import ROOT
 from fflin.robot.orbit import CircularOrbit, EllipticOrbit, OrbitState
 from fflin.robot.robot import Robot
@@ -23,6 +24,11 @@ _AXES = {
     "lvlh": _LVLH,
     "local": _LVLH,
 }
+
+
+def normal_of(frame: str) -> Array:
+    """Return the unit vector (3,) along the orbit normal in the axes of an orbital frame."""
+    return np.array(_AXES[frame][1])
 
 
 def mean_motion(robot: Robot) -> float:
@@ -71,6 +77,9 @@ class OrbitField:
         self._levers = np.array([skew(body.lever) for body in bodies])
         self._inertia = np.array([body.inertia for body in bodies])
         self._none = pin.Force.Zero()
+        self.magnetic: MagneticField | None = None
+        if robot.orbit and robot.orbit.field is not None:
+            self.magnetic = MagneticField(robot.orbit, self.axes)
         placements = robot.model.jointPlacements.tolist()[ROOT + 1 :]
         steps = [placement.translation for placement in placements]
         self._reach = sum(float(np.linalg.norm(x)) for x in (*steps, *self._lever))

@@ -316,7 +316,7 @@ class Accelerations:
             pull, pull_by_q, pull_by_turn = tide.force(model, data, q_still)
         inverse = by_u if actuation.default else np.empty((self._nv, self._nv))
         self.inertia.invert(q_still, inverse, quick=not self._resists)
-        columns = actuation.columns(data, q_still)
+        columns = actuation.columns(data, q_still, self._turned_flux(q))
         bias = pin.nonLinearEffects(model, data, q_still, v_still)
         wrenches = actuation.wrenches(u)
         if self._stored:
@@ -371,6 +371,19 @@ class Accelerations:
         if self._resists:
             self._of_stiffness += self._springs.stiffness
             self._of_damping += self._springs.damping
+
+    def _turned_flux(self, q: Array) -> Array | None:
+        """Return the magnetic flux density (3,) at t = 0 for a base in its neutral attitude.
+
+        It is turned together with the base, from the attitude of the base in q. Return None without
+        magnetorquers.
+        """
+        if not self._actuation.torquers:
+            return None
+        base = pin.XYZQUATToSE3(q[:7]).rotation
+        root = self._model.jointPlacements[ROOT].rotation
+        flux: Array = root @ (root @ base).T @ self._actuation.flux(0.0)
+        return flux
 
     def _gyroscopic(
         self, q: Array, v: Array, wrenches: pin.StdVec_Force | None

@@ -483,6 +483,7 @@ class Actuation:
         # without a joint of their own. Each input is (its index, wrench (6,) of a unit input in the
         # frame of the joint).
         carried: dict[int, list[tuple[int, Array]]] = {}
+        self.torquers = _torquers(state)
         identity = np.eye(nv)
         for item, input_names in robot.named_inputs:
             at = len(columns)
@@ -498,6 +499,8 @@ class Actuation:
                 columns.append(identity[6 + index])
             elif isinstance(item, kinds.ReactionWheel) and item.inertia:
                 columns.append(identity[6 + robot.joint_names.index(input_names[0])])
+            elif isinstance(item, kinds.Magnetorquer):
+                columns.append(np.zeros(nv))
             else:
                 assert isinstance(item, kinds.Thruster | kinds.ReactionWheel)
                 joint, placement = find_frame(robot.model, item.frame)
@@ -539,12 +542,22 @@ class Actuation:
             self._of_carried += places
         self.carried = bool(carried)  # whether columns depend on the configuration
 
-    def columns(self, data: pin.Data, q: Array) -> Array:
-        """Return B_u (6 + n, nu) at q, the generalised forces of unit inputs in base axes (6.1)."""
-        if not self.carried:
+    def columns(self, data: pin.Data, q: Array, flux: Array | None = None) -> Array:
+        """Return B_u (6 + n, nu) at q, the generalised forces of unit inputs in base axes (6.1).
+
+        `flux` (3,) is the magnetic flux density [T] in the axes in which q gives the attitude of
+        the base. By default, it is the flux density at t = 0 in the orbital frame.
+        """
+        if not (self.carried or self.torquers):
             return self.fixed
         columns = self.fixed.copy()
         pin.computeJointJacobians(self._model, data, q)
+        if self.torquers:
+            self._write_torquers(
+                data, self.flux(0.0) if flux is None else flux, columns
+            )
+        if not self.carried:
+            return columns
         forces = [
             pin.getJointJacobian(
                 self._model, data, joint, pin.ReferenceFrame.LOCAL
@@ -553,6 +566,28 @@ class Actuation:
         ]
         columns[:, self._of_carried] = self.state.forces(np.concatenate(forces, axis=1))
         return columns
+
+    def flux(self, t: float) -> Array:
+        """Return the magnetic flux density (3,) [T] at time t [s], in orbital axes."""
+        field = self.state.field
+        assert field is not None
+        assert field.magnetic is not None
+        return field.magnetic.at(t)
+
+    def magnetic_columns(self, data: pin.Data, q: Array, flux: Array) -> Array:
+        """Return the columns of `columns` that belong to magnetorquers, all others as zeros."""
+        columns = np.zeros_like(self.fixed)
+        pin.computeJointJacobians(self._model, data, q)
+        self._write_torquers(data, flux, columns)
+        return columns
+
+    def _write_torquers(self, data: pin.Data, flux: Array, columns: Array) -> None:
+        """Write the columns of magnetorquers; `data` must contain the Jacobians of the joints."""
+        local = pin.ReferenceFrame.LOCAL
+        for joint, index, axis in self.torquers:
+            torque = np.cross(axis, data.oMi[joint].rotation.T @ flux)
+            J = pin.getJointJacobian(self._model, data, joint, local)
+            columns[:, index] = self.state.forces(J[names.PIN_ANGULAR].T @ torque)
 
     def in_base_axes(self, chart: Chart, u: Array) -> Array:
         """Return the inputs u (.., nu) with all torques and forces on the base in base axes."""
@@ -572,6 +607,27 @@ class Actuation:
         for joint, inputs, wrenches in self.wrench_columns:
             external[joint] = pin.Force(wrenches.dot(u.take(inputs)))
         return external
+
+
+def _torquers(state: StateMap) -> list[tuple[int, int, Array]]:
+    """Return (joint, index in u, axis (3,) in the frame of the joint) of each magnetorquer.
+
+    Raise `InputError` if there are magnetorquers, but no magnetic field.
+    """
+    robot = state.robot
+    torquers: list[tuple[int, int, Array]] = []
+    at = 0
+    for item, input_names in robot.named_inputs:
+        if isinstance(item, kinds.Magnetorquer):
+            joint, placement = find_frame(robot.model, item.frame)
+            torquers.append((joint, at, placement.rotation @ np.array(item.axis)))
+        at += len(input_names)
+    if torquers and not (state.field and state.field.magnetic):
+        raise InputError(
+            f"'{robot.name}' has magnetorquers but no magnetic field; give it an orbit with a "
+            "field, such as CircularOrbit(500e3, inclination=1.7, field='dipole')"
+        )
+    return torquers
 
 
 def selection(names: Sequence[str], known: Sequence[str]) -> Array:

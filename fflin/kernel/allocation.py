@@ -199,11 +199,11 @@ def allocate(allocation, point, commanded):
     vec.copy(point.q, 0, work_point.q, 0, len(work_point.q))
     configure(work, asking, work_point.q)
     factorise(work, tree)
-    write_columns(work, tree)
+    write_columns(work, tree, None)
     vec.copy(commanded, 0, work_point.pushing, 0, len(commanded))
     _write_force(work, asking, work_point, columns, count * size)
     # Write the generalised forces of unit inputs of `giving`, one after the other.
-    write_columns(work, giving.tree)
+    write_columns(work, giving.tree, None)
     for unit in range(count):
         for index in range(count):
             store(work_point.pushing, index, 1.0 if index == unit else 0.0)
@@ -234,7 +234,7 @@ def write_difference(allocation, point, commanded):
     work_point, tree = allocation.point, asking.tree
     achieved = allocation.problem.columns
     size = len(tree.row)
-    write_columns(work, tree)
+    write_columns(work, tree, None)
     for unit in range(inputs):
         for index in range(inputs):
             store(work_point.pushing, index, 1.0 if index == unit else 0.0)

@@ -382,7 +382,10 @@ def stored_momentum(work, tree, index):
 
 
 def carried_wrench(work, tree, index):
-    """Return the wrench of a body-fixed unit input, in base axes and about its body's joint."""
+    """Return the wrench of a body-fixed unit input, in base axes and about its body's joint.
+
+    For a magnetorquer, return its axis in place of the moment.
+    """
     axes = vec.get_columns(work, tree.offsets.places + tree.wrench_body[index] * PLACE)
     moment, force = vec.get6(tree.wrench, 6 * index)
     return vec.product(axes, moment), vec.product(axes, force)
@@ -395,14 +398,19 @@ def add_column(work, at, width, force):
         vec.add(work, at + (3 + index) * width, force[1][index])
 
 
-def write_columns(work, tree):
-    """Write the generalised forces of body-fixed unit inputs, as columns of B_u."""
+def write_columns(work, tree, flux):
+    """Write the generalised forces of body-fixed unit inputs, as columns of B_u.
+
+    `flux` is the magnetic flux density [T] in base axes, or None if there are no magnetorquers.
+    """
     offsets = tree.offsets
     count = len(tree.wrench_body)
     vec.clear(work, offsets.columns, len(tree.row) * count)
     for index in range(count):
         body = tree.wrench_body[index]
         wrench = carried_wrench(work, tree, index)
+        if flux is not None and tree.magnetic[index]:
+            wrench = vec.cross(wrench[0], flux), wrench[1]
         while body > 0:
             value = vec.dot6(joint_axis(work, tree, body), wrench)
             at = offsets.columns + tree.coordinate[body] * count + index

@@ -303,7 +303,7 @@ def _derive(tree, points, field, out, lanes, work):
             bodies.move_bodies(work, tree, lanes.nu, vec.get3(lanes.nu, 0))
             bodies.load_bodies(work, tree)
             bodies.load_carried(work, tree, lanes.u)
-        bodies.write_columns(work, tree)
+        bodies.write_columns(work, tree, None)
         bodies.inwards(work, tree)
         bodies.factorise(work, tree)
         if moves:

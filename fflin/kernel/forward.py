@@ -21,6 +21,7 @@ from fflin.kernel.orbit import (
     RATE_CHANGE,
     STRENGTH,
     add_gradient,
+    flux_at,
     from_inertial_axes,
     kinetic_energy,
     normal_at,
@@ -218,12 +219,14 @@ def accelerate(work, robot, orbit, point, t, rates, to):
     tree, nu = robot.tree, point.nu
     force = tree.offsets.c
     size = len(tree.row)
-    bodies.write_columns(work, tree)
-    push(work, tree, point.pushing)
     omega_b = vec.get3(nu, 0)
     if orbit is not None:
         write_now(orbit, t)
         omega_b = vec.plus(omega_b, spin_at(orbit, point.q))
+        bodies.write_columns(work, tree, flux_at(orbit, point.q))
+    else:
+        bodies.write_columns(work, tree, None)
+    push(work, tree, point.pushing)
     disturb(work, robot, orbit, point, t)
     vec.copy(work, force, point.wrench, 0, 6)
     if orbit is not None:

@@ -14,6 +14,7 @@ from typing import NamedTuple
 from fflin.kernel.compiled import numba_is_there, without_numba
 from fflin.kernel.tree import batch_tree
 from fflin.robot.disturbance import PLATE
+from fflin.robot.inputs import Magnetorquer
 from fflin.robot.joints import ROOT
 from fflin.robot.orbit import is_elliptic
 from fflin.robot.robot import Robot
@@ -77,6 +78,14 @@ def _is_in_elliptic_orbit(robot: Robot) -> bool:
     return is_elliptic(robot.orbit)
 
 
+def _has_field_function(robot: Robot) -> bool:
+    return robot.orbit is not None and callable(robot.orbit.field)
+
+
+def _has_magnetorquer(robot: Robot) -> bool:
+    return any(isinstance(item, Magnetorquer) for item in robot.inputs)
+
+
 def _has_other_joint(robot: Robot) -> bool:
     return batch_tree(robot) is None
 
@@ -107,6 +116,17 @@ LIMITS = (
         "'{}' is in an elliptic orbit, whose field is computed in Python",
     ),
     Limit(lambda task: task.python_policy, "a {} is computed in Python"),
+    Limit(
+        lambda task: task.simulated and task.first(_has_field_function),
+        "the magnetic field of '{}' is a function, which is called in Python",
+    ),
+    Limit(
+        lambda task: (
+            (not task.simulated or len(task.robots) > 1)
+            and task.first(_has_magnetorquer)
+        ),
+        "sweeps and allocations with the magnetorquers of '{}' are computed in Python",
+    ),
     Limit(
         lambda task: task.first(_has_other_joint),
         "a joint of '{}' does not move along a screw with a fixed axis",

@@ -19,16 +19,19 @@ from fflin.kernel.tree import FIELD, INERTIA, PLACE, REALS, Struct
 from fflin.kernel.vectors import load
 
 # Offsets in `Orbit.now`.
-STRENGTH, RATE, RATE_CHANGE, ANGLE = range(4)
+STRENGTH, RATE, RATE_CHANGE, ANGLE, FLUX, FLUX_CHANGE, END = 0, 1, 2, 3, 4, 7, 10
 
 
-class Orbit(namedtuple("Orbit", "outwards normal mean_motion now")):
+class Orbit(namedtuple("Orbit", "outwards normal mean_motion latitude dipole now")):
     """Orbit of the simulated robot.
 
     - `outwards`, `normal` (3,): the unit vectors r and z in the axes of the orbital frame.
     - `mean_motion` (1,) [rad/s].
-    - `now` (4,): k [1/s^2], theta' [rad/s], theta'' [rad/s^2], and the angle [rad] by which the
-      orbital frame has rotated since t = 0. `write_now` writes these values.
+    - `latitude` (1,): argument of latitude [rad] at t = 0. `dipole` (3,) [T]: the amplitudes of
+      `dynamics.magnetic.MagneticField`; zero without a magnetic field.
+    - `now` (10,): k [1/s^2], theta' [rad/s], theta'' [rad/s^2], the angle [rad] by which the
+      orbital frame has rotated since t = 0, the magnetic flux density (3,) [T] in the axes of the
+      orbital frame, and the derivative (3,) of these three numbers. `write_now` writes all values.
     """
 
 
@@ -42,6 +45,15 @@ def write_now(orbit, t):
     orbit.now[RATE] = n
     orbit.now[RATE_CHANGE] = 0.0
     orbit.now[ANGLE] = n * t
+    r, z = vec.get3(orbit.outwards, 0), vec.get3(orbit.normal, 0)
+    along = vec.cross(z, r)
+    cosine, sine = vec.cosine_and_sine(orbit.latitude[0] + n * t)
+    radial, level, polar = vec.get3(orbit.dipole, 0)
+    flux = vec.plus(vec.times(r, radial * sine), vec.times(along, level * cosine))
+    vec.put3(orbit.now, FLUX, vec.plus(flux, vec.times(z, polar)))
+    change = vec.times(r, n * radial * cosine)
+    change = vec.minus(change, vec.times(along, n * level * sine))
+    vec.put3(orbit.now, FLUX_CHANGE, change)
 
 
 def outwards_at(orbit, q):
@@ -57,6 +69,17 @@ def normal_at(orbit, q):
 def spin_at(orbit, q):
     """Return the angular velocity of the orbital frame, in base axes."""
     return vec.times(normal_at(orbit, q), orbit.now[RATE])
+
+
+def flux_at(orbit, q):
+    """Return the magnetic flux density [T] in base axes."""
+    return vec.across(vec.axes_of(q), vec.get3(orbit.now, FLUX))
+
+
+def flux_rate_at(orbit, q, nu):
+    """Return the time derivative [T/s] of the magnetic flux density in base axes."""
+    change = vec.across(vec.axes_of(q), vec.get3(orbit.now, FLUX_CHANGE))
+    return vec.plus(change, vec.cross(flux_at(orbit, q), vec.get3(nu, 0)))
 
 
 def from_inertial_axes(orbit, a):

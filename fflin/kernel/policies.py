@@ -11,7 +11,7 @@ from fflin.kernel import vectors as vec
 from fflin.kernel.allocation import ALLOCATION
 from fflin.kernel.bodies import move_bodies
 from fflin.kernel.forward import COMMON_POINT, joint_position
-from fflin.kernel.orbit import spin_at, write_now
+from fflin.kernel.orbit import flux_rate_at, spin_at, write_now
 from fflin.kernel.tree import (
     FLAG,
     FLAGS,
@@ -182,7 +182,7 @@ def track(robot, path, point, u, t):
         store(u, row, total)
 
 
-NOTHING, LINEAR, TRACK = range(3)
+NOTHING, LINEAR, TRACK, B_DOT = range(4)
 
 
 class Law(
@@ -194,7 +194,9 @@ class Law(
 ):
     """A policy. In compiled code, `x`, `y`, `added` and `u` have one column per lane.
 
-    - `kind`: NOTHING, LINEAR or TRACK. NOTHING computes no command. LINEAR computes u from y, with
+    - `kind`: NOTHING, LINEAR, TRACK or B_DOT. B_DOT is for robots in orbit, and computes u from the
+      derivative of the magnetic flux density in base axes, with the gain `filter.D` (nu, 3).
+      NOTHING computes no command. LINEAR computes u from y, with
       `grid` if the grid has joints, otherwise with `filter`. TRACK computes u = u* - K e along
       `path`.
     - `x`: the state (nx,), followed by the three outputs of each gyroscope.
@@ -308,6 +310,13 @@ def command(work, robot, orbit, law, point, t, count, stage):
     """
     if law.kind == TRACK:
         track(robot, law.path, point, law.u, t)
+        return
+    if orbit is not None and law.kind == B_DOT:
+        write_now(orbit, t)
+        flux_rate = flux_rate_at(orbit, point.q, point.nu)
+        for index in range(len(law.u)):
+            gain = vec.get3(law.filter.D, 3 * index)
+            store(law.u, index, vec.dot(gain, flux_rate))
         return
     row = _row(law, count)
     read_state(robot, law, point, row)

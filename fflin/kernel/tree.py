@@ -217,8 +217,8 @@ class Tree(
     namedtuple(
         "Tree",
         "parent fixed index unbounded turns slides bodies axes coordinate factor armature "
-        "target share row depth path common driven wrench_body wrench input stored_body stored "
-        "stiffness damping offsets",
+        "target share row depth path common driven wrench_body wrench input magnetic stored_body "
+        "stored stiffness damping offsets",
     )
 ):
     """Kinematic tree of a robot, with inputs, stored momenta, springs and dampers.
@@ -263,7 +263,7 @@ class Tree(
     - `driven`: the coordinate that each input drives, -1 for a body-fixed wrench.
     - `wrench_body`: the body of each body-fixed input. `wrench`: the wrench per unit of the input,
       about the body's joint and in joint axes. `input`: the index of the body-fixed input among all
-      inputs.
+      inputs. `magnetic`: True for a magnetorquer, whose axis replaces the moment in `wrench`.
     - `stored_body`: the bodies with a stored momentum. `stored`: the stored momenta in joint axes.
     - `stiffness`, `damping` (n,): the springs and dampers of the joints.
 
@@ -282,6 +282,7 @@ TREE = Struct(
     REALS,
     _OF_TREE,
     unbounded=FLAGS,
+    magnetic=FLAGS,
     axes=_AXES,
     common=_COMMON,
     offsets=WORK_OFFSETS,
@@ -346,6 +347,7 @@ def batch_tree(robot: Robot) -> Tree | None:
         wrench_body=np.array(wrench_body, dtype=np.intp),
         wrench=np.array(wrench).ravel(),
         input=np.array(inputs, dtype=np.intp),
+        magnetic=np.isin(inputs, [index for _, index, _ in actuation.torquers]),
         stored_body=np.array(stored_body, dtype=np.intp),
         stored=np.array(stored).ravel(),
         stiffness=np.array(robot.springs.stiffness),
@@ -427,6 +429,11 @@ def _wrenches(
             wrench_body.append(body)
             inputs.append(number)
             wrenches.append(np.concatenate((moment, force)))
+    for joint, number, axis in actuation.torquers:
+        body = joint - ROOT
+        wrench_body.append(body)
+        inputs.append(number)
+        wrenches.append(np.concatenate((axes[body].T @ axis, np.zeros(3))))
     return wrench_body, inputs, wrenches
 
 

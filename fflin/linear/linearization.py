@@ -335,6 +335,7 @@ class Linearizer:
             if u is None
             else vector("u", u, len(still_u), "the robot's inputs").copy()
         )
+        _require_no_moment(self.prepared.actuation, u)
         with self._lock:
             if known:
                 B = np.zeros(self._shape_B)
@@ -577,3 +578,14 @@ def linearize(
         robot, frame=frame, reference=reference, moving=moving, independent=independent
     )
     return linearizer(q, v, u, t=t)
+
+
+def _require_no_moment(actuation: Actuation, u: Array) -> None:
+    """Raise `InputError` if the moment of a magnetorquer is not zero."""
+    for _, index, _ in actuation.torquers:
+        if u[index]:
+            raise InputError(
+                f"the moment of {actuation.names[index]} is {u[index]:g} A m^2 at the operating "
+                "point, expected 0; linear models do not contain the change of its torque with "
+                "the attitude"
+            )

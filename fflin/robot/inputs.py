@@ -318,12 +318,60 @@ class ReactionWheel(Input):
         return np.concatenate((np.zeros(3), -np.array(self.axis)))
 
 
+@dataclass(frozen=True)
+class Magnetorquer(Input):
+    r"""Magnetic dipole moment [A m^2] of a coil or rod, whose axis is fixed on a link.
+
+    The moment m about the axis s exerts the torque :math:`m\, s \times b` on its link, with the
+    magnetic flux density b at the origin of the orbital frame. So the robot needs an orbit with a
+    magnetic field, see `CircularOrbit`. The torque never has a part along b. Linear models contain
+    the field at t = 0, and must be about points at which the moments are zero.
+
+    Parameters
+    ----------
+    axis : sequence of float (3,)
+        Axis s in the axes of `frame`. The vector may have any length except zero.
+    frame : str, optional
+        Frame of the model, on the base or on any link; by default the root frame of the base.
+    name : str, optional
+        Name of the input; magnetorquer_1, magnetorquer_2, ... by default.
+    max, min : float, optional
+        Upper and lower limits [A m^2] of the moment; keyword only.
+
+    Examples
+    --------
+    >>> orbit = fflin.CircularOrbit(500e3, inclination=1.7, field="dipole")
+    >>> rods = [fflin.Magnetorquer(axis, max=0.2) for axis in np.eye(3)]
+    >>> robot = fflin.load("cubesat", inputs=rods, orbit=orbit)
+    >>> lin = fflin.linearize(robot)
+    >>> lin.input_names[0], lin.input_units[0], int(np.linalg.matrix_rank(lin.B))
+    ('magnetorquer_1', 'A m^2', 2)
+    """
+
+    KEY, GROUP, UNIT = "magnetorquer", "dipole", "A m^2"
+    axis: Vector3
+    frame: str | None = None
+    name: str | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._set("axis", unit_vector("magnetorquer axis", self.axis))
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """Name of the frame on which the torquer is mounted; () for the root frame of the base."""
+        if self.frame is None:
+            return ()
+        return (self.frame,)
+
+
 KINDS: tuple[type[Input], ...] = (
     BaseTorque,
     BaseForce,
     JointTorque,
     Thruster,
     ReactionWheel,
+    Magnetorquer,
 )
 
 
@@ -350,13 +398,13 @@ def unit_vector(what: str, value: object) -> tuple[float, float, float]:
 def named_inputs(inputs: Sequence[Input]) -> list[tuple[Input, tuple[str, ...]]]:
     """Return each input with the names of its entries in u, as (input, names).
 
-    The default names of thrusters and wheels are thruster_1, ... and wheel_1, ...
+    The default names are thruster_1, ..., wheel_1, ... and magnetorquer_1, ...
     """
     seen: Counter[str] = Counter()
     named = []
     for item in inputs:
         seen[item.GROUP] += 1
-        if isinstance(item, Thruster | ReactionWheel):
+        if isinstance(item, Thruster | ReactionWheel | Magnetorquer):
             names = [item.name or f"{item.KEY.rpartition('_')[2]}_{seen[item.GROUP]}"]
         else:
             entries = [item.joint] if isinstance(item, JointTorque) else item.ENTRIES

@@ -391,12 +391,13 @@ def load_inputs(path: str | Path) -> tuple[Input, ...]:
                                          and either ``inertia`` [kg m^2] with
                                          ``max_speed`` [rad/s], or ``momentum``
                                          [N m s]
+    ``magnetorquer``    `Magnetorquer`   ``axis``; optional: ``frame``, ``name``
     ==================  ===============  =========================================
 
-    Every type also accepts ``max`` and ``min`` [N m | N], the largest and the smallest value of the
-    input. For base inputs, each limit is one number, or three numbers. If ``min`` is omitted, it is
-    -max, or 0 for a thruster. With ``on_off = true``, a thruster fires in pulses of ``max``. Every
-    type accepts ``lag`` [s], the time constant of the actuator.
+    Every type also accepts ``max`` and ``min`` [N m | N | A m^2], the largest and the smallest
+    value of the input. For base inputs, each limit is one number, or three numbers. If ``min`` is
+    omitted, it is -max, or 0 for a thruster. With ``on_off = true``, a thruster fires in pulses of
+    ``max``. Every type accepts ``lag`` [s], the time constant of the actuator.
 
     Parameters
     ----------

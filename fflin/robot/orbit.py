@@ -5,13 +5,20 @@ from __future__ import annotations
 import json
 import math
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import KW_ONLY, asdict, dataclass
 from functools import lru_cache
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, ClassVar, NamedTuple, TypeAlias
 
 from fflin.base.errors import FflinWarning, InputError, require_known
-from fflin.base.validation import instance, number, positive
+from fflin.base.validation import (
+    ONE_ROTATION,
+    Array,
+    ArrayLike,
+    instance,
+    number,
+    positive,
+)
 
 # Gravitational parameter [m^3/s^2] and equatorial radius [m] of each body. The source for the earth
 # is WGS 84. For the other bodies, the sources are the JPL ephemerides (parameters) and IAU 2015
@@ -25,6 +32,16 @@ BODIES = {
     "jupiter": (1.266865341e17, 71492000.0),
     "saturn": (3.793120749e16, 60268000.0),
 }
+
+# Moments [T m^3] of the centred dipoles that are used as magnetic fields: mu_0 / (4 pi) times the
+# magnetic dipole moment. The earth's moment is (29.73 uT) (6371.2 km)^3, with the dipole terms of
+# IGRF-14 in 2025. The dipole is along the rotation axis, and points south.
+DIPOLES = {"earth": 29.73e-6 * 6371.2e3**3}
+
+# Function of time [s] and of the position (3,) [m] of the origin of the orbital frame from the
+# centre of the central body, which returns the magnetic flux density (3,) [T]. Both vectors are in
+# equatorial inertial axes: x towards the ascending node, z along the north pole.
+MagneticField: TypeAlias = Callable[[float, Array], ArrayLike]
 
 # If an altitude over the earth is below this value [m], it was probably given in km.
 _LOWEST = 80e3
@@ -63,10 +80,21 @@ class CircularOrbit:
         requires `mu` and `body_radius`.
     mu, body_radius : float, optional
         Gravitational parameter [m^3/s^2] and radius [m] of the central body.
+    inclination : float
+        Angle [rad] from the equator to the plane of the orbit, from 0 to pi; only the magnetic
+        field depends on it.
+    argument_of_latitude : float
+        Angle [rad] at t = 0 along the orbit, measured from the ascending node.
+    field : {"dipole"} or callable, optional
+        Magnetic field for inputs of the type `Magnetorquer`. "dipole" is the field of a dipole
+        along the rotation axis of the earth. A function of the time t [s] and of the position (3,)
+        [m] of the origin of the orbital frame from the centre of the body returns the flux density
+        (3,) [T]. Both vectors are in inertial axes with x towards the ascending node and z towards
+        the north pole. By default, there is no field.
 
     Attributes
     ----------
-    altitude, mean_motion, body, mu, body_radius
+    altitude, mean_motion, body, mu, body_radius, inclination, argument_of_latitude, field
         The parameters; omitted parameters are computed from the others.
     radius : float
         Radius of the orbit [m].
@@ -76,8 +104,8 @@ class CircularOrbit:
     Raises
     ------
     InputError
-        If altitude and mean motion are both given or both omitted, a value is not positive, or
-        the orbit is below the surface.
+        If altitude and mean motion are both given or both omitted, a value is not positive, the
+        orbit is below the surface, or the field or an angle is not valid.
     UnknownNameError
         If the central body is unknown.
 
@@ -98,6 +126,9 @@ class CircularOrbit:
     body: str = "earth"
     mu: float = _FOLLOWS
     body_radius: float = _FOLLOWS
+    inclination: float = 0.0
+    argument_of_latitude: float = 0.0
+    field: str | MagneticField | None = None
 
     def __post_init__(self) -> None:
         mu, ground = _central_body(self.body, self.mu, self.body_radius)
@@ -128,7 +159,15 @@ class CircularOrbit:
             "mean_motion": n,
             "mu": mu,
             "body_radius": ground,
+            "inclination": _angle("inclination", self.inclination, 0.0, math.pi),
+            "argument_of_latitude": _angle(
+                "argument_of_latitude",
+                self.argument_of_latitude,
+                -ONE_ROTATION,
+                ONE_ROTATION,
+            ),
         }
+        _check_field(self.field, self.body)
         for name, value in known.items():
             object.__setattr__(self, name, value)
 
@@ -143,8 +182,11 @@ class CircularOrbit:
         return 2.0 * math.pi / self.mean_motion
 
     def to_json(self) -> str:
-        """Return the orbit as JSON text."""
-        return json.dumps(asdict(self))
+        """Return the orbit as JSON text; a field that is a function is left out."""
+        parts = asdict(self)
+        if callable(self.field):
+            parts["field"] = None
+        return json.dumps(parts)
 
     @classmethod
     def from_json(cls, text: str) -> CircularOrbit:
@@ -259,6 +301,9 @@ class EllipticOrbit:
     1800.0
     """
 
+    # The magnetic field along an elliptic orbit is not known.
+    field: ClassVar[None] = None
+
     perigee: float
     apogee: float = _FOLLOWS
     eccentricity: float = _FOLLOWS
@@ -302,12 +347,7 @@ class EllipticOrbit:
             "anomaly": (-2.0 * math.pi, 2.0 * math.pi),
         }
         for name, (least, largest) in angles.items():
-            angle = number(name, getattr(self, name))
-            if not least <= angle <= largest:
-                raise InputError(
-                    f"{name} is {angle:g} rad, expected {least:.4g} to {largest:.4g} rad; convert "
-                    "degrees to radians"
-                )
+            angle = _angle(name, getattr(self, name), least, largest)
             object.__setattr__(self, name, angle)
         if self.body == "earth" and self.mu is None and low < _LOWEST:
             _warn_of_kilometres("a perigee", low)
@@ -453,6 +493,33 @@ def orbit_from_json(text: str) -> Orbit:
 def is_elliptic(orbit: Orbit | None) -> bool:
     """Return whether models in an orbit depend on time."""
     return isinstance(orbit, EllipticOrbit)
+
+
+def _angle(name: str, value: object, least: float, most: float) -> float:
+    """Return an angle [rad] within limits, or raise `InputError`."""
+    angle = number(name, value)
+    if not least <= angle <= most:
+        raise InputError(
+            f"{name} is {angle:g} rad, expected {least:.4g} to {most:.4g}; give radians, such as "
+            f"{math.radians(angle):.3g} for {angle:g} deg"
+        )
+    return angle
+
+
+def _check_field(field: object, body: str) -> None:
+    """Raise `InputError` if a magnetic field is neither known nor a function nor None."""
+    if field is None or callable(field):
+        return
+    if field != "dipole":
+        raise InputError(
+            f"field is {field!r}, expected 'dipole' or a function of time [s] and position [m] "
+            "that returns the flux density (3,) [T]"
+        )
+    if body not in DIPOLES:
+        raise InputError(
+            f"the magnetic dipole of {body} is not known; give field= as a function of time and "
+            "position"
+        )
 
 
 def checked_orbit(value: object) -> Orbit | None:

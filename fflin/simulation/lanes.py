@@ -19,10 +19,10 @@ from fflin.base.rotation import rotation_matrix
 from fflin.base.validation import Array, Indices, Mask, shaped, vector
 from fflin.control.channel import channel_of
 from fflin.control.loops import Loop, Sample, measured_at
-from fflin.control.policy import Form, OutputForm, PathForm, Policy, StateForm
+from fflin.control.policy import BDotForm, Form, OutputForm, PathForm, Policy, StateForm
 from fflin.control.tracking import AT_THE_END, TrajectoryFeedback
 from fflin.dynamics.disturbance import Wave, waves_of
-from fflin.dynamics.orbital import mean_motion
+from fflin.dynamics.orbital import OrbitField, mean_motion
 from fflin.dynamics.state import StateMap
 from fflin.kernel import allocation, forward, loop, orbit, policies
 from fflin.kernel.compiled import compiles, is_kept, kernel
@@ -87,7 +87,7 @@ def loop_name(plan: Plan, *, lanes: int) -> str:
 def form_of(policy: Policy, robot: Robot) -> Form | None:
     """Return the data of a policy for a robot, or None; raise `InputError` if they are invalid."""
     form = policy.form(robot)
-    if form is None or isinstance(form, OutputForm | PathForm):
+    if form is None or isinstance(form, OutputForm | PathForm | BDotForm):
         return form
     what = f"{policy.kind}.form(robot)"
     if not isinstance(form, StateForm):
@@ -651,14 +651,24 @@ def orbit_of(plant: Plant) -> orbit.Orbit:
     """Return the kernel's parameters of the orbit of a plant; empty without an orbit."""
     none: orbit.Orbit = empty(orbit.ORBIT)
     field = plant.field
-    if field is None:
+    circle = plant.robot.orbit
+    if field is None or circle is None:
         return none
     return none._replace(
         outwards=field.axes[:, 0],
         normal=field.axes[:, 2],
         mean_motion=[mean_motion(plant.robot)],
-        now=np.zeros(4),
+        latitude=[circle.argument_of_latitude],
+        dipole=_dipole_of(field),
+        now=np.zeros(orbit.END),
     )
+
+
+def _dipole_of(field: OrbitField) -> Array:
+    """Return the amplitudes (3,) [T] of the magnetic field of an orbit; zero without a field."""
+    if field.magnetic is None or field.magnetic.amplitudes is None:
+        return np.zeros(3)
+    return field.magnetic.amplitudes
 
 
 def no_law(state: StateMap, u: Array) -> policies.Law:
@@ -704,6 +714,9 @@ def _law(plan: Plan, mechanics: forward.Mechanics, noisy: bool) -> policies.Law:
         law = law._replace(kind=policies.TRACK, path=path)
     elif isinstance(form, StateForm):
         law = _linear(law, form, state)
+    elif isinstance(form, BDotForm):
+        direct = law.filter._replace(D=form.gain.ravel())
+        law = law._replace(kind=policies.B_DOT, filter=direct)
     size = len(law.measured)
     slots = SLOTS if noisy or plan.noise else 1
     return law._replace(y=np.zeros(size), added=np.zeros(slots * size))

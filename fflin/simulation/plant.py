@@ -125,7 +125,9 @@ class Plant(Aba):
         if self._plain and self.disturbance is None:
             tau = self._columns.dot(u)
             return pin.aba(self._model, self._data, q, v, tau), tau[:6]
-        force = self.actuation.columns(self._data, q) @ u
+        self.t = t
+        flux = self.actuation.flux(t) if self.actuation.torquers else None
+        force = self.actuation.columns(self._data, q, flux) @ u
         disturbed = None
         if self.disturbance is not None:
             begin, h = self.step

@@ -48,6 +48,7 @@ _TITLES = {
     ("tau_m", "N m"): "joint torques",
     ("tau_m", "N"): "joint forces",
     ("thrust", "N"): "thrusters",
+    ("dipole", "A m^2"): "magnetorquers",
     ("speed", "rad/s"): "wheel speed",
     ("wheel", "N m"): "wheel torque",
     ("momentum", "N m s"): "wheel momentum",

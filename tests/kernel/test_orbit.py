@@ -114,6 +114,43 @@ def test_the_frame_turns_a_constant_inertial_vector_back(robots):
     assert result == pytest.approx(tuple(expected), rel=1e-15)
 
 
+def with_torquers(robot, law=None):
+    """The robot with magnetorquers on the base and on its last link, in a strong field."""
+    frames = ["base", *robot.joint_names[-1:]]
+    rods = [fflin.Magnetorquer([1.0, 2.0, -1.0], frame, max=50.0) for frame in frames]
+    orbit = fflin.CircularOrbit(
+        mean_motion=N,
+        mu=N**2 * 1e18,
+        body_radius=1.0,
+        inclination=0.9,
+        argument_of_latitude=0.4,
+        field="dipole",
+    )
+    return robot.replace(orbit=orbit, inputs=[*rods, fflin.BaseTorque()])
+
+
+def test_magnetorquers_match_pinocchio(robots):
+    _, options = moving(robots["planar_detumble"])
+    robot = with_torquers(robots["planar_detumble"])
+    lin = fflin.linearize(robot)
+    K = np.zeros((5, len(lin.x0)))
+    K[:2, 8:11] = [[200.0, -100.0, 300.0], [100.0, 200.0, -200.0]]
+    law = fflin.StateFeedback(lin, K)
+    limits = {f"magnetorquer_{k}": (-50.0, 50.0) for k in (1, 2)}
+    run = agree(planned(robot, law, limits=limits, **options))
+    assert np.abs(run.u[:, :2]).max() == 50.0
+    free = go(planned(robot, **options))
+    assert np.abs(free.v - run.v).max() > 1e-6
+
+
+@pytest.mark.parametrize("sample", [None, 0.04])
+def test_the_b_dot_law_matches_the_python_engine(robots, sample):
+    _, options = moving(robots["cubesat"])
+    robot = with_torquers(robots["cubesat"])
+    run = agree(planned(robot, fflin.BDot(300.0), sample=sample, **options))
+    assert np.abs(run.u[:, 0]).max() > 0.1
+
+
 def swept(robot, monkeypatch, **options):
     """Models of the batch kernel, uncompiled, and models of `linearize`."""
     monkeypatch.setattr(

@@ -125,6 +125,12 @@ def light(folder):
         "CircularOrbit": {
             **{"altitude": 7e5, "mean_motion": None, "body": "earth", "mu": None},
             "body_radius": None,
+            **{"inclination": 1.0, "argument_of_latitude": 0.1, "field": "dipole"},
+        },
+        "BDot": {"gain": 1.0},
+        "detumbling_time": {"motion": motion, "factor": 4.0},
+        "Magnetorquer": {
+            **{"axis": vector, "frame": "base", "name": "m", "max": 1.0, "min": None}
         },
         "closed": {"robot": robot, "q": q, "v": v},
         "configuration": {

@@ -1,0 +1,163 @@
+"""Magnetorquers in the field of a dipole, and the B-dot law that detumbles with them."""
+
+import math
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import fflin
+from fflin.dynamics.magnetic import MagneticField
+from fflin.dynamics.orbital import OrbitField
+from fflin.robot.orbit import DIPOLES
+from tests.support.robots import random_point
+
+INCLINATION, LATITUDE = 1.2, 0.7
+ORBIT = fflin.CircularOrbit(
+    500e3, inclination=INCLINATION, argument_of_latitude=LATITUDE, field="dipole"
+)
+RODS = [fflin.Magnetorquer(axis, max=0.2) for axis in np.eye(3)]
+
+
+@pytest.fixture(scope="module")
+def cubesat():
+    return fflin.load("cubesat", orbit=ORBIT, inputs=RODS)
+
+
+def dipole(t, position):
+    """Flux density of a dipole along -z, in equatorial axes."""
+    distance = np.linalg.norm(position)
+    r = position / distance
+    north = np.array([0.0, 0.0, 1.0])
+    return DIPOLES["earth"] / distance**3 * (north - 3.0 * (north @ r) * r)
+
+
+def test_the_field_in_lvlh_axes(cubesat):
+    """b = a (sin i cos u, -cos i, 2 sin i sin u), x along, y minus normal, z to the earth."""
+    field = OrbitField(cubesat, "lvlh").magnetic
+    a = DIPOLES["earth"] / ORBIT.radius**3
+    for t in (0.0, 1234.5):
+        u = LATITUDE + ORBIT.mean_motion * t
+        s, c = math.sin(INCLINATION), math.cos(INCLINATION)
+        expected = a * np.array([s * math.cos(u), -c, 2.0 * s * math.sin(u)])
+        assert field.at(t) == pytest.approx(expected, rel=1e-14)
+    assert 2e-5 < a < 3e-5  # [T], the field at the magnetic equator in a low orbit
+
+
+@pytest.mark.parametrize("frame", ["lvlh", "hill"])
+def test_a_function_of_position_gives_the_same_field(frame):
+    """The dipole in equatorial axes is an independent computation of the field."""
+    axes = OrbitField(fflin.load("cubesat", orbit=ORBIT), frame).axes
+    other = fflin.CircularOrbit(
+        500e3, inclination=INCLINATION, argument_of_latitude=LATITUDE, field=dipole
+    )
+    known, given = MagneticField(ORBIT, axes), MagneticField(other, axes)
+    for t in (0.0, 700.0, 4000.0):
+        assert given.at(t) == pytest.approx(known.at(t), abs=1e-18)
+        # The central difference over 2 s has the relative error (n 1 s)^2 / 6 = 2e-7.
+        assert given.rate(t) == pytest.approx(known.rate(t), rel=1e-5, abs=1e-14)
+
+
+def test_the_torque_is_across_the_field(cubesat):
+    """With the moment m s, the torque is m s x b."""
+    q = fflin.configuration(cubesat, rpy=(30, 20, 50))
+    lin = fflin.linearize(cubesat, q)
+    R = pin.XYZQUATToSE3(q[:7]).rotation
+    b = R.T @ OrbitField(cubesat, "lvlh").magnetic.at(0.0)
+    torque = lin.M[:3, :3] @ lin.B[6:9]
+    assert torque == pytest.approx(np.cross(np.eye(3), b).T, abs=1e-18)
+    assert lin.input_units == ("A m^2",) * 3
+    assert fflin.check(cubesat, lin).ok
+
+
+def test_a_magnetorquer_on_a_moving_link_is_verified():
+    robot = fflin.load("planar_detumble")
+    rods = [fflin.Magnetorquer((1, 2, 3), robot.joint_names[-1]), fflin.BaseTorque()]
+    robot = robot.replace(orbit=ORBIT, inputs=rods)
+    q, v, _ = random_point(robot, np.random.default_rng(2), speed=0.1, degrees=40.0)
+    assert fflin.check(robot, fflin.linearize(robot, q, v, frame="hill")).ok
+
+
+def test_files_and_records(tmp_path, cubesat):
+    text = """
+    urdf = "cubesat"
+    orbit = { altitude = 500e3, inclination = 1.2, argument_of_latitude = 0.7, field = "dipole" }
+    [[input]]
+    type = "magnetorquer"
+    axis = [0, 0, 1]
+    max = 0.2
+    name = "rod"
+    """
+    (tmp_path / "sat.toml").write_text(text)
+    robot = fflin.load(tmp_path / "sat.toml")
+    assert robot.orbit == ORBIT
+    assert fflin.linearize(robot).input_names == ("rod",)
+    assert fflin.CircularOrbit.from_json(ORBIT.to_json()) == ORBIT
+    function = fflin.CircularOrbit(500e3, field=dipole)
+    assert fflin.CircularOrbit.from_json(function.to_json()).field is None
+
+
+def test_the_law_removes_energy(cubesat):
+    """The moment -k db/dt gives the power -|k| (w x b)^2 in a field that does not change."""
+    law = fflin.BDot(2e4).bind(cubesat)
+    b = OrbitField(cubesat, "lvlh").magnetic.at(0.0)
+    w = np.array(
+        [0.3, -0.2, 0.4]
+    )  # so fast that the change of the field does not matter
+    u = law(0.0, cubesat.neutral(), np.concatenate((np.zeros(3), w)))
+    power = w @ np.cross(u, b)
+    assert power == pytest.approx(-2e4 * np.sum(np.cross(w, b) ** 2), rel=0.02)
+
+
+@pytest.mark.exhaustive
+def test_a_cubesat_detumbles_within_a_few_orbits(cubesat):
+    spin = np.radians(5.0) / math.sqrt(3.0) * np.ones(3)
+    v0 = np.concatenate((np.zeros(3), spin))
+    options = {"duration": 3.0 * ORBIT.period, "dt": 10.0}
+    law = fflin.BDot(2e4)
+    motion = fflin.simulate(cubesat, law, v0=v0, limits="urdf", **options)
+    assert np.abs(motion.u).max() <= 0.2
+    assert fflin.detumbling_time(motion) < 3.0 * ORBIT.period
+    assert fflin.detumbling_time(motion, factor=0.5) == math.inf
+
+
+@pytest.mark.compiled
+def test_a_compiled_campaign_detumbles_as_the_python_engine_does(cubesat):
+    spread = {"q_b": 0.1, "omega_b": 0.02, "base.mass": 0.05}
+    options = {"runs": 3, "duration": 100.0, "dt": 1.0, "seed": 4}
+    one, other = (
+        fflin.monte_carlo(cubesat, fflin.BDot(2e4), spread, engine=engine, **options)
+        for engine in ("compiled", "python")
+    )
+    for name in ("q", "v", "u"):
+        expected = getattr(other, name)
+        size = np.maximum(1.0, np.abs(expected).max())
+        assert np.abs(getattr(one, name) - expected).max() < 1e-12 * size, name
+
+
+def refused(match, function):
+    with pytest.raises(fflin.InputError, match=match):
+        function()
+
+
+def test_errors(cubesat):
+    free = fflin.load("cubesat", inputs=RODS)
+    refused("no magnetic field", lambda: fflin.linearize(free))
+    refused("is zero", lambda: fflin.Magnetorquer((0, 0, 0)))
+    refused("expected 0; linear", lambda: fflin.linearize(cubesat, u=[0.1, 0, 0]))
+    refused("'igrf'", lambda: fflin.CircularOrbit(5e5, field="igrf"))
+    refused("moon", lambda: fflin.CircularOrbit(5e5, body="moon", field="dipole"))
+    refused("radians", lambda: fflin.CircularOrbit(5e5, inclination=98.0))
+    refused("gain", lambda: fflin.BDot(-1.0))
+    plain = fflin.load("cubesat", orbit=ORBIT)
+    refused("no magnetorquers", lambda: fflin.BDot(1.0).bind(plain))
+    free = fflin.simulate(fflin.load("cubesat"), duration=0.1)
+    refused("not in orbit", lambda: fflin.detumbling_time(free))
+    bad = plain.replace(
+        orbit=fflin.CircularOrbit(5e5, field=lambda t, r: [math.nan] * 3), inputs=RODS
+    )
+    refused("field", lambda: fflin.linearize(bad))
+    arm = fflin.load("planar_detumble")
+    rod = fflin.Magnetorquer((1, 0, 0), arm.joint_names[-1])
+    arm = arm.replace(orbit=ORBIT, inputs=[rod])
+    refused("moves relative", lambda: fflin.BDot(1.0).bind(arm))
