@@ -46,7 +46,7 @@ def test_a_body_returns_after_a_period_with_the_drift_of_its_orbit():
     period = robot.orbit.period
     along = fflin.linearize_orbit(robot, steps=40)
     total = np.eye(12)
-    for factor in along.monodromy_factors():
+    for factor in along._monodromy_factors():
         total = factor @ total
     q0 = robot.neutral()
     q0[0] = 1e-3
@@ -93,7 +93,7 @@ def test_a_periodic_schedule_repeats(monkeypatch):
     # Held commands miss the change of the torque within a sample. The rest repeats, because the
     # initial error of 7 deg is multiplied by at most the largest multiplier in each period.
     assert angle[-1] < 0.3
-    left = 7.2 * schedule.multipliers[0]
+    left = 7.2 * schedule.loop_multipliers[0]
     assert np.abs(angle[64:96] - angle[128:160]).max() < left < 1e-4
     assert str(robot.orbit)[:20] in str(motion)
     with pytest.raises(fflin.InputError, match="another orbit"):

@@ -111,6 +111,11 @@ def light(folder):
             **{"altitude": 7e5, "mean_motion": None, "body": "earth", "mu": None},
             "body_radius": None,
         },
+        "EllipticOrbit": {
+            **{"perigee": 7e5, "apogee": 9e5, "eccentricity": None, "body": "earth"},
+            **{"inclination": 0.1, "argument_of_perigee": 0.2, "anomaly": 0.3},
+            **{"mu": None, "body_radius": None},
+        },
         "configuration": {
             "robot": robot,
             "joints": {joint: 0.1},
@@ -176,6 +181,12 @@ def light(folder):
         "linearize": result | place,
         "linearize_trajectory": knots
         | {"robot": robot, "strict": False, "hold": "previous", "frame": "world"},
+        "linearize_orbit": {
+            "robot": fflin.load("cubesat", orbit=7e5),
+            "q": None,
+            "motion": "held",
+            "steps": 8,
+        },
         "Linearizer": {"robot": robot} | place,
         "list_robots": {},
         "LinearController": {"system": -gain.K, "lin": lin, "sign": -1, "noise": None},
@@ -362,6 +373,11 @@ def light(folder):
         "StateMap.to_pinocchio": {"self": fflin.StateMap(robot), "x": lin.x0},
         "StateMap.to_state": {"self": fflin.StateMap(robot), "q": q, "v": v},
         "CircularOrbit.from_json": {"text": "{}"},
+        "EllipticOrbit.at": {
+            "self": fflin.EllipticOrbit(perigee=5e5, apogee=9e5),
+            "t": 10.0,
+        },
+        "EllipticOrbit.from_json": {"text": "{}"},
         "Compensator.load": {"path": "nosuch.npz"},
         "Estimator.load": {"path": "nosuch.npz"},
         "FilterSchedule.load": {"path": "nosuch.npz"},

@@ -1,4 +1,4 @@
-"""Periodic Riccati equations: stabilising solutions by doubling of the period (20.3)."""
+"""Periodic Riccati equations: stabilising solutions by doubling of the period (17.5)."""
 
 from __future__ import annotations
 
