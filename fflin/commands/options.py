@@ -194,7 +194,8 @@ ABOUT: dict[str, str] = {
     "position. In every option, NAME can also be a pattern such as 'hinge_*'",
     "xacro": "value of an argument of a xacro file",
     "orbit": "circular orbit at an altitude [m], or elliptic orbit with the heights [m] of perigee "
-    "and apogee, above a central body: earth (default), moon, mars ... The world is then the orbital frame. `none` removes the orbit of a robot file",
+    "and apogee, above a central body: earth (default), moon, mars ... The world is then the "
+    "orbital frame. `none` removes the orbit of a robot file",
     "stiffness": "stiffness of a joint [N m/rad|N/m], or one value for all joints",
     "damping": "damping of a joint [N m s/rad|N s/m], or one value for all joints. With `urdf` as "
     "VALUE, the damping in the URDF is used",

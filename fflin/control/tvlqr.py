@@ -152,9 +152,7 @@ class GainSchedule(Schedule):
     u: Array
     hold: str
     frame: str
-    loop_multipliers: Vector = field(
-        default_factory=partial(np.zeros, 0), kw_only=True
-    )
+    loop_multipliers: Vector = field(default_factory=partial(np.zeros, 0), kw_only=True)
 
     def _report(self) -> str:
         """Return the report, which contains the sizes, the residual and the rule of the weights."""

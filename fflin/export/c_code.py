@@ -67,7 +67,8 @@ def write_c(
     - For an output feedback, the arguments are the outputs y, and the controller memory, which the
       caller allocates. A state feedback with integral action also has this memory. If the inputs
       saturate at `limits`, the integrals are corrected as in `simulate`.
-    - For gains along a trajectory, the sample number is an additional argument.
+    - For gains along a trajectory, the sample number is an additional argument. The gains of a
+      periodic trajectory repeat.
 
     Parameters
     ----------
@@ -551,6 +552,11 @@ def _state_words(law: Law, state: StateMap) -> dict[str, object]:
             "sample_comment": f" sample counts from 0; the last row applies from {rows - 1} on.",
             "row": f"(sample < {rows - 1}UL ? sample : {rows - 1}UL)",
             "feedback": "feed_back((int)row, 1, x, u);",
+        }
+    if law.repeats:
+        words |= {
+            "sample_comment": f" sample counts from 0; the rows repeat after {rows} samples.",
+            "row": f"(sample % {rows}UL)",
         }
     if points is not None:
         axes, room = points.shape

@@ -160,7 +160,7 @@ class Trajectory(Design):
             raise InputError(
                 f"t[{back[0] + 1}] is {early:.9g} s, after {late:.9g} s; expected increasing times"
             )
-        holds = ("linear", "previous")
+        holds: tuple[str, ...] = ("linear", "previous")
         if self.period:
             holds = (*holds, "smooth")
         if self.hold is not None and str(self.hold) not in holds:
