@@ -331,7 +331,9 @@ class Result(FrozenArrays):
     def __repr__(self) -> str:
         """Return a title with the robot, the numbers of points and signals, and the accuracy."""
         shown = [
-            key for key in _TITLE if key not in self._untitled and hasattr(self, key)
+            key
+            for key in _TITLE
+            if key not in self._untitled and getattr(self, key, None) is not None
         ]
         parts = [_TITLE[key](getattr(self, key)) for key in shown]
         return f"{type(self).__name__}({', '.join(parts)})"

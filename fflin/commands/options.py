@@ -195,8 +195,9 @@ ABOUT: dict[str, str] = {
     "weld": "weld a frame to the frame TO or, without TO, to inertial space, in the pose that they "
     "have at the operating point. The welds are added to the constraints in robot.toml",
     "xacro": "value of an argument of a xacro file",
-    "orbit": "circular orbit at an altitude [m] above a central body: earth (default), moon, mars "
-    "... The world is then the orbital frame. `none` removes the orbit of a robot file",
+    "orbit": "circular orbit at an altitude [m], or elliptic orbit with the heights [m] of perigee "
+    "and apogee, above a central body: earth (default), moon, mars ... The world is then the "
+    "orbital frame. `none` removes the orbit of a robot file",
     "stiffness": "stiffness of a joint [N m/rad|N/m], or one value for all joints",
     "damping": "damping of a joint [N m s/rad|N s/m], or one value for all joints. With `urdf` as "
     "VALUE, the damping in the URDF is used",

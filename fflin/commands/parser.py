@@ -127,11 +127,15 @@ def xacro_argument(text: str) -> tuple[str, str]:
 
 
 def orbit(text: str) -> dict[str, float | str] | str:
-    """Read ALTITUDE, ALTITUDE:BODY or none, which removes the orbit of a robot file."""
+    """Read ALTITUDE or PERIGEE/APOGEE, with :BODY or without it; none removes an orbit."""
     if text == NO_ORBIT:
         return text
-    altitude, _, body = text.partition(":")
-    return {"altitude": number(altitude), "body": body or "earth"}
+    heights, _, body = text.partition(":")
+    low, slash, high = heights.partition("/")
+    given: dict[str, float | str] = {"body": body or "earth"}
+    if slash:
+        return given | {"perigee": number(low), "apogee": number(high)}
+    return given | {"altitude": number(low)}
 
 
 def parameter_range(text: str) -> tuple[str, object]:
@@ -251,7 +255,7 @@ FORMS: dict[str, Form] = {
     "vary": many(parameter_range, "NAME=RANGE", required=True),
     "grid": many(grid_axis, "JOINT=LO:HI:N"),
     "range": many(joint_range, "JOINT=LO:HI"),
-    "orbit": one(orbit, "ALTITUDE[:BODY]|none"),
+    "orbit": one(orbit, "ALTITUDE|PERIGEE/APOGEE[:BODY]|none"),
     "rpy": _ANGLES,
     "target-rpy": _ANGLES,
     "position": _AXES,

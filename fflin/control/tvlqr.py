@@ -68,7 +68,7 @@ class Schedule(ModelDesign):
         starts: list[float] = times.tolist()
         return starts
 
-    def in_period(self, t: float) -> float:
+    def _in_period(self, t: float) -> float:
         """Return the time t of a periodic schedule, moved into the period of its knots."""
         if not self.period:
             return t
@@ -81,7 +81,7 @@ class Schedule(ModelDesign):
 
     def interval(self, t: float) -> int:
         """Return the index of the interval or sample at t; if there is none, raise `InputError`."""
-        t = self.in_period(number("t", t))
+        t = self._in_period(number("t", t))
         first = self.starts[0]
         last = float(self.t[-1])
         if not first <= t <= last:
@@ -121,7 +121,7 @@ class GainSchedule(Schedule):
         Description of the rule that set the weights.
     period : float
         Time [s] after which the gains repeat; 0 if they do not repeat.
-    multipliers : ndarray (nx,)
+    loop_multipliers : ndarray (nx,)
         Magnitudes of the characteristic multipliers of the closed loop over one period, the largest
         first; empty if the gains do not repeat.
     knots, q, v, u, hold, frame
@@ -152,13 +152,13 @@ class GainSchedule(Schedule):
     u: Array
     hold: str
     frame: str
-    multipliers: Vector = field(default_factory=partial(np.zeros, 0), kw_only=True)
+    loop_multipliers: Vector = field(default_factory=partial(np.zeros, 0), kw_only=True)
 
     def _report(self) -> str:
         """Return the report, which contains the sizes, the residual and the rule of the weights."""
         lines = [repr(self), f"weights: {self.weights or 'as given'}"]
         if self.period:
-            loop = multiplier_text(self.multipliers)
+            loop = multiplier_text(self.loop_multipliers)
             lines.append(f"repeats after {self.period:.6g} s; closed loop: {loop}")
         return folded(lines)
 
@@ -207,7 +207,7 @@ class GainSchedule(Schedule):
         if self.dt:
             K: Array = self.K[k]
             return K
-        x = self.in_period(t) - self.starts[k]
+        x = self._in_period(t) - self.starts[k]
         square = x * x
         fourth = square * square
         powers = np.array(
@@ -219,7 +219,7 @@ class GainSchedule(Schedule):
     def cost_to_go(self, t: float) -> Array:
         """Return P (nx, nx) at time t: interpolated, or of the latest sample if sampled."""
         k = self.interval(t)
-        P: Array = self.P[k] if self.dt else self._cubics(self.in_period(t))
+        P: Array = self.P[k] if self.dt else self._cubics(self._in_period(t))
         return P
 
     @cached_property
@@ -473,7 +473,7 @@ def tvlqr(
         dt=dt,
         weights=rule,
         knots=traj.t,
-        multipliers=multipliers,
+        loop_multipliers=multipliers,
         orbit=orbit_text(traj.robot),
     )
     if dt:

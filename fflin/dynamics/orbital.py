@@ -1,4 +1,4 @@
-"""Orbital frame: velocities relative to it, and the gravity-gradient field (14.1), (14.9)."""
+"""Orbital frame: velocities relative to it, and the gravity-gradient field (14.1), (17.1)."""
 
 import math
 import warnings
@@ -51,7 +51,7 @@ class OrbitField:
     - `tide` (3, 3): matrix G of (14.1). At a position x, gravity per unit mass minus gravity at the
       frame's origin is `tide` x.
     - `gradient`: the gravitational parameter divided by the cube of the radius [1/s^2].
-    - `pull` (3, 3): matrix K of (14.2) or (14.9). A free mass that is at rest in the frame at x has
+    - `pull` (3, 3): matrix K of (14.2) or (17.1). A free mass that is at rest in the frame at x has
       the acceleration `pull` x relative to the frame.
 
     One quantity is constant:
@@ -179,7 +179,7 @@ class OrbitField:
         return inertial
 
     def relative(self, q: Array, v: Array, absolute: Array, rate: Array) -> Array:
-        """Return dv/dt (nv,) of the velocity v relative to the orbital frame, see (14.2), (14.9).
+        """Return dv/dt (nv,) of the velocity v relative to the orbital frame, see (14.2), (17.1).
 
         `absolute` (nv,) is the inertial velocity, and `rate` (nv,) is its time derivative.
         """
@@ -319,7 +319,7 @@ class OrbitField:
         """Return the power [W] that changes the Jacobi integral because the orbit is elliptic.
 
         The Jacobi integral changes because its potentials depend on time, and because the
-        acceleration of the frame exerts the force -Omega' x r per unit mass, see (14.10).
+        acceleration of the frame exerts the force -Omega' x r per unit mass, see (17.3).
         """
         if not self.elliptic:
             return 0.0
@@ -386,7 +386,7 @@ class GravityGradient(NamedTuple):
     # this frame at the base's origin.
     fall: Array
     spin_change: Array  # derivative (3,) of the angular velocity of the frame [rad/s^2]
-    pull: Array  # matrix K (3, 3) of (14.2) or (14.9) [1/s^2]
+    pull: Array  # matrix K (3, 3) of (14.2) or (17.1) [1/s^2]
 
     @classmethod
     def at(cls, field: OrbitField, q: Array) -> "GravityGradient":

@@ -200,7 +200,7 @@ class Turning(NamedTuple):
 
     spin: Array  # Omega [rad/s]
     spin_change: Array  # its derivative [rad/s^2]
-    pull: Array  # K of (14.2) or (14.9) [1/s^2]
+    pull: Array  # K of (14.2) or (17.1) [1/s^2]
 
 
 class AccelerationDerivatives(NamedTuple):

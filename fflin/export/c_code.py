@@ -68,9 +68,9 @@ def write_c(
       caller allocates. A state feedback with integral action also has this memory. If the inputs
       saturate at `limits`, the integrals are corrected as in `simulate`.
     - For gains along a trajectory, for a law that follows one, and for outputs that are measured at
-      different rates, the sample number is an additional argument. The attitudes and positions in
-      the outputs y of a law that follows a trajectory are relative to the base poses of the
-      trajectory, which ``NAME.json`` lists.
+      different rates, the sample number is an additional argument. The gains of a periodic
+      trajectory repeat. The attitudes and positions in the outputs y of a law that follows a
+      trajectory are relative to the base poses of the trajectory, which ``NAME.json`` lists.
 
     Parameters
     ----------
@@ -486,7 +486,7 @@ def _texts(law: Law, name: str, real: str) -> tuple[str, dict[str, str]]:
         "tolerances": _listed("u", names, sizes),
         "inputs": len(names),
         "input_list": _listed("u", names, units),
-        **_sample_words(len(tables["u0"])),
+        **_sample_words(len(tables["u0"]), repeats=law.repeats),
         f"{kind}_list": _listed(signal, *law.signals),
         "vectors": "{\n" + ",\n".join(vectors) + "}",
         "ins": len(law.cases[0].given),
@@ -605,7 +605,7 @@ def _vector(case: Case, law: Law, error: float, array: Callable[[Array], str]) -
     return f"{{{case.sample}UL, {', '.join(numbers)}, {int(cut.any())}}}"
 
 
-def _sample_words(rows: int) -> dict[str, object]:
+def _sample_words(rows: int, *, repeats: bool) -> dict[str, object]:
     """Return {placeholder: text} for the number of the sample of a law with rows for samples."""
     words: dict[str, object] = {
         "rows": rows,
@@ -619,6 +619,11 @@ def _sample_words(rows: int) -> dict[str, object]:
             "sample_argument": "unsigned long sample, ",
             "sample_given": "given->sample, ",
             "sample_comment": f" sample counts from 0; the last row applies from {last} on.",
+        }
+    if repeats:
+        words |= {
+            "sample_comment": f" sample counts from 0; the rows repeat after {rows} samples.",
+            "row": f"(sample % {rows}UL)",
         }
     return words
 

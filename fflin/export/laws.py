@@ -19,12 +19,13 @@ from fflin.control.loops import NOT_CORRECTED, Sample
 from fflin.control.multirate_feedback import MultirateFeedback
 from fflin.control.policies import LinearLaw, StateFeedback
 from fflin.control.policy import Command, OutputForm, PathForm, Policy, StateForm, bound
-from fflin.control.tracking import TrajectoryFeedback
+from fflin.control.tracking import TrajectoryFeedback, TrajectoryOutputFeedback
 from fflin.control.tvlqr import GainSchedule
 from fflin.dynamics.state import StateMap
 from fflin.dynamics.state_rows import readout
 from fflin.linear.fit import Signals, signals_of
 from fflin.linear.model import LinearModel
+from fflin.linear.trajectory import refuse_periodic
 from fflin.robot.fields import chosen_limits, input_limits
 from fflin.robot.loading import load
 from fflin.robot.robot import Robot
@@ -84,6 +85,8 @@ class Law:
     operations: float
     cases: list[Case]
     period: int = 1  # number of samples after which the tables A, B and E repeat
+    # whether the rows of the tables for the samples repeat, instead of the last one being kept
+    repeats: bool = False
 
 
 def measured(world: StateMap, q: Array, v: Array) -> Array:
@@ -185,6 +188,8 @@ def _law_of(given: Design, robot: Robot) -> Law:
         policy = StateFeedback(model, law)
     if isinstance(policy, Following):
         return _following_law(title, policy, robot)
+    if isinstance(policy, TrajectoryFeedback) and policy.trajectory.period:
+        return _periodic_law(title, policy, robot)
     form = policy.form(robot)
     if isinstance(form, StateForm) and policy.model:
         dt = given.dt if isinstance(given, Gain) else policy.sample_time
@@ -457,18 +462,31 @@ def _state_cases(
         yield case
 
 
+def _periodic_law(title: str, policy: TrajectoryFeedback, robot: Robot) -> Law:
+    """Convert the feedback along a trajectory that repeats."""
+    if isinstance(policy, TrajectoryOutputFeedback):
+        refuse_periodic(policy.trajectory, "C code of output feedback")
+    state = policy.state_map(robot)
+    law = _law_of_states(title, policy, state, _samples(policy, state), {}, robot)
+    return replace(law, repeats=True)
+
+
 def _samples(policy: TrajectoryFeedback, state: StateMap) -> dict[str, Array]:
     """Return the tables of a law with one row for each sample of a trajectory.
 
-    The last row also applies to all samples after the end of the trajectory.
+    The last row also applies to all samples after the end of the trajectory. If the trajectory
+    repeats, the rows are the samples of one period.
     """
     if not (dt := policy.schedule.dt):
         raise InputError(
             "the gains are continuous in time, expected sampled gains; design sampled gains with "
             "tvlqr(..., sample=dt) (fflin tvlqr --sample)"
         )
-    times = dt * np.arange(int(policy.over / dt) + 3)
-    times = times[: np.searchsorted(times, policy.over, side="right") + 1]
+    if policy.trajectory.period:
+        times = dt * np.arange(len(policy.schedule.K) - 1)
+    else:
+        times = dt * np.arange(int(policy.over / dt) + 3)
+        times = times[: np.searchsorted(times, policy.over, side="right") + 1]
     q, v, u0 = map(np.array, zip(*map(policy.commanded, times), strict=True))
     gains = np.array([*map(policy.gain, times)])
     return _references(state, q, v) | {"u0": u0, "K": gains}

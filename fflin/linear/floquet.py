@@ -18,7 +18,7 @@ def multipliers(factors: Array) -> Complex:
     r"""Return the eigenvalues (nx,) of :math:`\Phi_N \cdots \Phi_1`, the largest first.
 
     The product itself is not formed, because its small eigenvalues would be lost beside the large
-    ones. Instead, groups of factors are the blocks of a cyclic matrix, see (20.2). Its eigenvalues
+    ones. Instead, groups of factors are the blocks of a cyclic matrix, see (17.4). Its eigenvalues
     are the roots of the multipliers, and their magnitudes differ far less.
 
     Parameters

@@ -130,7 +130,7 @@ class LinearTrajectory(Trajectory):
 
     def matrices_at(self, times: Array) -> tuple[Array, Array]:
         """Return A (k, nx, nx) and B (k, nx, nu) at times (k,), with one matrix pair per time."""
-        times = self.within_period(times)
+        times = self._within_period(times)
         k, s = intervals_of(self.t, times)
         if self.dt:
             s = 0.0 * s
@@ -181,11 +181,11 @@ class LinearTrajectory(Trajectory):
         """
         from fflin.linear.floquet import multipliers
 
-        values = multipliers(self.monodromy_factors())
+        values = multipliers(self._monodromy_factors())
         values.setflags(write=False)
         return values
 
-    def monodromy_factors(self) -> Array:
+    def _monodromy_factors(self) -> Array:
         """Return the transition matrices (k, nx, nx) from knot to knot of a periodic motion."""
         if not self.period:
             raise InputError(

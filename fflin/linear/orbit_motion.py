@@ -1,4 +1,4 @@
-"""Periodic motions of a robot in orbit, and the linear models over one period (section 20)."""
+"""Periodic motions of a robot in orbit, and the linear models over one period (section 17)."""
 
 from __future__ import annotations
 

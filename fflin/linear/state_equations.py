@@ -81,7 +81,7 @@ def assemble(
         spin = _spin(state, chart, turning)
         f0[..., g.omega_b] += times(W, spin)
         f0[..., g.v_b] -= 2.0 * times(skew(spin), v)
-        if state.elliptic:  # (14.9)
+        if state.elliptic:  # (17.1)
             assert turning is not None
             f0[..., g.omega_b] -= turning.spin_change
     if not v_in_reference:
@@ -182,7 +182,7 @@ def _rotation_derivative(
     if state.orbit:  # (14.5)
         spin_cross = skew(_spin(state, chart, turning))
         angular_rows += product(W, spin_cross)
-        if state.elliptic:  # (14.9)
+        if state.elliptic:  # (17.1)
             assert turning is not None
             angular_rows -= skew(turning.spin_change)
         if not v_in_reference:

@@ -225,7 +225,7 @@ class Trajectory(Design):
             )
         object.__setattr__(self, "period", period)
 
-    def within_period(self, times: Array) -> Array:
+    def _within_period(self, times: Array) -> Array:
         """Return times (k,) of a periodic motion, moved into its first period.
 
         The times of a motion that ends are returned unchanged.
@@ -349,7 +349,7 @@ class Trajectory(Design):
 
     def points(self, times: Array) -> tuple[Array, Array, Array]:
         """Return q, v and u (k, ..) at times (k,); see `point`."""
-        times = self.within_period(times)
+        times = self._within_period(times)
         k, s = intervals_of(self.t, times)
         s = s[:, None]
         steps, v = np.einsum("ij,lijk->lik", s ** np.arange(4), self.cubics[:, k])
@@ -540,7 +540,7 @@ class Trajectory(Design):
     def _within(self, t: float) -> float:
         t = number("t", t)
         if self.period:
-            return float(self.within_period(np.array([t]))[0])
+            return float(self._within_period(np.array([t]))[0])
         if not self.t[0] <= t <= self.t[-1]:
             raise InputError(
                 f"t is {t:g} s, expected a time of the trajectory, {self.t[0]:g} to "

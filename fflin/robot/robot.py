@@ -74,7 +74,7 @@ class Robot(RobotData):
     gravity : tuple of float (3,)
         Uniform gravitational acceleration [m/s^2] in Pinocchio's world axes. `model` itself has
         zero gravity.
-    orbit : CircularOrbit or None
+    orbit : CircularOrbit, EllipticOrbit or None
         Orbit of the robot. In orbit, Pinocchio's world is the orbital frame, see `CircularOrbit`.
     disturbance : mapping
         Torque and force on the base that act in simulations, {"tau_b" or "F_b": terms}, see
@@ -151,9 +151,9 @@ class Robot(RobotData):
             Positions {joint: position [rad|m]} at which the springs are relaxed.
         gravity : sequence of float (3,)
             Uniform gravitational acceleration [m/s^2] in Pinocchio's world axes.
-        orbit : CircularOrbit, float, mapping or None
+        orbit : CircularOrbit, EllipticOrbit, float, mapping or None
             Orbit of the robot, altitude [m] over the earth, or parameters {name: value} of a
-            `CircularOrbit`. None removes the orbit.
+            `CircularOrbit` or of an `EllipticOrbit`. None removes the orbit.
         disturbance : mapping or None
             Torque ``tau_b`` [N m] and force ``F_b`` [N] on the base that act on the true system:
             in `simulate` and in campaigns, but not in linear models, so that control laws do not

@@ -33,6 +33,7 @@ from fflin.robot.disturbance import BASE, INERTIAL, UNITS, DisturbanceTerm
 from fflin.robot.fields import input_limits, limits_of
 from fflin.robot.inputs import BaseTorque
 from fflin.robot.joints import ROOT, find_frame
+from fflin.robot.orbit import CircularOrbit
 from fflin.robot.outputs import Gyroscope
 from fflin.robot.robot import Robot
 from fflin.simulation.plan import Plan, Times
@@ -652,7 +653,7 @@ def orbit_of(plant: Plant) -> orbit.Orbit:
     none: orbit.Orbit = empty(orbit.ORBIT)
     field = plant.field
     circle = plant.robot.orbit
-    if field is None or circle is None:
+    if field is None or not isinstance(circle, CircularOrbit):
         return none
     return none._replace(
         outwards=field.axes[:, 0],

@@ -379,9 +379,11 @@ def _state_of(policy: Policy | None, options: SimulationOptions) -> StateMap:
     followed = policy.followed_trajectory if policy else None
     if followed is not None:
         _require_same_orbit(robot, followed.robot)
-    elif own_frame and (own_frame in ORBITAL) != bool(robot.orbit):
+    elif own_frame and _designed_in_orbit(policy, own_frame, robot) != bool(
+        robot.orbit
+    ):
         designed, simulated = "without an orbit", "in orbit"
-        if own_frame in ORBITAL:
+        if not robot.orbit:
             designed, simulated = "in orbit", "not in orbit"
         raise InputError(
             f"the policy was designed {designed}, frame '{own_frame}', but '{robot.name}' is "
@@ -390,6 +392,19 @@ def _state_of(policy: Policy | None, options: SimulationOptions) -> StateMap:
     reference = own_reference if reference is None else reference
     frame = own_frame if frame is None else frame
     return StateMap(robot, reference=reference, frame=frame)
+
+
+def _designed_in_orbit(policy: Policy | None, frame: str, robot: Robot) -> bool:
+    """Return whether a policy was designed for a robot in orbit.
+
+    Base axes are possible with and without an orbit. If the policy has no model that tells, it is
+    assumed to be designed for the given robot.
+    """
+    if frame != "local" or policy is None:
+        return frame in ORBITAL
+    if policy.model is None:
+        return bool(robot.orbit)
+    return policy.model.mean_motion > 0.0
 
 
 def _require_same_orbit(robot: Robot, design: Robot) -> None:

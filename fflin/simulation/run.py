@@ -4,7 +4,7 @@ Without external forces, the momentum about a fixed point is constant. The centr
 r_c(t) = r_c(0) + p t / m, with the linear momentum p and the mass m.
 
 In orbit, the momentum is not constant. The Jacobi integral (14.3) is constant if inputs,
-disturbance and dampers do no work. In an elliptic orbit, it changes by (14.10).
+disturbance and dampers do no work. In an elliptic orbit, it changes by (17.3).
 """
 
 from __future__ import annotations

@@ -383,9 +383,9 @@ def test_models_between_knots_are_computed_in_batches(moving, monkeypatch, sampl
     for name in ("__call__", "along"):
         whole = getattr(fflin.Linearizer, name)
 
-        def counted(*given, whole=whole):
+        def counted(*given, whole=whole, **options):
             calls.append(len(given))
-            return whole(*given)
+            return whole(*given, **options)
 
         monkeypatch.setattr(fflin.Linearizer, name, counted)
     Q, R = weights(moving)

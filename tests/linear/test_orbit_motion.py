@@ -19,7 +19,7 @@ TRANSLATION = np.r_[3:6, 9:12]
 def monodromy(along):
     """The transition matrix over one period."""
     total = np.eye(len(along.state_names))
-    for factor in along.monodromy_factors():
+    for factor in along._monodromy_factors():
         total = factor @ total
     return total
 
@@ -165,7 +165,7 @@ def test_wheels_carry_a_torque_that_has_no_mean():
     momentum = 1e-4 * speeds - inertia * rates
     assert np.ptp(momentum) < 1e-3 * np.ptp(1e-4 * speeds)
     q = fflin.configuration(robot, rpy=(0, 20, 0))
-    with pytest.raises(fflin.EquilibriumError, match="gains .* rad/s in every period"):
+    with pytest.raises(fflin.EquilibriumError, match="rad/s in every period"):
         fflin.linearize_orbit(robot, q, steps=8)
     q = fflin.configuration(robot, rpy=(20, 0, 0))
     with pytest.raises(fflin.EquilibriumError, match="nothing balances omega_b"):
@@ -204,13 +204,15 @@ def test_a_file_keeps_the_period(held, tmp_path):
         (lambda robot: fflin.linearize_orbit(robot, steps=3), "steps"),
         (
             lambda robot: fflin.linearize_orbit(
-                fflin.load("inspector_flexible", orbit=robot.orbit), motion="free"
+                fflin.load("inspector_flexible", orbit=robot.orbit),
+                motion="free",
+                steps=8,
             ),
             "lock the joints",
         ),
         (
             lambda robot: fflin.linearize_orbit(
-                robot.replace(inputs=[fflin.BaseForce()])
+                robot.replace(inputs=[fflin.BaseForce()]), steps=8
             ),
             "nothing balances omega_b.y",
         ),
@@ -223,7 +225,7 @@ def test_invalid_requests_are_refused(ask, words):
 
 
 MODEL = {
-    "a design about a fixed point": lambda lin: fflin.lqr(lin),
+    "a design about a fixed point": fflin.lqr,
     "discretize": lambda lin: lin.discretize(0.1),
     "controllability": fflin.controllability,
     "observability": fflin.observability,

@@ -1,5 +1,7 @@
 """Simulations in elliptic orbits: balance of energy, Kepler's orbits, and laws that repeat."""
 
+import shutil
+
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -46,7 +48,7 @@ def test_a_body_returns_after_a_period_with_the_drift_of_its_orbit():
     period = robot.orbit.period
     along = fflin.linearize_orbit(robot, steps=40)
     total = np.eye(12)
-    for factor in along.monodromy_factors():
+    for factor in along._monodromy_factors():
         total = factor @ total
     q0 = robot.neutral()
     q0[0] = 1e-3
@@ -93,7 +95,7 @@ def test_a_periodic_schedule_repeats(monkeypatch):
     # Held commands miss the change of the torque within a sample. The rest repeats, because the
     # initial error of 7 deg is multiplied by at most the largest multiplier in each period.
     assert angle[-1] < 0.3
-    left = 7.2 * schedule.multipliers[0]
+    left = 7.2 * schedule.loop_multipliers[0]
     assert np.abs(angle[64:96] - angle[128:160]).max() < left < 1e-4
     assert str(robot.orbit)[:20] in str(motion)
     with pytest.raises(fflin.InputError, match="another orbit"):
@@ -132,6 +134,32 @@ def test_output_feedback_repeats():
     angle = motion.attitude_error
     assert angle[-1] < 0.1
     assert np.allclose(angle[160:240], angle[320:400], rtol=0.0, atol=1e-2)
+
+
+@pytest.mark.exhaustive
+@pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler")
+def test_c_code_of_a_periodic_schedule_repeats(tmp_path):
+    robot = in_ellipse(free_body(BODY), 0.3)
+    along = fflin.linearize_orbit(robot, steps=8)
+    h = along.period / 16
+    schedule = fflin.tvlqr(along, 1.0, STRONG, "periodic", sample=h)
+    folder = fflin.write_c(schedule, tmp_path, robot=robot)
+    assert "the rows repeat after 16 samples" in (tmp_path / "controller.h").read_text()
+    law = fflin.CLaw(folder)
+    start = {"q0": fflin.configuration(robot, rpy=(5, -3, 4)), "dt": h / 2}
+    duration = 2.25 * along.period
+    inertial = fflin.simulate(robot, schedule, duration=duration, **start)
+    in_c = fflin.simulate(robot, law, duration=duration, **start)
+    assert np.allclose(in_c.q, inertial.q, rtol=0.0, atol=1e-9)
+    measured = robot.replace(outputs=[fflin.BasePose()])
+    along = fflin.linearize_orbit(measured, steps=8)
+    policy = fflin.TrajectoryOutputFeedback(
+        along,
+        fflin.tvlqr(along, 1.0, STRONG, "periodic", sample=h),
+        fflin.tvkalman(along, 1e-3, 1e-4, P0="periodic", sample=h),
+    )
+    with pytest.raises(fflin.InputError, match="C code of output feedback"):
+        fflin.write_c(policy, tmp_path, robot=measured)
 
 
 @pytest.mark.exhaustive

@@ -133,6 +133,11 @@ def light(folder):
             **{"axis": vector, "frame": "base", "name": "m", "max": 1.0, "min": None}
         },
         "closed": {"robot": robot, "q": q, "v": v},
+        "EllipticOrbit": {
+            **{"perigee": 7e5, "apogee": 9e5, "eccentricity": None, "body": "earth"},
+            **{"inclination": 0.1, "argument_of_perigee": 0.2, "anomaly": 0.3},
+            **{"mu": None, "body_radius": None},
+        },
         "configuration": {
             "robot": robot,
             "joints": {joint: 0.1},
@@ -206,6 +211,12 @@ def light(folder):
         "linearize": result | place | {"independent": ["q_b"]},
         "linearize_trajectory": knots
         | {"robot": robot, "strict": False, "hold": "previous", "frame": "world"},
+        "linearize_orbit": {
+            "robot": fflin.load("cubesat", orbit=7e5),
+            "q": None,
+            "motion": "held",
+            "steps": 8,
+        },
         "Linearizer": {"robot": robot} | place | {"independent": ["q_b"]},
         "list_robots": {},
         "LinearController": {"system": -gain.K, "lin": lin, "sign": -1, "noise": None},
@@ -406,6 +417,11 @@ def light(folder):
         "StateMap.to_pinocchio": {"self": fflin.StateMap(robot), "x": lin.x0},
         "StateMap.to_state": {"self": fflin.StateMap(robot), "q": q, "v": v},
         "CircularOrbit.from_json": {"text": "{}"},
+        "EllipticOrbit.at": {
+            "self": fflin.EllipticOrbit(perigee=5e5, apogee=9e5),
+            "t": 10.0,
+        },
+        "EllipticOrbit.from_json": {"text": "{}"},
         "Compensator.load": {"path": "nosuch.npz"},
         "Estimator.load": {"path": "nosuch.npz"},
         "MultirateEstimator.load": {"path": "nosuch.npz"},
