@@ -171,54 +171,70 @@ def _law_of(given: Design, robot: Robot) -> Law:
     title = type(given).__name__
     if isinstance(given, Compensator):
         return _compensator_law(given, robot)
-    policy = given
-    if isinstance(policy, GainSchedule):
-        policy = TrajectoryFeedback(policy.trajectory(robot), policy)
-    if isinstance(policy, Gain):
-        gain = policy
-        made = f"the gain was designed for '{policy.robot}'"
-        model = policy._lin or model_of(
-            policy, robot, made, pin.XYZQUATToSE3(policy.placement)
-        )
-        law: Gain | Array = gain.K
-        if gain.integrals:
-            law = gain
-        if (gain.integrals or gain.delay.any()) and not model.dt:
-            model = sampled_for(gain, model)
-        policy = StateFeedback(model, law)
+    policy = _policy_of(given, robot)
+    law = _law_along_trajectory(title, policy, robot)
+    if law is None:
+        dt = given.dt if isinstance(given, Gain) else policy.sample_time
+        law = _law_of_model(title, policy, dt, robot)
+    if law is None:
+        raise _not_written(given)
+    return law
+
+
+def _policy_of(given: Policy | Gain | GainSchedule, robot: Robot) -> Policy:
+    """Return the policy of a gain or of a gain schedule; return a policy unchanged."""
+    if isinstance(given, GainSchedule):
+        return TrajectoryFeedback(given.trajectory(robot), given)
+    if not isinstance(given, Gain):
+        return given
+    made = f"the gain was designed for '{given.robot}'"
+    model = given._lin or model_of(
+        given, robot, made, pin.XYZQUATToSE3(given.placement)
+    )
+    if (given.integrals or given.delay.any()) and not model.dt:
+        model = sampled_for(given, model)
+    return StateFeedback(model, given if given.integrals else given.K)
+
+
+def _law_along_trajectory(title: str, policy: Policy, robot: Robot) -> Law | None:
+    """Convert a policy along a trajectory, or return None for another policy."""
     if isinstance(policy, Following):
         return _following_law(title, policy, robot)
     if isinstance(policy, TrajectoryFeedback) and policy.trajectory.period:
         return _periodic_law(title, policy, robot)
     form = policy.form(robot)
-    if isinstance(form, StateForm) and policy.model:
-        dt = given.dt if isinstance(given, Gain) else policy.sample_time
+    if not isinstance(form, PathForm):
+        return None
+    state = form.policy.state_map(robot)
+    tables = _samples(form.policy, state)
+    return _law_of_states(title, policy, state, tables, {}, robot)
+
+
+def _law_of_model(title: str, policy: Policy, dt: float, robot: Robot) -> Law | None:
+    """Convert a policy about the point of its model, or return None if it is of another kind."""
+    form, lin = policy.form(robot), policy.model
+    if lin is None:
+        return None
+    if isinstance(form, StateForm):
         return _state_law(title, policy, dt, form, robot)
-    if isinstance(form, PathForm):
-        state = form.policy.state_map(robot)
-        return _law_of_states(
-            title, policy, state, _samples(form.policy, state), {}, robot
-        )
-    lin = policy.model
-    if isinstance(form, OutputForm) and form.loop.measures_state and lin:
+    if isinstance(form, OutputForm) and form.loop.measures_state:
         return _memory_law(title, policy, form.terms(0.0), robot)
     # The form also contains the sensors of the robot, which are no part of the code.
-    terms = None
     if isinstance(policy, MultirateFeedback):
         terms = policy.terms()
     elif isinstance(policy, LinearLaw):
         terms = [policy.terms()]
-    if terms and lin:
-        return _output_law(
-            title,
-            terms,
-            inputs=(lin.input_names, lin.input_units),
-            signals=(lin.output_names, lin.output_units),
-            dt=policy.sample_time,
-            robot=robot,
-            lin=lin,
-        )
-    raise _not_written(given)
+    else:
+        return None
+    return _output_law(
+        title,
+        terms,
+        inputs=(lin.input_names, lin.input_units),
+        signals=(lin.output_names, lin.output_units),
+        dt=policy.sample_time,
+        robot=robot,
+        lin=lin,
+    )
 
 
 def _state_law(

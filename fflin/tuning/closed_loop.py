@@ -146,7 +146,9 @@ class ClosedLoop:
         A, B, C, D = self.system(channel)
         nz = self.nz
         L = np.hstack((channel.D12, np.zeros((len(channel.D12), nz)))).astype(complex)
-        R = np.vstack((channel.D21, np.zeros((nz, channel.D21.shape[1])))).astype(complex)
+        R = np.vstack((channel.D21, np.zeros((nz, channel.D21.shape[1])))).astype(
+            complex
+        )
         T = D.astype(complex)
         if np.isfinite(frequency):
             inner = 1j * frequency * np.eye(len(A)) - A

@@ -199,5 +199,3 @@ def _started(parameter: Parameter, value: float | None) -> Parameter:
     else:
         value = least if math.isfinite(least) else largest
     return replace(parameter, value=value)
-
-

@@ -98,7 +98,9 @@ def signals_of(lin: LinearModel) -> Signals:
 def joined(A: Array, B: Array, C: Array) -> Array:
     """Return the indices of the states that an input reaches and that affect an output."""
     links = np.abs(A) > _ROUNDING * np.abs(A).max(initial=0.0)
-    reached = np.abs(B).max(axis=1, initial=0.0) > _ROUNDING * np.abs(B).max(initial=0.0)
+    reached = np.abs(B).max(axis=1, initial=0.0) > _ROUNDING * np.abs(B).max(
+        initial=0.0
+    )
     seen = C.any(axis=0)
     for _ in A:
         reached = reached | links[:, reached].any(axis=1)
@@ -106,7 +108,9 @@ def joined(A: Array, B: Array, C: Array) -> Array:
     return np.flatnonzero(reached & seen)
 
 
-def plant_of(matrices: tuple[Array, Array, Array, Array], dt: float, used: Array) -> Plant:
+def plant_of(
+    matrices: tuple[Array, Array, Array, Array], dt: float, used: Array
+) -> Plant:
     """Return the plant of a model.
 
     `used` (ny + nx,) marks the outputs and states that a law or a goal uses. States without an

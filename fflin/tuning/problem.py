@@ -129,9 +129,7 @@ class Problem:
         if loops is None:
             return None
         return [
-            pieces_of(
-                measure.goal, measure.ends, channel, loop, self.scaling(x, index)
-            )
+            pieces_of(measure.goal, measure.ends, channel, loop, self.scaling(x, index))
             for index, (measure, channel, loop) in enumerate(
                 zip(self.measures, case.channels, loops, strict=True)
             )

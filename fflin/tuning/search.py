@@ -153,7 +153,9 @@ def minimise(
                         proximity *= 0.3
                     if decrease >= _LONG * predicted:
                         levels_here = objective, constraint
-                        longer = _extended(evaluate, x, d, bounds, levels_here, decrease)
+                        longer = _extended(
+                            evaluate, x, d, bounds, levels_here, decrease
+                        )
                         if longer is not None:
                             accepted = *longer, z
                     break

@@ -65,7 +65,9 @@ class Element:
 
     def used(self, signals: Signals) -> tuple[tuple[int, ...], tuple[int, ...]]:
         """Return the indices of the outputs and inputs that the law connects."""
-        values = np.array([parameter.value or parameter.scale for parameter in self.parameters])
+        values = np.array(
+            [parameter.value or parameter.scale for parameter in self.parameters]
+        )
         measured, commanded = self.measured or (), self.commanded or ()
         law = self.law(values, len(measured))
         law = embedded(
@@ -124,7 +126,10 @@ class _Sum(Structure):
 
         def law(values: Array, width: int) -> Law:
             laws = []
-            for part, part_values in ((first, values[:split]), (second, values[split:])):
+            for part, part_values in (
+                (first, values[:split]),
+                (second, values[split:]),
+            ):
                 measured, commanded = part.measured or (), part.commanded or ()
                 part_law = part.law(part_values, len(measured))
                 laws.append(embedded(part_law, measured, commanded, ny, nu))
@@ -160,9 +165,7 @@ class _Series(Structure):
                 right.law(values[split:], before),
             )
 
-        return Element(
-            (*left.parameters, *right.parameters), measured, commanded, law
-        )
+        return Element((*left.parameters, *right.parameters), measured, commanded, law)
 
 
 def _require_name(name: object) -> None:
@@ -695,11 +698,15 @@ class StaticGain(Structure):
         measured = indices("output", self.measured, signals.outputs)
         inputs = indices("input", self.inputs, signals.inputs)
         shape = len(inputs), len(measured)
-        pattern = np.ones(shape) if self.pattern is None else self._array("pattern", shape)
+        pattern = (
+            np.ones(shape) if self.pattern is None else self._array("pattern", shape)
+        )
         start = np.zeros(shape) if self.gain is None else self._array("gain", shape)
         entries = [tuple(entry) for entry in np.argwhere(pattern).tolist()]
         if not entries:
-            raise InputError("pattern has no nonzero entry, so there is no gain to tune")
+            raise InputError(
+                "pattern has no nonzero entry, so there is no gain to tune"
+            )
         parameters = []
         dD = np.zeros((len(entries), *shape))
         for change, (row, column) in zip(dD, entries, strict=True):
@@ -992,13 +999,17 @@ class Structured:
         self.parameters = _distinct(self.parameters)
         self.free = [not parameter.fixed for parameter in self.parameters]
         if not any(self.free):
-            raise InputError("all parameters of the structure are fixed; free one of them")
+            raise InputError(
+                "all parameters of the structure are fixed; free one of them"
+            )
 
     def law(self, values: Array) -> Law:
         """Return the law from all outputs to all inputs, with derivatives for all parameters."""
         element = self._element
         law = element.law(values[self._place], self._width)
-        law = embedded(law, element.measured or (), element.commanded or (), *self._sizes)
+        law = embedded(
+            law, element.measured or (), element.commanded or (), *self._sizes
+        )
         stacks = []
         for stack in law[4:]:
             merged = np.zeros((len(self.parameters), *stack.shape[1:]))

@@ -112,7 +112,9 @@ def tune(
     True
     """
     started = time.process_time()
-    instance("structure", structure, Structure, "a structure of a law, such as fflin.PD")
+    instance(
+        "structure", structure, Structure, "a structure of a law, such as fflin.PD"
+    )
     every = [goals] if isinstance(goals, Goal) else goals
     if not isinstance(every, Sequence) or not every:
         raise InputError(f"goals are {goals!r}, expected one goal or more")
@@ -310,10 +312,16 @@ class _Task:
         distinct = list({id(point): point for point in every}.values())
         worst = self.worst(problem, minimum.x, distinct)
         law = problem.law(minimum.x)
-        soft = [w.value for w, m in zip(worst, self.measures, strict=True) if not m.goal.hard]
+        soft = [
+            w.value
+            for w, m in zip(worst, self.measures, strict=True)
+            if not m.goal.hard
+        ]
         level = max(soft, default=max(w.value for w in worst))
         goals = []
-        for index, (found, measure) in enumerate(zip(worst, self.measures, strict=True)):
+        for index, (found, measure) in enumerate(
+            zip(worst, self.measures, strict=True)
+        ):
             check, where = math.nan, math.nan
             loops = found.case.loops(law)
             if loops is not None and found.piece is not None:
@@ -436,4 +444,3 @@ def _is_better(minimum: Minimum, other: Minimum) -> bool:
         if abs(minimum.violation - other.violation) > least:
             return minimum.violation < other.violation
     return minimum.objective < other.objective
-

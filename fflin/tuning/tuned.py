@@ -141,7 +141,10 @@ class Tuned(LinearController):
         return self.report()
 
     def _repr_html_(self) -> str:
-        parts = [html.paragraph(self._verdict()), html.table(self._goal_rows(), "lrrrrl")]
+        parts = [
+            html.paragraph(self._verdict()),
+            html.table(self._goal_rows(), "lrrrrl"),
+        ]
         parts.append(html.table(self._parameter_rows(), "lrl"))
         return html.result_card(self, *parts)
 

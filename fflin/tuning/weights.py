@@ -116,6 +116,7 @@ def _of_system(name: str, given: object) -> Weight:
             "denominator)"
         ) from None
     if np.ndim(top) > 1 and len(np.atleast_2d(top)) > 1:
-        raise InputError(f"{name} has several outputs, expected one input and one output")
+        raise InputError(
+            f"{name} has several outputs, expected one input and one output"
+        )
     return Weight(_polynomial(name, np.ravel(top)), _polynomial(name, bottom))
-
