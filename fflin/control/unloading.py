@@ -35,8 +35,8 @@ def unload_wheels(law: LawT, design: Robot, rate: float) -> LawT:
 
     B_w are the rows of B of the wheel speeds, B_o the rows of all other rates, and the columns of U
     span the null space of B_o. So the external torque and the motors of the wheels cancel each
-    other on the robot: the wheels slow down with the rate k, and the attitude is not disturbed. The
-    law does not notice the unloading, and its margins do not change.
+    other on the robot: the wheels return to s_0 with the rate k, and the attitude is not disturbed.
+    The unloading changes no other signal of the given law, so the margins do not change.
 
     Thrusters that push in one direction only produce the external torque by `Allocation`. Choose k
     such that ``k * momentum`` is below the torque of the thrusters, because saturated thrusters

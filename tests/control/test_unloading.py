@@ -125,7 +125,7 @@ def test_inputs_that_unload_accelerate_only_wheels():
 
 @pytest.mark.exhaustive
 def test_thrusters_unload_wheels_while_integrals_hold_the_attitude():
-    """The total momentum goes to its target, and the attitude error stays below 1e-3 deg."""
+    """The total momentum goes to its target, and the attitude error stays below 1e-5 deg."""
     alone, design, flown = cubesat()
     point = fflin.velocity(alone, {"wheel_y": 100.0})
     model = fflin.linearize(alone, v=point).discretize(SAMPLE, delay=SAMPLE)
@@ -138,8 +138,8 @@ def test_thrusters_unload_wheels_while_integrals_hold_the_attitude():
     target = 3e-6 * 100.0 * np.array((0.0, 1.0, 0.0))
     first, last = (np.abs(momentum[k] - target).max() for k in (0, -1))
     assert last < np.exp(-0.95 * RATE * 60.0) * first
-    assert motion.attitude_error.max() < 1e-3
-    assert motion.u.min() >= -1e-3 and motion.u[:, :12].max() > 1e-4
+    assert motion.attitude_error.max() < 1e-5
+    assert motion.u[:, :12].max() > 1e-4
     assert motion.u[:, :12].min() >= 0.0
 
 
@@ -177,19 +177,43 @@ def test_compiled_code_unloads_as_python_does(kind):
     assert compiled.u == pytest.approx(python.u, abs=1e-9)
 
 
-def test_a_law_that_unloads_follows_a_slew_of_the_wheels():
-    alone, design, _ = cubesat()
+def slew_of(alone):
+    """Return a slew of 8 s by wheel_z, from rest to rest."""
 
     def bang_bang(t, q, v):
         return np.array((0.0, 0.0, 2e-5 if t < 3.999 else -2e-5))
 
-    trajectory = fflin.simulate(
+    return fflin.simulate(
         alone, bang_bang, duration=8.0, sample=0.5, dt=0.5
     ).trajectory()
+
+
+def test_a_law_that_unloads_follows_a_slew_of_the_wheels():
+    alone, design, _ = cubesat()
     law = fflin.unload_wheels(state_law(alone), design, RATE)
-    motion = fflin.simulate(design, law.follow(trajectory), duration=12.0, dt=SAMPLE)
+    policy = law.follow(slew_of(alone))
+    motion = fflin.simulate(design, policy, duration=12.0, dt=SAMPLE)
     assert motion.attitude_error.max() < 1e-9
     assert np.abs(motion.q[-1][5]) > 0.01
+
+
+@pytest.mark.compiled
+@pytest.mark.exhaustive
+def test_thrusters_unload_wheels_during_a_slew_in_both_engines():
+    alone, design, flown = cubesat()
+    law = fflin.unload_wheels(output_law(alone, delay=SAMPLE), design, RATE)
+    policy = fflin.Allocation(law.follow(slew_of(alone)), design)
+    v0 = fflin.velocity(flown, SPEEDS)
+    options = {"v0": v0, "duration": 16.0, "dt": 0.125}
+    python, compiled = (
+        fflin.simulate(flown, policy, engine=engine, **options)
+        for engine in ("python", "compiled")
+    )
+    # The momentum of the wheels turns with the base, a torque that the plan does not contain.
+    assert python.attitude_error.max() < 0.1
+    assert np.abs(python.v[-1, 6:]).max() < 0.7 * 300.0
+    assert compiled.q == pytest.approx(python.q, abs=1e-9)
+    assert compiled.u == pytest.approx(python.u, abs=1e-9)
 
 
 def test_laws_and_robots_that_cannot_unload_are_refused():
