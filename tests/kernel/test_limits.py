@@ -15,6 +15,13 @@ IN_ELLIPSE = CUBESAT.replace(orbit={"perigee": 500e3, "eccentricity": 0.1})
 CONSTRAINED_IN_ORBIT = fflin.load(
     "dual_arm", orbit=500e3, constraints=[fflin.Weld("tool_left", "tool_right")]
 )
+WITH_FIELD = CUBESAT.replace(
+    orbit=fflin.CircularOrbit(500e3, field=lambda t, position: (0.0, 2e-5, 0.0))
+)
+WITH_TORQUER = CUBESAT.replace(
+    orbit=fflin.CircularOrbit(500e3, inclination=1.7, field="dipole"),
+    inputs=[fflin.Magnetorquer((1, 0, 0), max=0.2)],
+)
 WITH_PLATE = CUBESAT.replace(
     disturbance={"plate": {"area": 0.1, "normal": (0, 0, 1), "sun": (0, 0, 1)}}
 )
@@ -45,6 +52,8 @@ TASKS = {
     "lags of inputs and outputs are": Task(robots=(CUBESAT,), lagging=True),
     "a Mpc is computed in Python": Task(robots=(CUBESAT,), python_policy="Mpc"),
     "'cubesat' is in an elliptic orbit": Task(robots=(CUBESAT, IN_ELLIPSE)),
+    "the magnetic field of 'cubesat'": Task(robots=(WITH_FIELD,), simulated=True),
+    "sweeps and allocations with the magnetorquers of": Task(robots=(WITH_TORQUER,)),
     "a joint of 'composite' does not": Task(robots=(with_displaced_axis(),)),
     "the root joint of 'displaced'": Task(
         robots=(with_displaced_root(),), simulated=True
