@@ -5,6 +5,7 @@ import pytest
 
 import fflin
 from fflin.kernel import limits
+from tests.support.c_code import needs_compiler
 from tests.support.marks import exhaustive
 
 
@@ -166,3 +167,15 @@ def test_laws_that_cannot_integrate_sensors_are_refused():
     command(0.0, q, v)
     with pytest.raises(fflin.InputError, match=r"only fflin\.simulate can integrate"):
         command(0.1, q, v)
+
+
+@needs_compiler
+def test_the_C_code_of_a_law_remembers_the_forces(tmp_path):
+    robot, lin = pushed_base()
+    model = lin.with_lags().discretize(0.25, delay=0.1)
+    policy = fflin.StateFeedback(model, fflin.lqr(model))
+    code = fflin.CLaw(fflin.write_c(policy, tmp_path / "law"))
+    options = {"x0": 0.1 * (np.arange(12) % 6 == 3), "duration": 5.0, "dt": 0.05}
+    expected = fflin.simulate(robot, policy, **options)
+    result = fflin.simulate(robot, code, **options)
+    assert np.abs(result.u - expected.u).max() < 1e-12 * np.abs(expected.u).max()
