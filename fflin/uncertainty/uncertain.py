@@ -220,12 +220,13 @@ class Uncertain:
         Parameters
         ----------
         gain : Gain, array_like (nu, nx), StateFeedback or LinearController
-            Linear law, which must stabilise the robot at the middle of the ranges. A
-            `LinearController` must be continuous, because the uncertain model is, and must measure
-            outputs that depend on states only. For a `Gain`, only the states in `Gain.regulated`,
-            and states that affect them, must be stable; for a policy, the states that it feeds
-            back. For an array, all states must be stable. For example, a gain of reaction wheels
-            does not stabilise the wheel angles, so give the `Gain` itself.
+            Linear law, which must stabilise the robot at the middle of the ranges. If it measures
+            outputs, they must depend on states only. For a sampled law, every robot is sampled
+            exactly with the delays of the law's model. The search is then the same, but there is no
+            guarantee for the robots that it does not try. For a `Gain`, only the states in
+            `Gain.regulated`, and states that affect them, must be stable; for a policy, the states
+            that it feeds back. For an array, all states must be stable. For example, a gain of
+            reaction wheels does not stabilise the wheel angles, so give the `Gain` itself.
         q : array_like (nq,), optional
             Configuration, as in `lft`.
         samples : int
@@ -241,7 +242,7 @@ class Uncertain:
         Raises
         ------
         InputError
-            If K has a wrong size, the law is sampled and has states, the loop at the middle of the
+            If K has a wrong size, the loop at the middle of the
             ranges is unstable, or `lft` raises an `InputError` for this robot.
         """
         return searched(self, self.lft(q), gain, count("samples", samples), seed)

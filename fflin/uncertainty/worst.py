@@ -16,11 +16,19 @@ from fflin.base.process import Progress, in_one_thread
 from fflin.base.tables import folded
 from fflin.base.validation import Array, Mask, shaped
 from fflin.control.compensator import Compensator
-from fflin.control.delayed import is_delayed
 from fflin.control.gain import Gain, gain_matrix, regulated_states
+from fflin.control.optimal.disk import Loop, largest_scaled_gain
 from fflin.control.optimal.largest_gain import ACCURACY, gain_crossings, largest_gain
 from fflin.control.policy import Policy
 from fflin.uncertainty.lft import LFT
+from fflin.uncertainty.sampled_loops import (
+    DISK,
+    OUTPUTS,
+    SampledLaw,
+    SampledLoops,
+    measured_signals,
+    sampled_law,
+)
 
 if TYPE_CHECKING:
     from fflin.uncertainty.uncertain import Uncertain
@@ -80,9 +88,9 @@ class Worst(html.Reported):
     damping : Found
         Least damping ratio of a pole.
     margin : Found
-        Least disk margin at the inputs, with the inputs scaled by sqrt(R_ii) of a `Gain`. It is a
-        lower bound of the margin of `Gain.margins`, which has the best scaling. 0 if a loop is
-        unstable.
+        Least disk margin at the inputs; 0 if a loop is unstable. For policies and sampled gains, it
+        has the best scaling of the inputs, as in `margins`. For a continuous `Gain`, the inputs are
+        scaled by sqrt(R_ii), so that it is a lower bound of the margin of `Gain.margins`.
     gain : Found
         Largest gain over all frequencies from a disturbance at the inputs to the outputs. Outputs
         that depend on states which the gain does not regulate are excluded.
@@ -94,7 +102,9 @@ class Worst(html.Reported):
     safe : float
         Factor by which all ranges may be scaled about their middles with the loop still stable. A
         value of 1 or more covers the whole set. It follows from an upper bound of the structured
-        singular value over intervals of frequency, evaluated at five frequencies in each.
+        singular value over intervals of frequency, evaluated at five frequencies in each. NaN for a
+        sampled law, because the sampled model is no LFT: the worst loops are then those that the
+        search finds, without a guarantee.
     """
 
     damping: Found
@@ -120,6 +130,12 @@ class Worst(html.Reported):
                 f"{name} {value:.4g}" for name, value in case.parameters.items()
             )
             lines.append(f"{criterion} {case.value:.4g} at {at}")
+        if np.isnan(self.safe):
+            lines.append(
+                "stability in the whole set is not guaranteed, because the law is sampled: the "
+                "worst loops are those that the search found"
+            )
+            return folded(lines)
         where = f"the central {100.0 * self.safe:.3g} % of each range"
         if self.safe >= 1.0:
             where = f"all ranges, and in ranges that are {self.safe:.3g} times as wide"
@@ -131,12 +147,13 @@ def searched(
     model: Uncertain, lft: LFT, gain: object, samples: int, seed: int
 ) -> Worst:
     """Search for the worst closed loops; see `Uncertain.worst`."""
-    nu = lft.B2.shape[1]
-    lft, K, regulated = _around(lft, gain)
-    kept = judged_states(lft, K, regulated)
-    lft = part_of(lft, kept)
-    K = K[:, kept]
-    size, loops = len(lft.repeats), Loops(lft, K)
+    sampled = sampled_law(gain)
+    loops: Loops | SampledLoops
+    if sampled is None:
+        loops, criteria = _continuous_loops(lft, gain)
+    else:
+        loops, criteria = _sampled_loops(lft, sampled)
+    size = len(lft.repeats)
     middle = np.zeros((1, size))
     if loops.undamped(middle)[0] >= 0.0:
         raise InputError(
@@ -150,29 +167,20 @@ def searched(
     physical = np.array([not model.refusal(corner) for corner in corners])
     # The random draws come last. So a search with more draws begins like one with fewer draws.
     tried = np.vstack((middle, corners[physical], draws))
-    # The disk margin is computed from (S - T)/2, with each input scaled by sqrt(R_ii), as in
-    # control.gain.
-    R = gain.R if isinstance(gain, Gain) else np.eye(nu)
-    scale = np.sqrt(R.diagonal())
-    # The rates of the states of a controller are no inputs that could be disturbed.
-    none = np.zeros(len(K) - nu)
-    half = np.hstack((0.5 * np.eye(nu), np.zeros((nu, len(none)))))
-    disk = Channel(-scale[:, None] * K[:nu], half, np.concatenate((1.0 / scale, none)))
-    through = np.zeros((len(lft.C2), len(K)))
-    whole = Channel(lft.C2, through, np.concatenate((np.ones(nu), none)))
     cases = []
     bar = Progress()
     undamped = Figures(
         loops.undamped, loops.undamped, lambda rows, b: loops.undamped(rows) > b
     )
-    for figures in (undamped, loops.figures(disk), loops.figures(whole)):
+    for figures in (undamped, *criteria()):
         value, delta = _largest(figures, tried, model.refusal)
         cases.append(Found(value, model.values(delta)))
         bar(len(cases), 4)
     unstable = loops.undamped(tried) >= 0.0
-    safe = min(
-        _safe(loops), float(np.abs(tried[unstable]).max(axis=1).min(initial=np.inf))
-    )
+    safe = np.nan
+    if isinstance(loops, Loops):
+        first = float(np.abs(tried[unstable]).max(axis=1).min(initial=np.inf))
+        safe = min(_safe(loops), first)
     bar.close()
     damping, margin, gained = cases
     return Worst(
@@ -184,6 +192,63 @@ def searched(
         excluded=excluded + int((~physical).sum()),
         safe=safe,
     )
+
+
+def _continuous_loops(
+    lft: LFT, gain: object
+) -> tuple[Loops, Callable[[], list[Figures]]]:
+    """Return the loops of a continuous law, and a function that returns two criteria.
+
+    They are the disk margin, and the gain from a disturbance at the inputs to the outputs.
+    """
+    nu = lft.B2.shape[1]
+    lft, K, regulated = _around(lft, gain)
+    kept = judged_states(lft, K, regulated)
+    lft = part_of(lft, kept)
+    K = K[:, kept]
+    loops = Loops(lft, K)
+
+    def criteria() -> list[Figures]:
+        # The disk margin is computed from (S - T)/2. Each input of a gain is scaled by sqrt(R_ii),
+        # as in control.gain. The inputs of a policy have the best scaling of the middle loop.
+        scale: Array = np.ones(nu)
+        if isinstance(gain, Gain):
+            scale = np.sqrt(gain.R.diagonal())
+        if isinstance(gain, Policy):
+            middle = loops.at_inputs(np.zeros(len(lft.repeats)), nu)
+            scale = largest_scaled_gain(middle)[2]
+        # The rates of the states of a controller are no inputs that could be disturbed.
+        none = np.zeros(len(K) - nu)
+        half = np.hstack((0.5 * np.eye(nu), np.zeros((nu, len(none)))))
+        factors = np.concatenate((1.0 / scale, none))
+        disk = Channel(-scale[:, None] * K[:nu], half, factors)
+        through = np.zeros((len(lft.C2), len(K)))
+        whole = Channel(lft.C2, through, np.concatenate((np.ones(nu), none)))
+        of_disk = loops.figures(disk)
+        if isinstance(gain, Policy):
+            # As in `margins`, the inputs of a policy have the best scaling of each loop. With
+            # another scaling, the gain is at least as large, so `above` finds every worse loop.
+            of_disk = of_disk._replace(exact=lambda row: loops.scaled(row, nu))
+        return [of_disk, loops.figures(whole)]
+
+    return loops, criteria
+
+
+def _sampled_loops(
+    lft: LFT, law: SampledLaw
+) -> tuple[SampledLoops, Callable[[], list[Figures]]]:
+    """Return the loops of a sampled law, and a function that returns the criteria as above."""
+    kept = judged_states(lft, measured_signals(lft, law), law.regulated)
+    loops = SampledLoops(part_of(lft, kept), law)
+
+    def figures(kind: str) -> Figures:
+        return Figures(
+            lambda rows: loops.quick(rows, kind),
+            lambda row: np.array((loops.exact(row[0], kind),)),
+            lambda rows, bound: loops.above(rows, bound, kind),
+        )
+
+    return loops, lambda: [figures(DISK), figures(OUTPUTS)]
 
 
 def _around(lft: LFT, gain: object) -> tuple[LFT, Array, Sequence[str]]:
@@ -205,12 +270,6 @@ def _around(lft: LFT, gain: object) -> tuple[LFT, Array, Sequence[str]]:
                 "StateFeedback or a continuous LinearController"
             )
     if law is None or not isinstance(gain, Policy) or gain.feedback_gain is not None:
-        if isinstance(gain, Gain) and is_delayed(gain.state_names):
-            raise InputError(
-                "the gain was designed for delayed inputs, but the uncertain model is continuous "
-                "and has no delay; give a gain of the continuous model, or the samples of the set "
-                "to fflin.margins one by one"
-            )
         if isinstance(gain, Gain) and gain.integrals:
             lft = _with_integrals(lft, gain)
         K = shaped("gain", gain_matrix(gain), lft.B2.T.shape, " (nu, nx)")
@@ -218,12 +277,6 @@ def _around(lft: LFT, gain: object) -> tuple[LFT, Array, Sequence[str]]:
         if isinstance(gain, Policy):
             regulated = gain.fed_back
         return lft, K, regulated
-    if law.dt:
-        raise InputError(
-            f"the law is sampled at {law.dt:g} s, but the uncertain model is continuous; give a "
-            "continuous law, such as a LinearController, or sample the robots of uncertain.draws "
-            "and call fflin.margins"
-        )
     signals = lft.state_names
     measured: Array = np.eye(len(lft.A))
     if gain.senses_outputs:
@@ -356,6 +409,18 @@ class Loops:
             gram = response.conj().mT @ response
             largest = np.maximum(largest, np.linalg.eigvalsh(gram)[..., -1])
         return np.where(self.undamped(rows) >= 0.0, np.inf, np.sqrt(largest))
+
+    def scaled(self, row: Array, nu: int) -> Array:
+        """Return the largest gain (1,) of (S - T)/2 at the inputs, with their best scaling."""
+        loop = self.at_inputs(row[0], nu)
+        if np.linalg.eigvals(loop.F).real.max() >= 0.0:
+            return np.array((np.inf,))
+        return np.array((largest_scaled_gain(loop)[0],))
+
+    def at_inputs(self, delta: Array, nu: int) -> Loop:
+        """Return (S - T)/2 at the first nu inputs for one row of deltas."""
+        F, B = self.matrices(delta)
+        return Loop(F, B[:, :nu], -self.K[:nu], 0.5 * np.eye(nu))
 
     def figures(self, channel: Channel) -> Figures:
         """Return the functions for the criterion "largest gain" of a channel."""

@@ -521,12 +521,14 @@ def test_the_worst_loops_of_a_law_with_integrals_are_those_of_its_gain(arm):
     uncertain = fflin.uncertain(robot, {"base.density": 0.2})
     by_gain = uncertain.worst(gain)
     by_law = uncertain.worst(fflin.StateFeedback(lin, gain))
-    # The inputs are scaled by the weights of a gain, which a law does not contain.
     for name in ("damping", "gain"):
         expected = getattr(by_gain, name).value
         assert getattr(by_law, name).value == pytest.approx(expected, rel=1e-6)
-    unscaled = uncertain.worst(replace(gain, R=np.eye(len(gain.R))))
-    assert by_law.margin.value == pytest.approx(unscaled.margin.value, rel=1e-6)
+    # The inputs of a law have the best scaling, and those of a gain the scaling by its weights.
+    robot = uncertain.at(by_law.margin.parameters)
+    expected = fflin.margins(gain, fflin.linearize(robot)).disk
+    assert by_law.margin.value == pytest.approx(expected, rel=1e-6)
+    assert by_law.margin.value >= by_gain.margin.value * (1.0 - 1e-6)
     compensator = fflin.lqg(fflin.lqr(lin), fflin.kalman(lin, 1e-3, 1e-4))
     with pytest.raises(fflin.InputError, match="LinearController"):
         uncertain.worst(compensator)

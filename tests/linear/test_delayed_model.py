@@ -395,9 +395,6 @@ def test_analyses_of_a_delayed_model():
     robot, gain = satellite()[0], fflin.lqr(late)
     with pytest.raises(fflin.InputError, match=r"lin\.undelayed"):
         fflin.validity(robot, late, gain)
-    uncertain = fflin.uncertain(robot, {"base.mass": 0.1})
-    with pytest.raises(fflin.InputError, match="delayed inputs"):
-        uncertain.worst(gain)
 
 
 def test_a_mode_that_no_input_stabilises_is_named_as_without_a_delay():

@@ -7,8 +7,16 @@ import numpy as np
 import pytest
 
 import fflin
+from fflin.control.margins import ClosedLoop, delayed_model, law_in_loop
 from fflin.uncertainty import worst
-from fflin.uncertainty.worst import Channel, Loops
+from fflin.uncertainty.sampled_loops import (
+    OUTPUTS,
+    SampledLoops,
+    measured_signals,
+    sampled_law,
+)
+from fflin.uncertainty.worst import Channel, Loops, judged_states, part_of
+from tests.support.marks import exhaustive
 
 FOUR = {
     "base.mass": 0.2,
@@ -424,11 +432,18 @@ def uncertain_arm():
 def test_a_state_feedback_has_the_worst_loops_of_its_gain(uncertain_arm):
     model, lin, gain = uncertain_arm
     worst = model.worst(gain.K, samples=5)
-    policy = model.worst(fflin.StateFeedback(lin, gain.K), samples=5)
-    assert policy == worst
+    law = fflin.StateFeedback(lin, gain.K)
+    policy = model.worst(law, samples=5)
+    assert (policy.damping, policy.gain) == (worst.damping, worst.gain)
+    assert (policy.tried, policy.safe) == (worst.tried, worst.safe)
+    # As in `margins`, the inputs of a policy have the best scaling.
+    robot = model.at(policy.margin.parameters)
+    expected = fflin.margins(law, fflin.linearize(robot)).disk
+    assert policy.margin.value == pytest.approx(expected, rel=1e-6)
+    assert policy.margin.value > worst.margin.value
     # A controller without states is the same law.
     static = fflin.LinearController(-gain.K, lin)
-    assert model.worst(static, samples=5) == worst
+    assert model.worst(static, samples=5) == policy
 
 
 @pytest.mark.exhaustive
@@ -456,10 +471,88 @@ def test_the_worst_loop_of_a_controller_with_states_is_that_of_its_closed_loop(
     assert 0.0 < worst.margin.value < model.worst(gain.K, samples=5).margin.value
 
 
-def test_a_sampled_controller_is_refused(uncertain_arm):
-    model, lin, _ = uncertain_arm
-    sampled = lin.discretize(0.1)
-    estimator = fflin.kalman(sampled, 1e-3, 1e-4)
-    compensator = fflin.lqg(fflin.lqr(sampled, 1.0, 1.0), estimator)
-    with pytest.raises(fflin.InputError, match="but the uncertain model is continuous"):
-        model.worst(fflin.OutputFeedback(sampled, compensator), samples=5)
+@pytest.fixture(scope="module")
+def sampled_satellite():
+    """An uncertain satellite with a sampled and delayed model, and two laws for it."""
+    outputs = [fflin.BasePose(), fflin.Gyroscope("base")]
+    robot = fflin.load("cubesat", inputs=[fflin.BaseTorque()], outputs=outputs)
+    ranges = {"base.inertia.xx": 0.2, "base.inertia.zz": 0.3}
+    lin = fflin.linearize(robot)
+    late = lin.discretize(0.5, delay={"tau_b.x": 0.7, "tau_b.y": 0.2})
+    gain = fflin.lqr(late)
+    noise = {"q_b": 1e-9, "r_b": 1e-4, "gyroscope": 1e-9}
+    estimator = fflin.kalman(late, {"omega_b": 1e-9}, noise)
+    laws = {
+        "state": fflin.StateFeedback(late, gain),
+        "output": fflin.OutputFeedback(late, fflin.lqg(gain, estimator)),
+        "gain": gain,
+        "integral": fflin.lqr(late, integral_action=["q_b"]),
+    }
+    return fflin.uncertain(robot, ranges), laws
+
+
+@pytest.mark.parametrize("name", exhaustive("state", "output", "gain", "integral"))
+def test_the_worst_sampled_loop_has_its_margin_its_poles_and_its_gain(
+    sampled_satellite, name
+):
+    model, laws = sampled_satellite
+    law = laws[name]
+    worst = model.worst(law, samples=10)
+    assert worst.unstable == 0 and np.isnan(worst.safe)
+    assert "is not guaranteed" in " ".join(str(worst).split())
+
+    def closed(parameters):
+        lin = fflin.linearize(model.at(parameters))
+        lin, delay = delayed_model(law, lin, None)
+        return ClosedLoop(law_in_loop(law, lin, None), lin, delay, None, "inputs")
+
+    def figures(loop):
+        F = loop.loop()[0]
+        rates = np.log(np.linalg.eigvals(F)) / loop.dt
+        return loop.margins().disk, (-rates.real / np.abs(rates)).min()
+
+    disk, _ = figures(closed(worst.margin.parameters))
+    assert worst.margin.value == pytest.approx(disk, rel=1e-6)
+    _, damping = figures(closed(worst.damping.parameters))
+    assert worst.damping.value == pytest.approx(damping, rel=1e-6)
+    for delta in model.draws(8, seed=5)[0]:
+        disk, damping = figures(closed(model.values(delta)))
+        assert worst.margin.value <= disk * (1.0 + 1e-6)
+        assert worst.damping.value <= damping + 1e-9
+
+
+def test_the_gain_of_a_sampled_loop_is_that_of_its_frequency_response(
+    sampled_satellite,
+):
+    model, laws = sampled_satellite
+    worst = model.worst(laws["state"], samples=5)
+    law = sampled_law(laws["state"])
+    lft = model.lft()
+    kept = judged_states(lft, measured_signals(lft, law), law.regulated)
+    loops = SampledLoops(part_of(lft, kept), law)
+    # One of the tried corners, or a better point, is the worst.
+    corner = loops.exact(np.array((-1.0, -1.0)), OUTPUTS)
+    assert worst.gain.value >= corner * (1.0 - 1e-5)
+    F, G, _, H = loops._closed(np.array((-1.0, -1.0)))
+    w = np.geomspace(1e-4, np.pi / 0.5, 3000)
+    gains = [
+        np.linalg.norm(H @ np.linalg.solve(np.exp(0.5j * x) * np.eye(len(F)) - F, G), 2)
+        for x in (0.0, *w)
+    ]
+    assert max(gains) == pytest.approx(corner, rel=1e-4)
+
+
+def test_unstable_sampled_loops_are_counted(sampled_satellite):
+    model, laws = sampled_satellite
+    policy = laws["state"]
+    lin = policy.lin
+    # A loop that is near its limit of stability at the middle.
+    factor = 0.97 * fflin.margins(policy, lin).channels[2].gain[1]
+    K = policy.K * np.array((1.0, 1.0, factor))[:, None]
+    worst = model.worst(fflin.StateFeedback(lin, K), samples=5)
+    assert worst.unstable > 0 and worst.margin.value == 0.0
+    assert worst.damping.value < 0.0
+    other = fflin.linearize(fflin.load("planar_detumble")).discretize(0.1)
+    law = fflin.StateFeedback(other, fflin.lqr(other))
+    with pytest.raises(fflin.InputError, match="give the law of this robot"):
+        model.worst(law)

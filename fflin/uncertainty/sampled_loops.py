@@ -1,0 +1,189 @@
+"""Loops of uncertain robots with sampled laws: the plant of each robot is sampled exactly."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from fflin.base.errors import InputError
+from fflin.base.validation import Array, Mask
+from fflin.control.delayed import law_with_memory
+from fflin.control.gain import Gain, regulated_states
+from fflin.control.optimal.disk import Loop, as_continuous, largest_scaled_gain
+from fflin.control.optimal.largest_gain import ACCURACY, gain_crossings, largest_gain
+from fflin.control.policy import Policy, System
+from fflin.dynamics.delays import HeldSystem
+from fflin.uncertainty.lft import LFT
+
+# Number of frequencies at which the quick estimates of gains are computed.
+_FREQUENCIES = 6
+
+# Kinds of gains: (S - T)/2 at the inputs, and from the inputs to the outputs.
+DISK, OUTPUTS = "disk", "outputs"
+
+
+class SampledLaw(NamedTuple):
+    """Sampled linear law, with the delays of its inputs and the states that it regulates."""
+
+    system: System
+    delays: Array  # (nu,) [s]
+    regulated: tuple[str, ...]
+    outputs: bool  # whether the law measures outputs and not states
+
+
+def sampled_law(gain: object) -> SampledLaw | None:
+    """Return the law of a sampled gain or policy, or None if it is continuous."""
+    if isinstance(gain, Gain):
+        if not gain.dt:
+            return None
+        names = gain.state_names, gain.input_names
+        system = law_with_memory(gain.K, gain.A, gain.B, gain.dt, *names)
+        if gain.integrals:
+            system = gain.integral_law()
+        return SampledLaw(system, gain.delay, regulated_states(gain), False)
+    if not isinstance(gain, Policy):
+        return None
+    law = gain.linear_law()
+    if law is None or not law.dt:
+        return None
+    delays = gain.input_delays
+    late = np.array([delays.get(name, 0.0) for name in law.outputs])
+    return SampledLaw(law, late, gain.fed_back, gain.senses_outputs)
+
+
+class SampledLoops:
+    """Closed loops of a sampled law and the robots of an LFT; each row of deltas gives one loop."""
+
+    def __init__(self, lft: LFT, law: SampledLaw) -> None:
+        self.lft = lft
+        self._law = law.system
+        self._delays = law.delays
+        self._dt = law.system.dt or 0.0
+        self._kept: dict[bytes, tuple[Array, Array, Array, Array]] = {}
+        self._measured = measured_signals(lft, law)
+        # Scaling of the inputs for DISK: the best scaling of the loop at the middle of the ranges.
+        # With it, few loops seem to be worse than they are with their own best scaling.
+        self._scale: Array = np.ones(len(law.system.outputs))
+        middle = self.loop(np.zeros(len(lft.repeats)), DISK)
+        if middle is not None:
+            self._scale = largest_scaled_gain(middle)[2]
+        # Frequencies at which earlier loops had their largest gains, by kind.
+        self._peaks: dict[str, list[float]] = {}
+
+    def _closed(self, row: Array) -> tuple[Array, Array, Array, Array]:
+        """Return F and G of a sampled loop, and its matrices to the commands and to the outputs."""
+        key = row.tobytes()
+        if key in self._kept:
+            return self._kept[key]
+        A, B, *_ = self.lft.at(row)
+        law = self._law
+        plant, inputs = HeldSystem(A, B, self._dt, self._delays).sampled()
+        past = len(plant) - len(A)
+        measured = np.hstack((self._measured, np.zeros((len(self._measured), past))))
+        seen = np.hstack((self.lft.C2, np.zeros((len(self.lft.C2), past))))
+        F = np.block(
+            [
+                [plant + inputs @ law.D @ measured, inputs @ law.C],
+                [law.B @ measured, law.A],
+            ]
+        )
+        G = np.vstack((inputs, np.zeros((len(law.A), inputs.shape[1]))))
+        command = np.hstack((law.D @ measured, law.C))
+        outputs = np.hstack((seen, np.zeros((len(seen), len(law.A)))))
+        self._kept[key] = F, G, command, outputs
+        return self._kept[key]
+
+    def undamped(self, rows: Array) -> Array:
+        """Return minus the least damping ratio of each loop (N,); >= 0 means an unstable loop."""
+        return np.array([self._undamped(row) for row in rows])
+
+    def _undamped(self, row: Array) -> float:
+        poles = np.linalg.eigvals(self._closed(row)[0])
+        # A pole at z = 0 has no rate. It is the pole of a delay, and as damped as possible.
+        rates = np.log(poles[np.abs(poles) > np.finfo(float).tiny])
+        ratios = rates.real / np.maximum(np.abs(rates), 1e-300)
+        return float(ratios.max(initial=-1.0))
+
+    def loop(self, row: Array, kind: str) -> Loop | None:
+        """Return the loop of one kind of gain as a continuous loop, or None if it is unstable."""
+        F, G, command, outputs = self._closed(row)
+        if self._undamped(row) >= 0.0:
+            return None
+        H, J = outputs, np.zeros((len(outputs), G.shape[1]))
+        if kind == DISK:
+            H, J = command, 0.5 * np.eye(G.shape[1])
+        loop = as_continuous(F, G, H, J, self._dt)
+        return loop.scaled(self._scale) if kind == DISK else loop
+
+    def exact(self, row: Array, kind: str) -> float:
+        """Return the largest gain of a loop, for DISK with the best scaling of the inputs."""
+        loop = self.loop(row, kind)
+        if loop is None:
+            return np.inf
+        if kind == DISK:
+            value, w, _ = largest_scaled_gain(loop)
+        else:
+            value, w = largest_gain(*loop)
+        self._peaks.setdefault(kind, []).append(min(w, 1e300))
+        return float(value)
+
+    def quick(self, rows: Array, kind: str) -> Array:
+        """Return the largest gain (N,) of loops at frequencies where others had their largest."""
+        frequencies = [0.0, *self._peaks.get(kind, [])[-_FREQUENCIES:]]
+        values = []
+        for row in rows:
+            loop = self.loop(row, kind)
+            if loop is None:
+                values.append(np.inf)
+                continue
+            gains = [np.linalg.norm(loop.at(w), 2) for w in frequencies]
+            values.append(float(max(gains)))
+        return np.array(values)
+
+    def above(self, rows: Array, bound: float, kind: str) -> Mask:
+        """Return which loops (N,) have a gain above a bound.
+
+        For DISK, the gain without the best scaling may be above the bound, although the gain with
+        it is not.
+        """
+        return np.array([self._is_above(row, bound, kind) for row in rows], bool)
+
+    def _is_above(self, row: Array, bound: float, kind: str) -> bool:
+        loop = self.loop(row, kind)
+        if loop is None:
+            return True
+        limit = bound * (1.0 + ACCURACY)
+        if np.linalg.norm(loop.J, 2) >= limit:
+            return True
+        _, crossed = gain_crossings(*loop, limit)
+        return bool(crossed.any())
+
+
+def measured_signals(lft: LFT, law: SampledLaw) -> Array:
+    """Return the matrix (ny, nx) from the states of an LFT to the signals that a law measures."""
+    system = law.system
+    names = lft.output_names if law.outputs else lft.state_names
+    used: Mask = np.any(system.B, axis=0) | np.any(system.D, axis=0)
+    needed = [name for name, use in zip(system.inputs, used, strict=True) if use]
+    missing = [name for name in needed if name not in names]
+    if missing or system.outputs != lft.input_names:
+        raise InputError(
+            "the inputs and outputs of the law are not those of the robot; give the law of this "
+            "robot"
+        )
+    if not law.outputs:
+        matrix = np.zeros((len(system.inputs), len(names)))
+        for name in needed:
+            matrix[system.inputs.index(name), names.index(name)] = 1.0
+        return matrix
+    matrix = np.zeros((len(system.inputs), len(lft.A)))
+    for index in np.flatnonzero(used):
+        at = names.index(system.inputs[index])
+        if lft.D21[at].any() or lft.D22[at].any():
+            raise InputError(
+                "the law measures outputs that depend on inputs or on uncertain parameters, such "
+                "as accelerations; give a law of outputs that depend on states only"
+            )
+        matrix[index] = lft.C2[at]
+    return matrix
