@@ -1,6 +1,7 @@
 """Constrained accelerations and constraint forces, with their derivatives, in base axes.
 
-The accelerations a of the state's velocities satisfy M a + h = S u + J^T lam and J a + gamma = 0.
+The accelerations a satisfy M a + h = S u + J^T lam and J a + gamma = 0, see (18.2) and (18.3) of
+docs/derivation.md.
 The free accelerations and their derivatives, with lam = 0, come from `fflin.dynamics.rnea`.
 """
 

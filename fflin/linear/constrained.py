@@ -2,7 +2,8 @@
 
 With a basis G of the velocities that the constraints permit, the tangent of the state manifold in
 base axes is xi = G z1, dnu = G z2 + Y z1. Z maps these displacements to the coordinates of chart
-and frame, where P picks d independent coordinates, the same for positions and rates.
+and frame, where P picks d independent coordinates, the same for positions and rates. See (18.5) and
+(18.6) of docs/derivation.md.
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ from tests.support.constrained import (
     strut,
 )
 from tests.support.marks import exhaustive
-from tests.support.robots import FRAMES, random_pose
+from tests.support.robots import FRAMES, LINKS, MIMIC, random_pose
 
 INERTIA = np.array((0.2, 0.3, 0.4))
 
@@ -219,6 +219,52 @@ def test_the_check_sees_a_change_of_one_entry():
         rows = references.rows(replace(lin, **changed))
         failed = [row.block for row in rows if not row.ok]
         assert failed, name
+
+
+def in_orbit():
+    weld = fflin.Weld("tool_left", "tool_right")
+    return fflin.load("dual_arm", orbit=500e3, constraints=[weld])
+
+
+def flexible():
+    modes = {"translation": [[0], [0], [2.0]], "rotation": [[3.0], [0], [0]]}
+    array = fflin.FlexibleAppendage("base", [0.3], **modes, name="array")
+    held = [fflin.Spherical("tool_left"), fflin.Weld("tool_left", "tool_right")]
+    return fflin.load("dual_arm", appendages=[array], constraints=held)
+
+
+def with_wheels():
+    """A wheel without inertia, a wheel that is a joint, and a thruster on an arm."""
+    inputs = [
+        fflin.ReactionWheel((0, 0, 1), momentum=3.0),
+        fflin.ReactionWheel((1, 0, 0), inertia=0.02, name="wheel_x"),
+        fflin.Thruster("tool_right", (0, 0, 0.1), (0, 1, 0)),
+        fflin.JointTorque("*"),
+    ]
+    held = [fflin.Hinge("base", axis=(1, 2, 3))]
+    return fflin.load("dual_arm", inputs=inputs, constraints=held)
+
+
+def mimicking(tmp_path):
+    mimic = '<mimic joint="b" multiplier="-0.7" offset="0.2"/>'
+    kinds = {"a": "revolute", "b": "revolute", "parent": "base"}
+    path = tmp_path / "gripper.urdf"
+    path.write_text(MIMIC.format(links=LINKS, mimic=mimic, **kinds))
+    return fflin.load(path, constraints=[fflin.Spherical("la")], gravity=(1, 2, 3))
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("make", [in_orbit, flexible, with_wheels, mimicking])
+def test_constraints_agree_on_robots_of_every_kind(make, tmp_path):
+    robot = make(tmp_path) if make is mimicking else make()
+    rng = np.random.default_rng(5)
+    joints = {name: 0.3 for name in robot.joint_names[:1]}
+    q = fflin.configuration(robot, joints, rpy=(10, 20, 30))
+    nu = 0.05 * rng.normal(size=6 + robot.n)
+    q, v = fflin.closed(robot, q, fflin.StateMap(robot).spread(nu))
+    u = rng.normal(size=len(fflin.linearize(robot, q).u0))
+    check = fflin.check(robot, fflin.linearize(robot, q, v, u))
+    assert check.ok, check
 
 
 def clamped(**fields):
