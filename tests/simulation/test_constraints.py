@@ -8,7 +8,8 @@ import pytest
 
 import fflin
 from fflin.dynamics.constraints import Constraints
-from tests.support.robots import free_body
+from tests.support.marks import exhaustive
+from tests.support.robots import free_body, random_tree
 
 GRIP = fflin.Weld("tool_left", "tool_right", name="grip")
 JOINTS = {
@@ -248,3 +249,49 @@ def test_orbits_and_loops_go_together_and_the_world_is_refused():
     assert residual < 1e-13 and rate < 1e-13
     with pytest.raises(fflin.InputError, match="in orbit"):
         circling.replace(constraints=[fflin.Weld("tool_left")])
+
+
+def random_robot(rng):
+    """Return a random tree with one to three random constraints, and a closed q and v."""
+    tree = random_tree(rng, int(rng.integers(3, 8)))
+    model = tree.model.copy()
+    for index in range(1, model.njoints):
+        model.addJointFrame(index)
+    names = list(model.names)[1:]
+    items = []
+    for number in range(int(rng.integers(1, 4))):
+        kind = (fflin.Weld, fflin.Hinge, fflin.Spherical)[int(rng.integers(3))]
+        one, other = rng.choice(len(names), 2, replace=False).tolist()
+        to = names[other] if rng.random() < 0.8 else None
+        items.append(kind(names[one], to, name=f"c{number}"))
+    if rng.random() < 0.3:
+        # A copy of a constraint adds only redundant rows.
+        items.append(type(items[0])(items[0].frame, items[0].to, name="copy"))
+    robot = fflin.from_model(model, name="random").replace(constraints=items)
+    q = pin.integrate(model, robot.neutral(), rng.uniform(-1.0, 1.0, robot.nv))
+    return robot, *fflin.closed(robot, q, 0.3 * rng.normal(size=robot.nv))
+
+
+@pytest.mark.parametrize(
+    "seed", [*range(3), *exhaustive(*range(3, 200))], ids=lambda seed: f"seed{seed}"
+)
+def test_random_constraints_stay_closed_and_loops_keep_momentum(seed):
+    rng = np.random.default_rng(seed)
+    try:
+        robot, q, v = random_robot(rng)
+        motion = fflin.simulate(
+            robot, q0=q, v0=v, duration=0.02, dt=0.005, engine="python"
+        )
+    except fflin.ConstraintError as error:
+        # By chance, random constraints are singular or hold nothing; then they are refused.
+        assert "singular" in str(error) or "no effect" in str(error)
+        return
+    if motion.stopped:
+        assert "singular" in motion.stopped or "diverged" in motion.stopped
+        return
+    residual, rate = off(robot, motion)
+    # Rounding errors at rates of up to 100 rad/s.
+    speed = 1.0 + np.abs(motion.v).max()
+    assert residual < 1e-12 and rate < 1e-12 * speed
+    if not robot.anchored:
+        assert motion.momentum_drift.max() < 1e-12
