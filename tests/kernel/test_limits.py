@@ -30,12 +30,25 @@ def with_displaced_axis():
     return fflin.from_model(model, name="composite")
 
 
+def in_field(field):
+    return CUBESAT.replace(
+        orbit=fflin.CircularOrbit(500e3, field=field),
+        inputs=[fflin.Magnetorquer((1, 0, 0))],
+    )
+
+
 TASKS = {
     "the outputs are not the state": Task(robots=(CUBESAT,), outputs=True),
     "events are computed in Python": Task(robots=(CUBESAT,), events=True),
     "callbacks are called in Python": Task(robots=(CUBESAT,), callback=True),
     "disturbances are computed in Python": Task(robots=(CUBESAT,), disturbance=True),
     "a Mpc is computed in Python": Task(robots=(CUBESAT,), python_policy="Mpc"),
+    "the magnetic field of 'cubesat' is a function": Task(
+        robots=(in_field(lambda t, position: np.zeros(3)),), simulated=True
+    ),
+    "sweeps and allocations with the magnetorquers of 'cubesat'": Task(
+        robots=(in_field("dipole"),)
+    ),
     "a joint of 'composite' does not": Task(robots=(with_displaced_axis(),)),
     "the root joint of 'displaced'": Task(
         robots=(with_displaced_root(),), simulated=True
@@ -54,6 +67,7 @@ def test_each_limit_has_a_task_whose_reason_it_is(monkeypatch):
         met.append(next(i for i, limit in enumerate(LIMITS) if limit.subject(task)))
     assert reason_against(Task(robots=(CUBESAT,), simulated=True)) == ""
     assert reason_against(Task(robots=(with_displaced_root(),))) == ""
+    assert reason_against(Task(robots=(in_field("dipole"),), simulated=True)) == ""
     monkeypatch.setattr(limits, "numba_is_there", lambda: False)
     assert "numba" in reason_against(Task(robots=(CUBESAT,)))
     assert sorted([0, *met]) == list(range(len(LIMITS)))
