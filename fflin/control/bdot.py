@@ -46,7 +46,7 @@ class BDot(Policy):
     >>> orbit = fflin.CircularOrbit(500e3, inclination=1.7, field="dipole")
     >>> rods = [fflin.Magnetorquer(axis, max=0.2) for axis in np.eye(3)]
     >>> robot = fflin.load("cubesat", inputs=rods, orbit=orbit)
-    >>> v0 = fflin.velocity(robot, base=(0, 0, 0, 0.05, 0.05, 0.05))
+    >>> v0 = fflin.velocity(robot, {"omega_b": 0.05})
     >>> motion = fflin.simulate(robot, fflin.BDot(2e4), v0=v0, duration=600.0, dt=1.0)
     >>> bool(np.linalg.norm(motion.v[-1, 3:6]) < np.linalg.norm(v0[3:6]))
     True

@@ -15,13 +15,6 @@ IN_ELLIPSE = CUBESAT.replace(orbit={"perigee": 500e3, "eccentricity": 0.1})
 CONSTRAINED_IN_ORBIT = fflin.load(
     "dual_arm", orbit=500e3, constraints=[fflin.Weld("tool_left", "tool_right")]
 )
-WITH_FIELD = CUBESAT.replace(
-    orbit=fflin.CircularOrbit(500e3, field=lambda t, position: (0.0, 2e-5, 0.0))
-)
-WITH_TORQUER = CUBESAT.replace(
-    orbit=fflin.CircularOrbit(500e3, inclination=1.7, field="dipole"),
-    inputs=[fflin.Magnetorquer((1, 0, 0), max=0.2)],
-)
 WITH_PLATE = CUBESAT.replace(
     disturbance={"plate": {"area": 0.1, "normal": (0, 0, 1), "sun": (0, 0, 1)}}
 )
@@ -44,6 +37,13 @@ def with_displaced_axis():
     return fflin.from_model(model, name="composite")
 
 
+def in_field(field):
+    return CUBESAT.replace(
+        orbit=fflin.CircularOrbit(500e3, field=field),
+        inputs=[fflin.Magnetorquer((1, 0, 0))],
+    )
+
+
 TASKS = {
     "the outputs are not the state": Task(robots=(CUBESAT,), outputs=True),
     "events are computed in Python": Task(robots=(CUBESAT,), events=True),
@@ -52,8 +52,12 @@ TASKS = {
     "lags of inputs and outputs are": Task(robots=(CUBESAT,), lagging=True),
     "a Mpc is computed in Python": Task(robots=(CUBESAT,), python_policy="Mpc"),
     "'cubesat' is in an elliptic orbit": Task(robots=(CUBESAT, IN_ELLIPSE)),
-    "the magnetic field of 'cubesat'": Task(robots=(WITH_FIELD,), simulated=True),
-    "sweeps and allocations with the magnetorquers of": Task(robots=(WITH_TORQUER,)),
+    "the magnetic field of 'cubesat' is a function": Task(
+        robots=(in_field(lambda t, position: np.zeros(3)),), simulated=True
+    ),
+    "sweeps and allocations with the magnetorquers of 'cubesat'": Task(
+        robots=(in_field("dipole"),)
+    ),
     "a joint of 'composite' does not": Task(robots=(with_displaced_axis(),)),
     "the root joint of 'displaced'": Task(
         robots=(with_displaced_root(),), simulated=True
@@ -76,6 +80,7 @@ def test_each_limit_has_a_task_whose_reason_it_is(monkeypatch):
         met.append(next(i for i, limit in enumerate(LIMITS) if limit.subject(task)))
     assert reason_against(Task(robots=(CUBESAT,), simulated=True)) == ""
     assert reason_against(Task(robots=(with_displaced_root(),))) == ""
+    assert reason_against(Task(robots=(in_field("dipole"),), simulated=True)) == ""
     monkeypatch.setattr(limits, "numba_is_there", lambda: False)
     assert "numba" in reason_against(Task(robots=(CUBESAT,)))
     assert sorted([0, *met]) == list(range(len(LIMITS)))
