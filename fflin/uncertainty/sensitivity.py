@@ -397,6 +397,11 @@ def sensitivity(lin: LinearModel) -> Sensitivity:
             "the model was loaded from a file, which contains no robot; linearise the robot again"
         )
     refuse_frozen(lin, "sensitivity")
+    if robot.orbit and lin.frame == "local":
+        raise InputError(
+            f"sensitivities in base axes are defined only without an orbit, but '{robot.name}' is "
+            "in orbit; linearise in frame 'lvlh' or 'hill'"
+        )
     source = lin.generator
     if source is None:
         raise InputError(
