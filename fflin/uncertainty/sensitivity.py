@@ -399,6 +399,11 @@ def sensitivity(lin: LinearModel) -> Sensitivity:
         )
     refuse_constraints(robot, "sensitivities")
     refuse_frozen(lin, "sensitivity")
+    if robot.orbit and lin.frame == "local":
+        raise InputError(
+            f"sensitivities in base axes are defined only without an orbit, but '{robot.name}' is "
+            "in orbit; linearise in frame 'lvlh' or 'hill'"
+        )
     source = lin.generator
     if source is None:
         raise InputError(

@@ -780,6 +780,17 @@ def test_linearize_shows_no_rounding_in_f0_and_calls_no_frozen_model_unstable():
     assert "unstable" not in falling and "f0:" in falling
 
 
+def test_an_elliptic_orbit_is_given_by_perigee_and_apogee():
+    code, out, _ = run("info", "cubesat", "--orbit", "500e3/900e3")
+    assert code == 0
+    assert "elliptic orbit 500 x 900 km over earth" in out
+    code, out, _ = run("info", "cubesat", "--orbit", "100e3/300e3:mars")
+    assert "elliptic orbit 100 x 300 km over mars" in out
+    code, _, error = run("lqr", "cubesat", "--orbit", "500e3/900e3")
+    assert code != 0
+    assert "elliptic orbit" in error
+
+
 @pytest.mark.exhaustive
 def test_equilibria_in_orbit_are_taken_as_panels_sag(tmp_path):
     soft = ["servicer_7dof", "--passive", "panel_*", "--stiffness", "panel_*=40"]

@@ -274,6 +274,31 @@ def test_features_without_time_refuse_elliptic_orbits(feature):
         ROBOT[feature](robot)
 
 
+def test_models_in_base_axes_in_orbit_have_the_poles_of_other_frames():
+    robot = fflin.load("cubesat", orbit=5e5)
+    models = [
+        fflin.linearize(robot, frame="local"),
+        fflin.linearize(robot, moving=True),
+    ]
+    expected = fflin.lqr(fflin.linearize(robot)).poles
+    for lin in models:
+        poles = fflin.lqr(lin).poles
+        assert np.allclose(np.sort_complex(poles), np.sort_complex(expected), rtol=1e-9)
+        with pytest.raises(fflin.InputError, match="in frame 'lvlh' or 'hill'"):
+            fflin.sensitivity(lin)
+
+
+def test_a_law_in_base_axes_knows_whether_it_was_designed_in_orbit():
+    robot = fflin.load("cubesat", orbit=5e5)
+    free = robot.replace(orbit=None)
+    for design, flown in ((robot, free), (free, robot)):
+        lin = fflin.linearize(design, frame="local")
+        policy = fflin.StateFeedback(lin, np.zeros((6, 12)))
+        with pytest.raises(fflin.InputError, match="design it for the robot"):
+            fflin.simulate(flown, policy, duration=1.0)
+        assert fflin.simulate(design, policy, duration=0.1, dt=0.1).frame == "local"
+
+
 @pytest.mark.compiled
 def test_models_in_base_axes_in_orbit_are_swept_in_python():
     robot = fflin.load("cubesat", orbit=5e5)
