@@ -467,7 +467,11 @@ def loop_of(
     if arguments.duration is None:
         design = policy.commanded_robot or robot
         settings["duration"] = time_to_settle(design, linear, q, v)
-    return policy, settings | {"q0": q, "v0": v, "linear": lin}
+    settings |= {"q0": q, "v0": v}
+    if not robot.constraints:
+        # A model in independent states does not predict a motion.
+        settings["linear"] = lin
+    return policy, settings
 
 
 def with_errors(

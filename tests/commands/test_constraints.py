@@ -64,3 +64,10 @@ def test_a_weld_without_a_frame_is_refused():
 def test_a_command_without_support_for_constraints_refuses_them():
     message = refused("sensitivity", *GRASP)
     assert "sensitivities do not support constraints" in message
+
+
+def test_a_held_robot_is_simulated_with_its_regulator_and_its_forces():
+    how = ("--duration", "0.1", "--dt", "0.05", "--joint", "left_2=0.4")
+    code, out, _ = run("simulate", "dual_arm", "--weld", "base", *how)
+    assert code == 0
+    assert "largest force of constraint 'base'" in out
