@@ -89,9 +89,7 @@ def ends_of(
 
 def _split(
     sources: dict[tuple[str, int], float], sinks: dict[tuple[str, int], float]
-) -> tuple[
-    tuple[tuple[str, int], ...], tuple[tuple[str, int], ...], Array, Array
-]:
+) -> tuple[tuple[tuple[str, int], ...], tuple[tuple[str, int], ...], Array, Array]:
     return (
         tuple(sources),
         tuple(sinks),

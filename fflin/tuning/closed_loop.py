@@ -48,8 +48,8 @@ class ClosedLoop:
         D22 = with_states(plant.D[:ny], none)
         K = law.gain
         self.well_posed = True
-        self.left = np.eye(nu + nz)
-        self.right = np.eye(ny + nz)
+        self.left: Array = np.eye(nu + nz)
+        self.right: Array = np.eye(ny + nz)
         if D22.any():
             loop = self.left - K @ D22
             if np.linalg.svd(loop, compute_uv=False)[-1] < _SINGULAR:
@@ -98,11 +98,10 @@ class ClosedLoop:
 
     def pole_gradient(self, index: int) -> Values:
         """Return the derivatives (p,) of a pole."""
-        poles, vectors, inverse = self._modes
+        _, vectors, inverse = self._modes
         if inverse is None:
-            row = np.linalg.pinv(vectors)[index]
-        else:
-            row = inverse[index]
+            inverse = np.linalg.pinv(vectors)
+        row = inverse[index]
         a = row @ self.B2 @ self.left
         b = self.right @ self.C2 @ vectors[:, index]
         derivatives: Values = np.einsum("i,pij,j->p", a, self.changes, b)
@@ -146,7 +145,9 @@ class ClosedLoop:
         A, B, C, D = self.system(channel)
         nz = self.nz
         L = np.hstack((channel.D12, np.zeros((len(channel.D12), nz)))).astype(complex)
-        R = np.vstack((channel.D21, np.zeros((nz, channel.D21.shape[1])))).astype(complex)
+        R = np.vstack((channel.D21, np.zeros((nz, channel.D21.shape[1])))).astype(
+            complex
+        )
         T = D.astype(complex)
         if np.isfinite(frequency):
             inner = 1j * frequency * np.eye(len(A)) - A

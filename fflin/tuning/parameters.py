@@ -86,7 +86,8 @@ class Parameter:
 
     `scale` is the size of a typical value. If `sign` is not 0, the parameter keeps this sign, and
     its logarithm is searched; otherwise the inverse hyperbolic sine of value / scale, which is
-    linear for small values and logarithmic for large ones. `source` is the `Tunable` that the user gave, if any.
+    linear for small values and logarithmic for large ones. `source` is the `Tunable` that the user
+    gave, if any.
     """
 
     name: str
@@ -199,5 +200,3 @@ def _started(parameter: Parameter, value: float | None) -> Parameter:
     else:
         value = least if math.isfinite(least) else largest
     return replace(parameter, value=value)
-
-

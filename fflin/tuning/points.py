@@ -144,5 +144,3 @@ def named(point: Point) -> str:
     if not point.parameters:
         return "nominal"
     return ", ".join(f"{key} {value:.4g}" for key, value in point.parameters.items())
-
-

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -65,7 +65,9 @@ class Element:
 
     def used(self, signals: Signals) -> tuple[tuple[int, ...], tuple[int, ...]]:
         """Return the indices of the outputs and inputs that the law connects."""
-        values = np.array([parameter.value or parameter.scale for parameter in self.parameters])
+        values = np.array(
+            [parameter.value or parameter.scale for parameter in self.parameters]
+        )
         measured, commanded = self.measured or (), self.commanded or ()
         law = self.law(values, len(measured))
         law = embedded(
@@ -124,7 +126,10 @@ class _Sum(Structure):
 
         def law(values: Array, width: int) -> Law:
             laws = []
-            for part, part_values in ((first, values[:split]), (second, values[split:])):
+            for part, part_values in (
+                (first, values[:split]),
+                (second, values[split:]),
+            ):
                 measured, commanded = part.measured or (), part.commanded or ()
                 part_law = part.law(part_values, len(measured))
                 laws.append(embedded(part_law, measured, commanded, ny, nu))
@@ -160,9 +165,7 @@ class _Series(Structure):
                 right.law(values[split:], before),
             )
 
-        return Element(
-            (*left.parameters, *right.parameters), measured, commanded, law
-        )
+        return Element((*left.parameters, *right.parameters), measured, commanded, law)
 
 
 def _require_name(name: object) -> None:
@@ -209,8 +212,8 @@ class PID(Structure):
     inputs : str or sequence of str
         Inputs of the robot, one for each measured output, in the same order.
     rates : str or sequence of str, optional
-        Measured rates of the outputs, such as a gyroscope. The derivative term is then ``k_d`` times
-        these rates, without a lag.
+        Measured rates of the outputs, such as a gyroscope. The derivative term is then ``k_d``
+        times these rates, without a lag.
     kp, ki, kd : float, (least, largest) or Tunable, optional
         Gains: a number is fixed; see `Tunable`. Units: the unit of the input by the unit of the
         output; ki per second and kd times seconds. With `rates`, kd is by the unit of the rates.
@@ -326,7 +329,7 @@ class PID(Structure):
         unit = quotient(signals.input_units[command], signals.output_units[signal])
         if term == "ki":
             size *= 0.1 * w
-            unit = f"{unit}/s" if "/" not in unit else f"{unit}/s"
+            unit = f"{unit}/s"
         if term == "kd" and self.rates is None:
             size *= 1.4 / w
             unit = times_seconds(unit)
@@ -343,8 +346,6 @@ class PID(Structure):
 
 
 def _named(parameter: Parameter, name: str) -> Parameter:
-    from dataclasses import replace
-
     return replace(parameter, name=name)
 
 
@@ -352,8 +353,8 @@ def _gains(
     values: Array, places: Sequence[tuple[str, list[tuple[int, int]]]], k: int
 ) -> tuple[dict[str, Array], list[tuple[str, Array]]]:
     """Return the gain matrices of the terms, and the derivative of each parameter."""
-    gains = {term: np.zeros((k, k)) for term in ("kp", "ki", "kd")}
-    derivatives = []
+    gains: dict[str, Array] = {term: np.zeros((k, k)) for term in ("kp", "ki", "kd")}
+    derivatives: list[tuple[str, Array]] = []
     for value, (term, pairs) in zip(values, places, strict=True):
         unit = np.zeros((k, k))
         for pair in pairs:
@@ -528,10 +529,10 @@ class LowPass(_Filter):
             matrices = _array([-w]), _array([w]), _array([1.0]), _array([0.0])
             zero = _array([0.0])
             return law_of(matrices, [(_array([-1.0]), _array([1.0]), zero, zero)])
-        matrices, by_w, by_damping = _second_order(w, float(values[1]))
+        (A, B), by_w, by_damping = _second_order(w, float(values[1]))
         C, D = _array([1.0, 0.0]), _array([0.0])
         nothing = np.zeros((1, 2)), D
-        return law_of((*matrices, C, D), [(*by_w, *nothing), (*by_damping, *nothing)])
+        return law_of((A, B, C, D), [(*by_w, *nothing), (*by_damping, *nothing)])
 
 
 def _second_order(
@@ -695,11 +696,15 @@ class StaticGain(Structure):
         measured = indices("output", self.measured, signals.outputs)
         inputs = indices("input", self.inputs, signals.inputs)
         shape = len(inputs), len(measured)
-        pattern = np.ones(shape) if self.pattern is None else self._array("pattern", shape)
+        pattern = (
+            np.ones(shape) if self.pattern is None else self._array("pattern", shape)
+        )
         start = np.zeros(shape) if self.gain is None else self._array("gain", shape)
         entries = [tuple(entry) for entry in np.argwhere(pattern).tolist()]
         if not entries:
-            raise InputError("pattern has no nonzero entry, so there is no gain to tune")
+            raise InputError(
+                "pattern has no nonzero entry, so there is no gain to tune"
+            )
         parameters = []
         dD = np.zeros((len(entries), *shape))
         for change, (row, column) in zip(dD, entries, strict=True):
@@ -989,16 +994,23 @@ class Structured:
                 sources[key] = index
             self._place.append(index)
             self.parameters.append(parameter)
+        self._is_shared = len(self.parameters) < len(self._place)
         self.parameters = _distinct(self.parameters)
         self.free = [not parameter.fixed for parameter in self.parameters]
         if not any(self.free):
-            raise InputError("all parameters of the structure are fixed; free one of them")
+            raise InputError(
+                "all parameters of the structure are fixed; free one of them"
+            )
 
     def law(self, values: Array) -> Law:
         """Return the law from all outputs to all inputs, with derivatives for all parameters."""
         element = self._element
         law = element.law(values[self._place], self._width)
-        law = embedded(law, element.measured or (), element.commanded or (), *self._sizes)
+        law = embedded(
+            law, element.measured or (), element.commanded or (), *self._sizes
+        )
+        if not self._is_shared:
+            return law
         stacks = []
         for stack in law[4:]:
             merged = np.zeros((len(self.parameters), *stack.shape[1:]))
@@ -1014,7 +1026,6 @@ def _distinct(parameters: list[Parameter]) -> list[Parameter]:
     for parameter in parameters:
         name = parameter.name
         counts[name] = counts.get(name, 0) + 1
-        if counts[name] > 1:
-            parameter = _named(parameter, f"{name}_{counts[name]}")
-        result.append(parameter)
+        label = name if counts[name] == 1 else f"{name}_{counts[name]}"
+        result.append(_named(parameter, label))
     return result

@@ -153,7 +153,7 @@ def _step_ratio(goal: Track, system: System, dt: float) -> float:
     errors = np.zeros(count + 1)
     for k in range(count + 1):
         errors[k] = -float(rows[0] @ state + through[0, 0]) - 1.0
-        state = advance @ state + drive[:, 0]
+        state[:] = advance @ state + drive[:, 0]
     low, high = goal.bounds(times)
     ratios = np.where(errors > 0.0, errors / high, errors / low)
     return float(ratios[1:].max())
