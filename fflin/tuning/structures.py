@@ -218,7 +218,7 @@ class PID(Structure):
         Gains: a number is fixed; see `Tunable`. Units: the unit of the input by the unit of the
         output; ki per second and kd times seconds. With `rates`, kd is by the unit of the rates.
     lag : float, (least, largest) or Tunable, optional
-        Time constant of the derivative [s].
+        Time constant of the derivative [s]; at least 0.01 / bandwidth by default.
     bandwidth : float, optional
         Bandwidth [rad/s] of the first start. The gains follow from the response of the plant.
     coupled : bool
@@ -305,7 +305,8 @@ class PID(Structure):
         with_lag = not rates
         if with_lag:
             start = 0.1 / self.bandwidth
-            lag = Parameter(f"{self._prefix}lag", "s", start, 0.0, math.inf, start)
+            least = 0.1 * start
+            lag = Parameter(f"{self._prefix}lag", "s", start, least, math.inf, start)
             parameters.append(resolved(lag, self.lag))
 
         def law(values: Array, width: int) -> Law:
