@@ -65,6 +65,7 @@ class ClosedLoop:
     def _modes(self) -> tuple[Values, Values, Values | None]:
         """Poles, eigenvectors and their inverse; None if the eigenvectors are nearly dependent."""
         poles, vectors = np.linalg.eig(self.A)
+        poles = poles.astype(complex)
         with np.errstate(all="ignore"):
             condition = np.linalg.cond(vectors)
         if not condition < _CONDITION:

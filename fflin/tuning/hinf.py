@@ -20,7 +20,7 @@ from fflin.linear.model import LinearModel
 from fflin.tuning.channels import Ends, channel_of, ends_of
 from fflin.tuning.goals import Goal, MaxGain
 from fflin.tuning.law import Law, law_of
-from fflin.tuning.plant import plant_of, signals_of
+from fflin.tuning.plant import Plant, plant_of, signals_of
 from fflin.tuning.structures import Names, indices
 from fflin.tuning.tuned import matrices_of
 from fflin.tuning.verification import largest_in_band
@@ -144,7 +144,10 @@ def hinf(
                 "give a number, or the continuous model"
             )
         ends.append(found)
-    plant = _generalised(lin, every, ends, rows, columns)
+    model = _plant(lin, ends, rows)
+    # Outputs without a state that the inputs move are not fed back.
+    rows = tuple(row for row in rows if model.C[row].any())
+    plant = _generalised(model, every, ends, rows, columns)
     law, gamma = synthesis(plant)
     ny, nu = len(signals.outputs), len(signals.inputs)
     selected, placed = np.eye(ny)[list(rows)], np.eye(nu)[:, list(columns)]
@@ -153,14 +156,8 @@ def hinf(
     return HInfinity(law_of(whole, []), lin, gamma)
 
 
-def _generalised(
-    lin: LinearModel,
-    goals: Sequence[Goal],
-    ends: Sequence[Ends],
-    rows: Sequence[int],
-    columns: Sequence[int],
-) -> Generalised:
-    """Return the generalised plant of goals, with the states of their weights."""
+def _plant(lin: LinearModel, ends: Sequence[Ends], rows: Sequence[int]) -> Plant:
+    """Return the plant with the states that the goals and the measured outputs contain."""
     ny = len(lin.output_names)
     used = np.zeros(ny + len(lin.state_names), bool)
     used[list(rows)] = True
@@ -168,7 +165,17 @@ def _generalised(
         for kind, index in (*end.sinks, *end.sources):
             if kind in ("output", "error", "sensor"):
                 used[index] = True
-    plant = plant_of((lin.A, lin.B, lin.C, lin.D), lin.dt, used)
+    return plant_of((lin.A, lin.B, lin.C, lin.D), lin.dt, used)
+
+
+def _generalised(
+    plant: Plant,
+    goals: Sequence[Goal],
+    ends: Sequence[Ends],
+    rows: Sequence[int],
+    columns: Sequence[int],
+) -> Generalised:
+    """Return the generalised plant of goals, with the states of their weights."""
     channels = [
         channel_of(goal, end, plant) for goal, end in zip(goals, ends, strict=True)
     ]
@@ -287,14 +294,14 @@ def _regular(plant: Generalised, with_states: bool) -> Generalised:
     B1, C1, D11 = plant.B1, plant.C1, plant.D11
     D12, D21 = plant.D12, plant.D21
     sizes = np.linalg.svd(D12, compute_uv=False) if D12.size else np.zeros(0)
-    if len(sizes) < nu or sizes[-1] < _REGULAR * max(sizes[0], 1.0):
-        size = _REGULAR * max(float(sizes.max(initial=0.0)), 1.0)
+    if len(sizes) < nu or sizes[-1] < _REGULAR * sizes[0] or not sizes[0]:
+        size = _REGULAR * (float(sizes.max(initial=0.0)) or 1.0)
         C1 = np.vstack((C1, np.zeros((nu, C1.shape[1]))))
         D11 = np.vstack((D11, np.zeros((nu, nw))))
         D12 = np.vstack((D12, size * np.eye(nu)))
     sizes = np.linalg.svd(D21, compute_uv=False) if D21.size else np.zeros(0)
-    if len(sizes) < ny or sizes[-1] < _REGULAR * max(sizes[0], 1.0):
-        size = _REGULAR * max(float(sizes.max(initial=0.0)), 1.0)
+    if len(sizes) < ny or sizes[-1] < _REGULAR * sizes[0] or not sizes[0]:
+        size = _REGULAR * (float(sizes.max(initial=0.0)) or 1.0)
         B1 = np.hstack((B1, np.zeros((len(B1), ny))))
         D11 = np.hstack((D11, np.zeros((len(D11), ny))))
         D21 = np.hstack((D21, size * np.eye(ny)))

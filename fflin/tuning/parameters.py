@@ -58,7 +58,7 @@ class Tunable:
             given = getattr(self, key)
             if given is not None:
                 object.__setattr__(self, key, number(key, given))
-        if self.name != "":
+        if not isinstance(self.name, str) or self.name:
             printable("name", self.name)
         least, largest = self.least, self.largest
         if least is not None and largest is not None and not least < largest:

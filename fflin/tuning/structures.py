@@ -170,7 +170,7 @@ class _Series(Structure):
 
 def _require_name(name: object) -> None:
     """Raise `InputError` unless a name is printable or empty."""
-    if name != "":
+    if not isinstance(name, str) or name:
         printable("name", name)
 
 
@@ -688,7 +688,7 @@ class StaticGain(Structure):
     name: str = ""
 
     def __post_init__(self) -> None:
-        if self.largest != math.inf:
+        if not isinstance(self.largest, float) or self.largest != math.inf:
             positive("largest", self.largest)
         _require_name(self.name)
 

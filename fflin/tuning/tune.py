@@ -130,8 +130,7 @@ def tune(
     starts = count("starts", starts, largest=1000)
     steps = count("steps", steps, largest=100_000)
     seed = whole("seed", seed, 0)
-    at = None if q is None else np.asarray(q, float)
-    points = points_of(plant, dt, delay, seed, at)
+    points = points_of(plant, dt, delay, seed, q)
     task = _Task(structure, every, points)
     bar = Progress()
     problem, minimum, values = task.first(starts, steps, seed, bar)
@@ -408,7 +407,7 @@ class _Task:
         plant = problem.cases[0].plant
         poles = np.linalg.eigvals(plant.A)
         measured, commanded = self.structured.used
-        for pole in poles[poles.real > -1e-9 * np.abs(poles).max(initial=0.0)]:
+        for pole in poles[poles.real >= -1e-9 * np.abs(poles).max(initial=0.0)]:
             inner = plant.A - pole * np.eye(len(plant.A))
             size = np.abs(plant.A).max(initial=1.0)
             tests = {

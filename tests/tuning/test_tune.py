@@ -222,12 +222,12 @@ def test_goals_and_structures_refuse_what_makes_no_sense(make, word):
 def test_hinf_meets_the_goals_of_tune(stiff):
     lin = fflin.linearize(stiff)
     goal = fflin.MaxGain({"tau_b": 0.01, "q_b": 1e-3}, {"q_b": 0.05, "tau_b": 1.0})
-    policy = fflin.hinf(lin, goal)
+    policy = fflin.hinf(lin, goal, measured="q_b")
     least = fflin.tune(lin, LAW, goal, starts=1, steps=20).goals[0].value
     assert policy.gamma <= least * 1.001
     poles = np.sort(np.linalg.eigvals(policy.loop).real)
     assert policy.order == 6 and math.isfinite(policy.gamma)
-    # The position of the base, which no torque moves, has the poles at zero.
+    # No torque moves the position of the base, whose six poles are at zero.
     assert poles[-7] < 0.0
     with pytest.raises(fflin.InputError, match="band"):
         fflin.hinf(lin, fflin.MaxGain("tau_b", "q_b", band=(1.0, 2.0)))
