@@ -136,6 +136,8 @@ def _step_ratio(goal: Track, system: System, dt: float) -> float:
     """Return the largest ratio of the error of a step response to its template."""
     A, B, C, D = system
     n = len(A)
+    rows: Array = C
+    through: Array = D
     h = dt or goal.examined / (_STEPS * _FINER)
     if dt:
         rate = 2.0 / dt
@@ -146,7 +148,6 @@ def _step_ratio(goal: Track, system: System, dt: float) -> float:
     else:
         step = expm(h * np.block([[A, B], [np.zeros((1, n + 1))]]))
         advance, drive = step[:n, :n], step[:n, n:]
-        rows, through = C, D
     count = max(2, math.ceil(goal.examined / h - 1e-9))
     times = h * np.arange(count + 1)
     state = np.zeros(n)
