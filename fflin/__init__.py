@@ -74,6 +74,15 @@ _PUBLIC = {
         "uncertainty.uncertain": "uncertain Uncertain",
         "uncertainty.lft": "LFT",
     },
+    "Tuning": {
+        "tuning.tune": "tune",
+        "tuning.tuned": "Tuned GoalValue",
+        "tuning.parameters": "Tunable",
+        "tuning.structures": "PD PID LowPass Lead Notch StaticGain StateSpaceLaw CustomLaw "
+        "Structure",
+        "tuning.goals": "Goal MaxGain RollOff Margin Decay Damping Variance Track",
+        "tuning.hinf": "hinf HInfinity",
+    },
     "Policies": {
         "control.policy": "Policy StateForm",
         "control.policies": "StateFeedback Allocation",

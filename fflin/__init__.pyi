@@ -121,6 +121,31 @@ from fflin.uncertainty.uncertain import uncertain as uncertain
 from fflin.uncertainty.uncertain import Uncertain as Uncertain
 from fflin.uncertainty.lft import LFT as LFT
 
+# Tuning
+from fflin.tuning.tune import tune as tune
+from fflin.tuning.tuned import Tuned as Tuned
+from fflin.tuning.tuned import GoalValue as GoalValue
+from fflin.tuning.parameters import Tunable as Tunable
+from fflin.tuning.structures import PD as PD
+from fflin.tuning.structures import PID as PID
+from fflin.tuning.structures import LowPass as LowPass
+from fflin.tuning.structures import Lead as Lead
+from fflin.tuning.structures import Notch as Notch
+from fflin.tuning.structures import StaticGain as StaticGain
+from fflin.tuning.structures import StateSpaceLaw as StateSpaceLaw
+from fflin.tuning.structures import CustomLaw as CustomLaw
+from fflin.tuning.structures import Structure as Structure
+from fflin.tuning.goals import Goal as Goal
+from fflin.tuning.goals import MaxGain as MaxGain
+from fflin.tuning.goals import RollOff as RollOff
+from fflin.tuning.goals import Margin as Margin
+from fflin.tuning.goals import Decay as Decay
+from fflin.tuning.goals import Damping as Damping
+from fflin.tuning.goals import Variance as Variance
+from fflin.tuning.goals import Track as Track
+from fflin.tuning.hinf import hinf as hinf
+from fflin.tuning.hinf import HInfinity as HInfinity
+
 # Policies
 from fflin.control.policy import Policy as Policy
 from fflin.control.policy import StateForm as StateForm

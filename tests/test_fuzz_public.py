@@ -49,6 +49,7 @@ RESULTS = {
     "PointingError",
     "CampaignPointing",
     "ErrorBudget",
+    *("Tuned", "GoalValue", "HInfinity", "Structure", "Goal"),
     "Contribution",
     "MultirateCompensator",
     "MultirateEstimator",

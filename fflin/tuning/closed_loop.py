@@ -48,8 +48,8 @@ class ClosedLoop:
         D22 = with_states(plant.D[:ny], none)
         K = law.gain
         self.well_posed = True
-        self.left = np.eye(nu + nz)
-        self.right = np.eye(ny + nz)
+        self.left: Array = np.eye(nu + nz)
+        self.right: Array = np.eye(ny + nz)
         if D22.any():
             loop = self.left - K @ D22
             if np.linalg.svd(loop, compute_uv=False)[-1] < _SINGULAR:
@@ -65,6 +65,7 @@ class ClosedLoop:
     def _modes(self) -> tuple[Values, Values, Values | None]:
         """Poles, eigenvectors and their inverse; None if the eigenvectors are nearly dependent."""
         poles, vectors = np.linalg.eig(self.A)
+        poles = poles.astype(complex)
         with np.errstate(all="ignore"):
             condition = np.linalg.cond(vectors)
         if not condition < _CONDITION:
@@ -98,11 +99,10 @@ class ClosedLoop:
 
     def pole_gradient(self, index: int) -> Values:
         """Return the derivatives (p,) of a pole."""
-        poles, vectors, inverse = self._modes
+        _, vectors, inverse = self._modes
         if inverse is None:
-            row = np.linalg.pinv(vectors)[index]
-        else:
-            row = inverse[index]
+            inverse = np.linalg.pinv(vectors)
+        row = inverse[index]
         a = row @ self.B2 @ self.left
         b = self.right @ self.C2 @ vectors[:, index]
         derivatives: Values = np.einsum("i,pij,j->p", a, self.changes, b)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fflin.base.errors import InputError
-from fflin.base.validation import Array
+from fflin.base.validation import Array, Values
 from fflin.tuning.channels import Channel, Ends
 from fflin.tuning.closed_loop import ClosedLoop
 from fflin.tuning.goals import Damping, Decay, Goal, Margin, Track, Variance
@@ -26,6 +26,9 @@ _PARTS, _REFINEMENTS = 8, 6
 
 # Poles whose values are above _NEAR of the largest are reported, at most _POLES.
 _POLES = 6
+
+# Least distance of a transformed pole from a pole of the transformation.
+_AT_ONCE = 1e-9
 
 # Number of instants of a step response.
 _STEPS = 500
@@ -53,8 +56,12 @@ def pieces_of(
     channel: Channel | None,
     loop: ClosedLoop,
     scaling: Array,
+    floor: float = 0.0,
 ) -> list[Piece]:
-    """Return the pieces of a goal in a stable closed loop, the largest first."""
+    """Return the pieces of a goal in a stable closed loop, the largest first.
+
+    Peaks of gains below `floor` are not refined.
+    """
     if isinstance(goal, Decay):
         return _decay(goal, loop)
     if isinstance(goal, Damping):
@@ -66,7 +73,7 @@ def pieces_of(
     if isinstance(goal, Track):
         return _step_errors(goal, channel, loop)
     factors = np.exp(scaling) if isinstance(goal, Margin) else None
-    return _peaks(ends, channel, loop, factors)
+    return _peaks(ends, channel, loop, factors, floor)
 
 
 def scaled(
@@ -114,8 +121,15 @@ def gains_at(
     if min(responses.shape[1:]) == 1:
         gains = np.linalg.norm(responses, axis=(1, 2))
     else:
-        gains = np.linalg.svd(responses, compute_uv=False)[:, 0]
-    return gains * weights_at(loop, ends, frequencies)
+        adjoint = responses.conj().transpose(0, 2, 1)
+        gram = responses @ adjoint
+        if responses.shape[1] > responses.shape[2]:
+            gram = adjoint @ responses
+        if not np.isfinite(gram).all():
+            return np.full(len(gram), np.inf)
+        gains = np.sqrt(np.maximum(np.linalg.eigvalsh(gram)[:, -1], 0.0))
+    weighted: Array = gains * weights_at(loop, ends, frequencies)
+    return weighted
 
 
 def weights_at(loop: ClosedLoop, ends: Ends, frequencies: Array) -> Array:
@@ -124,13 +138,21 @@ def weights_at(loop: ClosedLoop, ends: Ends, frequencies: Array) -> Array:
     The highest frequency of a sampled plant is half the sample rate.
     """
     plant = loop.plant
+    weight = ends.weight
+    if len(weight.denominator) == 1:
+        constant = float(weight.numerator[0] / weight.denominator[0])
+        return np.full(len(frequencies), abs(constant))
     if not plant.dt:
-        return ends.weight.at(frequencies)
-    return ends.weight.at(2.0 * np.arctan(0.5 * plant.dt * frequencies) / plant.dt)
+        return weight.at(frequencies)
+    return weight.at(2.0 * np.arctan(0.5 * plant.dt * frequencies) / plant.dt)
 
 
 def _peaks(
-    ends: Ends, channel: Channel, loop: ClosedLoop, factors: Array | None
+    ends: Ends,
+    channel: Channel,
+    loop: ClosedLoop,
+    factors: Array | None,
+    floor: float,
 ) -> list[Piece]:
     """Return the local peaks of the weighted gain of a channel."""
     system = scaled(loop.system(channel), factors)
@@ -140,9 +162,12 @@ def _peaks(
     gains = gains_at(loop, system, ends, grid)
     if not np.isfinite(gains).all():
         return [Piece(math.inf, 0.0, lambda: (_NOTHING, _NOTHING))]
+    highest = int(gains.argmax())
+    if gains[highest] < floor:
+        return [_gain_piece(ends, channel, loop, factors, float(grid[highest]))]
     padded = np.concatenate(([-1.0], gains, [-1.0]))
     is_peak = (gains >= padded[:-2]) & (gains >= padded[2:])
-    chosen = np.flatnonzero(is_peak & (gains >= _NEAR * gains.max()))
+    chosen = np.flatnonzero(is_peak & (gains >= _NEAR * gains[highest]))
     chosen = chosen[np.argsort(-gains[chosen], kind="stable")][:_PEAKS]
     peaks: dict[float, None] = {}
     last = len(grid) - 1
@@ -225,13 +250,16 @@ def _gain_piece(
     return Piece(value, loop.plant.time(frequency), gradient)
 
 
-def _continuous(loop: ClosedLoop) -> tuple[Array, Array]:
+def _continuous(loop: ClosedLoop) -> tuple[Values, Values]:
     """Return the poles in the time of the model, and their derivatives by those of the plant."""
     poles = loop.poles
     dt = loop.plant.dt
     if not dt:
-        return poles, np.ones(len(poles))
-    half = 0.5 * dt * poles
+        return poles, np.ones(len(poles), complex)
+    half: Values = 0.5 * dt * poles
+    # A pole at -2/dt is a pole at zero of the sampled loop, which decays at once.
+    half = np.where(np.abs(half + 1.0) < _AT_ONCE, -1.0 + _AT_ONCE, half)
+    half = np.where(np.abs(half - 1.0) < _AT_ONCE, 1.0 - _AT_ONCE, half)
     return 2.0 * np.arctanh(half) / dt, 1.0 / (1.0 - half**2)
 
 

@@ -203,7 +203,7 @@ class Margin(Goal):
         disk = positive("disk", self.disk)
         if disk >= _LARGEST_DISK:
             raise InputError(f"disk is {disk:g}, expected a margin between 0 and 2")
-        if self.at not in ("inputs", "outputs"):
+        if not isinstance(self.at, str) or self.at not in ("inputs", "outputs"):
             raise InputError(f"at is {self.at!r}, expected 'inputs' or 'outputs'")
         truth("hard", self.hard)
 
@@ -381,6 +381,6 @@ class Track(Goal):
     def bounds(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the least and the largest error y - 1 of a unit step at times [s]."""
         settled = times >= self.settling
-        low = np.where(settled, -self.within, -1.0)
+        low = np.where(settled, -self.within, -math.inf)
         high = np.where(settled, min(self.within, self.overshoot), self.overshoot)
         return low, high

@@ -68,8 +68,17 @@ def static_law(D: Array, dD: Array) -> Law:
 
 def repeated(law: Law, width: int) -> Law:
     """Return a law of one channel that acts on each of `width` channels."""
-    unit = np.eye(width)
-    return Law(*(np.kron(unit, matrix) for matrix in law))
+    return Law(*(_on_diagonal(matrix, width) for matrix in law))
+
+
+def _on_diagonal(matrix: Array, width: int) -> Array:
+    """Return block-diagonal matrices with `width` copies of each matrix."""
+    *outer, rows, columns = matrix.shape
+    result = np.zeros((*outer, width * rows, width * columns))
+    for index in range(width):
+        row, column = index * rows, index * columns
+        result[..., row : row + rows, column : column + columns] = matrix
+    return result
 
 
 def series(left: Law, right: Law) -> Law:

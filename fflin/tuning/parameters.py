@@ -58,7 +58,7 @@ class Tunable:
             given = getattr(self, key)
             if given is not None:
                 object.__setattr__(self, key, number(key, given))
-        if self.name != "":
+        if not isinstance(self.name, str) or self.name:
             printable("name", self.name)
         least, largest = self.least, self.largest
         if least is not None and largest is not None and not least < largest:
@@ -86,7 +86,8 @@ class Parameter:
 
     `scale` is the size of a typical value. If `sign` is not 0, the parameter keeps this sign, and
     its logarithm is searched; otherwise the inverse hyperbolic sine of value / scale, which is
-    linear for small values and logarithmic for large ones. `source` is the `Tunable` that the user gave, if any.
+    linear for small values and logarithmic for large ones. `source` is the `Tunable` that the user
+    gave, if any.
     """
 
     name: str

@@ -1,7 +1,7 @@
 """Plants of a search: matrices of linear models with their signals, in continuous time.
 
 A model sampled at dt is transformed to continuous time by s = (2/dt) (z - 1)/(z + 1). A continuous
-law closes the loop with this plant exactly as its Tustin discretisation does with the sampled model.
+law closes the loop with this plant exactly as its Tustin discretisation does with the model.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ class Signals:
     C: Array
 
     @cached_property
-    def _markov(self) -> list[Array]:
+    def _markov(self) -> tuple[Array, ...]:
         """Products C A^k B, the initial derivatives of the impulse responses."""
         products = []
         states = self.B
         for _ in range(4):
             products.append(self.C @ states)
             states = self.A @ states
-        return products
+        return tuple(products)
 
     def response(self, output: int, command: int) -> tuple[float, int]:
         """Return the gain g and order r of the fast response g / s^r of an output to an input."""
@@ -95,7 +95,7 @@ def signals_of(lin: LinearModel) -> Signals:
     )
 
 
-def joined(A: Array, B: Array, C: Array) -> Array:
+def joined(A: Array, B: Array, C: Array) -> list[int]:
     """Return the indices of the states that an input reaches and that affect an output."""
     links = np.abs(A) > _ROUNDING * np.abs(A).max(initial=0.0)
     reached = np.abs(B).max(axis=1, initial=0.0) > _ROUNDING * np.abs(B).max(
@@ -105,7 +105,8 @@ def joined(A: Array, B: Array, C: Array) -> Array:
     for _ in A:
         reached = reached | links[:, reached].any(axis=1)
         seen = seen | links[seen].any(axis=0)
-    return np.flatnonzero(reached & seen)
+    indices: list[int] = np.flatnonzero(reached & seen).tolist()
+    return indices
 
 
 def plant_of(

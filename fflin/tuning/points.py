@@ -9,7 +9,7 @@ from itertools import product
 import numpy as np
 
 from fflin.base.errors import InputError
-from fflin.base.validation import Array, instance, positive
+from fflin.base.validation import Array, ArrayLike, as_double, instance, positive
 from fflin.dynamics.delays import HeldSystem
 from fflin.linear.linearization import linearize
 from fflin.linear.model import Delay, LinearModel, delays_of, refuse_sampled
@@ -53,7 +53,7 @@ class Points:
 
 
 def points_of(
-    plant: object, dt: float | None, delay: Delay, seed: int, q: Array | None = None
+    plant: object, dt: float | None, delay: Delay, seed: int, q: ArrayLike | None = None
 ) -> Points:
     """Return the models of the plant of `tune`."""
     if isinstance(plant, LinearModel):
@@ -90,7 +90,7 @@ def points_of(
 def _in_time(lin: LinearModel, dt: float | None, delay: Delay) -> LinearModel:
     """Return a model sampled at dt [s] with delayed inputs, or the model itself."""
     if dt is None:
-        if delay != 0.0:
+        if not isinstance(delay, int | float) or delay != 0.0:
             raise InputError(
                 "delay is given without dt; give the sample time of the law, or a sampled model "
                 "with a delay, lin.discretize(dt, delay=)"
@@ -101,11 +101,12 @@ def _in_time(lin: LinearModel, dt: float | None, delay: Delay) -> LinearModel:
 
 
 def _of_ranges(
-    plant: Uncertain, dt: float | None, delay: Delay, seed: int, q: Array | None
+    plant: Uncertain, dt: float | None, delay: Delay, seed: int, q: ArrayLike | None
 ) -> Points:
     """Return the nominal model, the corners of the ranges and random points in them."""
-    lft = plant.lft(q)
-    nominal = linearize(plant.robot, q)
+    at = None if q is None else as_double("q", q)
+    lft = plant.lft(at)
+    nominal = linearize(plant.robot, at)
     lin = _in_time(nominal, dt, delay)
     size = len(lft.repeats)
     if 2**size <= _CORNERS:

@@ -24,6 +24,9 @@ _LEAST = 1e-9
 # Hard goals are tighter by this factor (in the logarithm), so that they hold after rounding.
 _TIGHT = 1e-6
 
+# Peaks below this fraction of the level of the goals are not refined.
+_ROUGH = 0.5
+
 # Bound of the logarithm of the scaling of a channel.
 _SCALING = math.log(1e6)
 
@@ -85,10 +88,12 @@ class Problem:
                 size += more
             self.scalings.append(place)
         self.size = size
+        # Least level of the soft goals so far; peaks far below it are not refined.
+        self._level = math.inf
         low = np.full(size, -_SCALING)
         high = np.full(size, _SCALING)
-        for place, index in enumerate(self.free):
-            low[place], high[place] = parameters[index].bounds
+        for position, index in enumerate(self.free):
+            low[position], high[position] = parameters[index].bounds
         self.bounds = low, high
 
     def start(self, rng: np.random.Generator | None = None) -> Array:
@@ -123,17 +128,23 @@ class Problem:
             return np.zeros(0)
         return np.concatenate(([0.0], x[place]))
 
-    def pieces(self, x: Array, case: Case) -> list[list[Piece]] | None:
-        """Return the pieces of each goal for a plant, or None if the loop is unstable."""
+    def pieces(
+        self, x: Array, case: Case, floors: Sequence[float] | None = None
+    ) -> list[list[Piece]] | None:
+        """Return the pieces of each goal for a plant, or None if the loop is unstable.
+
+        Peaks of gains below `floors` are not refined.
+        """
         loops = case.loops(self.law(x))
         if loops is None:
             return None
-        return [
-            pieces_of(measure.goal, measure.ends, channel, loop, self.scaling(x, index))
-            for index, (measure, channel, loop) in enumerate(
-                zip(self.measures, case.channels, loops, strict=True)
-            )
-        ]
+        pieces = []
+        for index, measure in enumerate(self.measures):
+            floor = floors[index] if floors is not None else 0.0
+            ends, channel, loop = measure.ends, case.channels[index], loops[index]
+            scaling = self.scaling(x, index)
+            pieces.append(pieces_of(measure.goal, ends, channel, loop, scaling, floor))
+        return pieces
 
     def evaluate(self, x: Array) -> list[Term] | None:
         """Return the logarithms of the values of all goals, or None if a loop is unstable.
@@ -143,8 +154,12 @@ class Problem:
         rates = self.values(x)[1]
         all_hard = all(measure.goal.hard for measure in self.measures)
         terms: list[Term] = []
+        floors = [
+            _ROUGH * (1.0 if measure.goal.hard and not all_hard else self._level)
+            for measure in self.measures
+        ]
         for number, case in enumerate(self.cases):
-            pieces = self.pieces(x, case)
+            pieces = self.pieces(x, case, floors)
             if pieces is None:
                 return None
             for index, of_goal in enumerate(pieces):
@@ -155,6 +170,8 @@ class Problem:
                     if piece.value > _LEAST:
                         key = (number, index)
                         terms.append(self._term(piece, hard, key, rates))
+        level = max((t.value for t in terms if not t.is_constraint), default=0.0)
+        self._level = min(self._level, math.exp(min(level, 100.0)))
         return terms or None
 
     def _term(

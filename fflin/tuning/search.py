@@ -28,7 +28,7 @@ _LONG = 0.5
 _SMALL, _TRIALS = 1e-9, 30
 
 # It also ends if _PATIENCE steps decrease the objective by less than _WORTH.
-_PATIENCE, _WORTH = 30, 3e-4
+_PATIENCE, _WORTH = 20, 5e-4
 
 # Length of the first step in the coordinates of the parameters, and the longest step.
 _FIRST, _LONGEST = 0.3, 3.0
@@ -69,8 +69,8 @@ class Minimum:
     """Result of a search.
 
     `stationarity` is the norm of the convex combination of gradients that the last quadratic
-    program found, plus the distance of these pieces from the largest. `weights` are the coefficients
-    of the functions in this combination.
+    program found, plus the distance of these pieces from the largest. `weights` are the
+    coefficients of the functions in this combination.
     """
 
     x: Array
@@ -79,7 +79,7 @@ class Minimum:
     stationarity: float
     steps: int
     history: list[tuple[float, float]]
-    weights: dict[Hashable, float]
+    weights: dict[Hashable, float] | None
 
 
 def levels(terms: list[Term]) -> tuple[float, float]:
@@ -97,6 +97,18 @@ class _Model(NamedTuple):
     terms: list[Term]
 
 
+class _Trials(NamedTuple):
+    """Result of the trials from a point; `terms` is None if none of them was accepted."""
+
+    x: Array = np.zeros(0)
+    terms: list[Term] | None = None
+    model: _Model = _Model(np.zeros(0), np.zeros((0, 0)), [])
+    z: Array = np.zeros(0)
+    proximity: float = 0.0
+    stationarity: float = math.inf
+    weights: dict[Hashable, float] | None = None
+
+
 def minimise(
     evaluate: Evaluate,
     start: Array,
@@ -104,25 +116,18 @@ def minimise(
     *,
     steps: int,
     is_done: Callable[[list[Term]], bool] | None = None,
-    on_step: Callable[[float, float], None] | None = None,
 ) -> Minimum:
     """Minimise the largest objective subject to constraints, from a point where all are defined."""
-    low, high = bounds
-    x = np.clip(start, low, high)
+    x: Array = np.clip(start, *bounds)
     terms = evaluate(x)
     assert terms is not None
-    n = len(x)
     hessian: Array | None = None
     proximity = 0.0
-    stationarity = math.inf
+    trials = _Trials()
     history: list[tuple[float, float]] = []
-    weights: dict[Hashable, float] = {}
-    taken = 0
-    for taken in range(1, steps + 1):
+    while len(history) < steps:
         objective, constraint = levels(terms)
         history.append((objective, constraint))
-        if on_step is not None:
-            on_step(objective, constraint)
         if is_done is not None and is_done(terms):
             break
         if is_done is None and _stagnates(history):
@@ -130,47 +135,70 @@ def minimise(
         model = _model_of(terms, objective, constraint)
         if hessian is None:
             size = float(np.linalg.norm(model.gradients, axis=1).max(initial=0.0))
-            hessian = max(size, 1e-8) / _FIRST * np.eye(n)
-        room = x - low, high - x
-        accepted = None
-        for trial in range(_TRIALS):
-            curvature = hessian + proximity * np.eye(n)
-            d, z, predicted, stationarity = _step(model, curvature, room)
-            weights = _weights(model, z)
-            longest = float(np.abs(d).max(initial=0.0))
-            if longest > _LONGEST:
-                proximity = max(2.0 * proximity, 0.5 * float(np.trace(hessian)) / n)
-                continue
-            if predicted <= _SMALL:
-                break
-            candidate = np.clip(x + d, low, high)
-            after = evaluate(candidate)
-            if after is not None:
-                decrease = -_progress(after, objective, constraint)
-                if decrease >= _ACCEPTED * predicted:
-                    accepted = candidate, after, z
-                    if trial == 0 and decrease >= 0.3 * predicted:
-                        proximity *= 0.3
-                    if decrease >= _LONG * predicted:
-                        levels_here = objective, constraint
-                        longer = _extended(
-                            evaluate, x, d, bounds, levels_here, decrease
-                        )
-                        if longer is not None:
-                            accepted = *longer, z
-                    break
-                model = _with_cuts(model, after, objective, constraint, x, candidate)
-            if after is None or trial >= 1:
-                scale = float(np.trace(hessian)) / n
-                proximity = max(4.0 * proximity, 0.3 * scale)
-        if accepted is None:
+            hessian = max(size, 1e-8) / _FIRST * np.eye(len(x))
+        trials = _improved(
+            evaluate, x, bounds, (objective, constraint), model, hessian, proximity
+        )
+        if trials.terms is None:
             break
-        candidate, after, z = accepted
-        hessian = _updated(hessian, candidate - x, model, z, after)
-        x, terms = candidate, after
+        proximity = trials.proximity
+        hessian = _updated(hessian, trials.x - x, trials.model, trials.z, trials.terms)
+        x, terms = trials.x, trials.terms
     objective, constraint = levels(terms)
     violation = max(constraint, 0.0)
-    return Minimum(x, objective, violation, stationarity, taken, history, weights)
+    return Minimum(
+        x,
+        objective,
+        violation,
+        trials.stationarity,
+        len(history),
+        history,
+        trials.weights,
+    )
+
+
+def _improved(
+    evaluate: Evaluate,
+    x: Array,
+    bounds: tuple[Array, Array],
+    here: tuple[float, float],
+    model: _Model,
+    hessian: Array,
+    proximity: float,
+) -> _Trials:
+    """Return the first accepted trial from x; `here` contains the levels at x."""
+    low, high = bounds
+    room = x - low, high - x
+    scale = float(np.trace(hessian)) / len(x)
+    result = _Trials()
+    for trial in range(_TRIALS):
+        curvature = hessian + proximity * np.eye(len(x))
+        d, z, predicted, stationarity = _step(model, curvature, room)
+        weights = _weights(model, z)
+        result = result._replace(stationarity=stationarity, weights=weights)
+        if float(np.abs(d).max(initial=0.0)) > _LONGEST:
+            proximity = max(2.0 * proximity, 0.5 * scale)
+            continue
+        if predicted <= _SMALL:
+            break
+        candidate: Array = np.clip(x + d, low, high)
+        after = evaluate(candidate)
+        decrease = -math.inf if after is None else -_progress(after, *here)
+        if after is not None and decrease >= _ACCEPTED * predicted:
+            if trial == 0 and decrease >= 0.3 * predicted:
+                proximity *= 0.3
+            if decrease >= _LONG * predicted:
+                longer = _extended(evaluate, x, d, bounds, here, decrease)
+                if longer is not None:
+                    candidate, after = longer
+            return result._replace(
+                x=candidate, terms=after, model=model, z=z, proximity=proximity
+            )
+        if after is not None:
+            model = _with_cuts(model, after, *here, x, candidate)
+        if after is None or trial >= 1:
+            proximity = max(4.0 * proximity, 0.3 * scale)
+    return result
 
 
 def _stagnates(history: list[tuple[float, float]]) -> bool:
@@ -386,7 +414,8 @@ def _updated(
     )
     sizes, vectors = np.linalg.eigh(0.5 * (updated + updated.T))
     sizes = np.maximum(sizes, _FLAT * max(float(sizes[-1]), 1.0))
-    return (vectors * sizes) @ vectors.T
+    raised: Array = (vectors * sizes) @ vectors.T
+    return raised
 
 
 def _apart(first: float, second: float) -> float:

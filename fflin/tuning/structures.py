@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -170,7 +170,7 @@ class _Series(Structure):
 
 def _require_name(name: object) -> None:
     """Raise `InputError` unless a name is printable or empty."""
-    if name != "":
+    if not isinstance(name, str) or name:
         printable("name", name)
 
 
@@ -212,13 +212,13 @@ class PID(Structure):
     inputs : str or sequence of str
         Inputs of the robot, one for each measured output, in the same order.
     rates : str or sequence of str, optional
-        Measured rates of the outputs, such as a gyroscope. The derivative term is then ``k_d`` times
-        these rates, without a lag.
+        Measured rates of the outputs, such as a gyroscope. The derivative term is then ``k_d``
+        times these rates, without a lag.
     kp, ki, kd : float, (least, largest) or Tunable, optional
         Gains: a number is fixed; see `Tunable`. Units: the unit of the input by the unit of the
         output; ki per second and kd times seconds. With `rates`, kd is by the unit of the rates.
     lag : float, (least, largest) or Tunable, optional
-        Time constant of the derivative [s].
+        Time constant of the derivative [s]; at least 0.01 / bandwidth by default.
     bandwidth : float, optional
         Bandwidth [rad/s] of the first start. The gains follow from the response of the plant.
     coupled : bool
@@ -305,7 +305,8 @@ class PID(Structure):
         with_lag = not rates
         if with_lag:
             start = 0.1 / self.bandwidth
-            lag = Parameter(f"{self._prefix}lag", "s", start, 0.0, math.inf, start)
+            least = 0.1 * start
+            lag = Parameter(f"{self._prefix}lag", "s", start, least, math.inf, start)
             parameters.append(resolved(lag, self.lag))
 
         def law(values: Array, width: int) -> Law:
@@ -329,7 +330,7 @@ class PID(Structure):
         unit = quotient(signals.input_units[command], signals.output_units[signal])
         if term == "ki":
             size *= 0.1 * w
-            unit = f"{unit}/s" if "/" not in unit else f"{unit}/s"
+            unit = f"{unit}/s"
         if term == "kd" and self.rates is None:
             size *= 1.4 / w
             unit = times_seconds(unit)
@@ -346,8 +347,6 @@ class PID(Structure):
 
 
 def _named(parameter: Parameter, name: str) -> Parameter:
-    from dataclasses import replace
-
     return replace(parameter, name=name)
 
 
@@ -355,8 +354,8 @@ def _gains(
     values: Array, places: Sequence[tuple[str, list[tuple[int, int]]]], k: int
 ) -> tuple[dict[str, Array], list[tuple[str, Array]]]:
     """Return the gain matrices of the terms, and the derivative of each parameter."""
-    gains = {term: np.zeros((k, k)) for term in ("kp", "ki", "kd")}
-    derivatives = []
+    gains: dict[str, Array] = {term: np.zeros((k, k)) for term in ("kp", "ki", "kd")}
+    derivatives: list[tuple[str, Array]] = []
     for value, (term, pairs) in zip(values, places, strict=True):
         unit = np.zeros((k, k))
         for pair in pairs:
@@ -531,10 +530,10 @@ class LowPass(_Filter):
             matrices = _array([-w]), _array([w]), _array([1.0]), _array([0.0])
             zero = _array([0.0])
             return law_of(matrices, [(_array([-1.0]), _array([1.0]), zero, zero)])
-        matrices, by_w, by_damping = _second_order(w, float(values[1]))
+        (A, B), by_w, by_damping = _second_order(w, float(values[1]))
         C, D = _array([1.0, 0.0]), _array([0.0])
         nothing = np.zeros((1, 2)), D
-        return law_of((*matrices, C, D), [(*by_w, *nothing), (*by_damping, *nothing)])
+        return law_of((A, B, C, D), [(*by_w, *nothing), (*by_damping, *nothing)])
 
 
 def _second_order(
@@ -689,7 +688,7 @@ class StaticGain(Structure):
     name: str = ""
 
     def __post_init__(self) -> None:
-        if self.largest != math.inf:
+        if not isinstance(self.largest, float) or self.largest != math.inf:
             positive("largest", self.largest)
         _require_name(self.name)
 
@@ -996,6 +995,7 @@ class Structured:
                 sources[key] = index
             self._place.append(index)
             self.parameters.append(parameter)
+        self._is_shared = len(self.parameters) < len(self._place)
         self.parameters = _distinct(self.parameters)
         self.free = [not parameter.fixed for parameter in self.parameters]
         if not any(self.free):
@@ -1010,6 +1010,8 @@ class Structured:
         law = embedded(
             law, element.measured or (), element.commanded or (), *self._sizes
         )
+        if not self._is_shared:
+            return law
         stacks = []
         for stack in law[4:]:
             merged = np.zeros((len(self.parameters), *stack.shape[1:]))
@@ -1025,7 +1027,6 @@ def _distinct(parameters: list[Parameter]) -> list[Parameter]:
     for parameter in parameters:
         name = parameter.name
         counts[name] = counts.get(name, 0) + 1
-        if counts[name] > 1:
-            parameter = _named(parameter, f"{name}_{counts[name]}")
-        result.append(parameter)
+        label = name if counts[name] == 1 else f"{name}_{counts[name]}"
+        result.append(_named(parameter, label))
     return result

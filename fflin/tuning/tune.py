@@ -27,11 +27,17 @@ from fflin.tuning.verification import second_value
 # Steps of the search for a stable loop, and its real part of the poles relative to the slowest.
 _STABILISING = 150
 
+# Steps of each start; the best one is then continued.
+_SCREENING = 60
+
 # Rounds in which worst models are added.
 _ROUNDS = 12
 
 # A model is worse if a goal exceeds its value in the search, or its limit, by this factor.
 _WORSE = 1.0 + 1e-4
+
+# Peaks below this fraction of the largest known value are not refined.
+_REFINED = 0.9
 
 # Random models that are examined in all rounds but the last.
 _FEW = 24
@@ -55,15 +61,16 @@ def tune(
 ) -> Tuned:
     """Tune the parameters of a law of a given structure to goals.
 
-    The search minimises the largest value of the soft goals, while the hard goals hold. It is local:
-    it starts several times, and stops at points where no small change improves all active goals.
+    The search minimises the largest value of the soft goals, while the hard goals hold. It is
+    local: it starts several times, and stops at points where no small change improves all active
+    goals.
 
     Parameters
     ----------
     plant : LinearModel, sequence of LinearModel, or Uncertain
-        Model or models for which the goals must hold. For an `Uncertain`, the search begins with the
-        nominal model. It adds the worst of the corners and of 200 random points of the ranges, until
-        none of them is worse.
+        Model or models for which the goals must hold. For an `Uncertain`, the search begins with
+        the nominal model. It adds the worst of the corners and of 200 random points of the ranges,
+        until none of them is worse.
     structure : Structure
         Structure of the law: `PD`, `PID`, `StaticGain`, `StateSpaceLaw`, `CustomLaw`, filters, sums
         and series.
@@ -123,12 +130,11 @@ def tune(
     starts = count("starts", starts, largest=1000)
     steps = count("steps", steps, largest=100_000)
     seed = whole("seed", seed, 0)
-    at = None if q is None else np.asarray(q, float)
-    points = points_of(plant, dt, delay, seed, at)
+    points = points_of(plant, dt, delay, seed, q)
     task = _Task(structure, every, points)
     bar = Progress()
-    problem, x, minimum, values = task.first(starts, steps, seed, bar)
-    problem, minimum = task.with_worst(problem, x, minimum, steps, bar)
+    problem, minimum, values = task.first(starts, steps, seed, bar)
+    problem, minimum = task.with_worst(problem, minimum, steps, bar)
     bar.close()
     return task.result(problem, minimum, values, time.process_time() - started)
 
@@ -197,7 +203,7 @@ class _Task:
 
     def first(
         self, starts: int, steps: int, seed: int, bar: Progress
-    ) -> tuple[Problem, Array, Minimum, tuple[float, ...]]:
+    ) -> tuple[Problem, Minimum, tuple[float, ...]]:
         """Search from several starts, and return the best result and the values of all."""
         problem = self.problem()
         best: Minimum | None = None
@@ -207,7 +213,8 @@ class _Task:
             x = self.stabilised(problem, problem.start(rng))
             value = math.inf
             if x is not None:
-                minimum = minimise(problem.evaluate, x, problem.bounds, steps=steps)
+                few = min(steps, _SCREENING) if starts > 1 else steps
+                minimum = minimise(problem.evaluate, x, problem.bounds, steps=few)
                 value = _level(minimum)
                 if best is None or _is_better(minimum, best):
                     best = minimum
@@ -215,7 +222,9 @@ class _Task:
             bar(number + 1, starts, "search")
         if best is None:
             raise InputError(self._why_unstable(problem))
-        return problem, best.x, best, tuple(values)
+        if best.steps == _SCREENING and steps > _SCREENING:
+            best = minimise(problem.evaluate, best.x, problem.bounds, steps=steps)
+        return problem, best, tuple(values)
 
     def stabilised(self, problem: Problem, x: Array) -> Array | None:
         """Return a point whose loops are all stable, found from x; None if there is none."""
@@ -235,7 +244,7 @@ class _Task:
         return minimum.x
 
     def with_worst(
-        self, problem: Problem, x: Array, minimum: Minimum, steps: int, bar: Progress
+        self, problem: Problem, minimum: Minimum, steps: int, bar: Progress
     ) -> tuple[Problem, Minimum]:
         """Add the worst models until none is worse, and return the last problem and result."""
         if not self.points.candidates:
@@ -289,7 +298,10 @@ class _Task:
         results: list[_Worst | None] = [None] * len(self.measures)
         for point in points:
             case = self.case(point)
-            pieces = problem.pieces(x, case)
+            floors = [
+                0.0 if known is None else _REFINED * known.value for known in results
+            ]
+            pieces = problem.pieces(x, case, floors)
             for index in range(len(self.measures)):
                 value, piece = math.inf, None
                 if pieces is not None:
@@ -379,7 +391,7 @@ class _Task:
 
             relaxed = minimise(evaluate, minimum.x, problem.bounds, steps=_STABILISING)
         weights: dict[int, float] = {}
-        for key, weight in relaxed.weights.items():
+        for key, weight in (relaxed.weights or {}).items():
             index = key[1] if isinstance(key, tuple) else 0
             weights[index] = weights.get(index, 0.0) + weight
         largest = sorted(weights, key=lambda index: -weights[index])[:2]
@@ -395,7 +407,7 @@ class _Task:
         plant = problem.cases[0].plant
         poles = np.linalg.eigvals(plant.A)
         measured, commanded = self.structured.used
-        for pole in poles[poles.real > -1e-9 * np.abs(poles).max(initial=0.0)]:
+        for pole in poles[poles.real >= -1e-9 * np.abs(poles).max(initial=0.0)]:
             inner = plant.A - pole * np.eye(len(plant.A))
             size = np.abs(plant.A).max(initial=1.0)
             tests = {
@@ -440,7 +452,7 @@ def _level(minimum: Minimum) -> float:
 def _is_better(minimum: Minimum, other: Minimum) -> bool:
     """Return whether a result is better; one that violates hard goals less is better."""
     least = 1e-6
-    if minimum.violation > least or other.violation > least:
-        if abs(minimum.violation - other.violation) > least:
-            return minimum.violation < other.violation
+    largest = max(minimum.violation, other.violation)
+    if largest > least and abs(minimum.violation - other.violation) > least:
+        return minimum.violation < other.violation
     return minimum.objective < other.objective

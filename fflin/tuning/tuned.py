@@ -36,8 +36,8 @@ class GoalValue:
     check : float
         The same value by a second method; NaN for poles.
     frequency : float
-        Frequency [rad/s] of the peak, magnitude [rad/s] of the pole, or time [s] of a step response;
-        NaN for variances.
+        Frequency [rad/s] of the peak, magnitude [rad/s] of the pole, or time [s] of a step
+        response; NaN for variances.
     parameters : mapping
         Uncertain parameters at which the value occurs; empty for the nominal model.
     active : bool
@@ -175,9 +175,6 @@ class Tuned(LinearController):
             check = "" if math.isnan(goal.check) else f"{goal.check:.6g}"
             where = "" if math.isnan(goal.frequency) else f"{goal.frequency:.4g}"
             unit = "s" if goal.label.startswith("step") else "rad/s"
-            model = ", ".join(
-                f"{key} {value:.4g}" for key, value in goal.parameters.items()
-            )
             rows.append(
                 [
                     label,
@@ -185,10 +182,32 @@ class Tuned(LinearController):
                     check,
                     where,
                     unit if where else "",
-                    model or "nominal",
+                    self._model(goal.parameters),
                 ]
             )
         return rows
+
+    def _models(self) -> list[Mapping[str, float]]:
+        """Return the parameters of the models in the table of goals, without the nominal one."""
+        models: list[Mapping[str, float]] = []
+        for goal in self.goals:
+            if goal.parameters and goal.parameters not in models:
+                models.append(goal.parameters)
+        return models
+
+    def _model(self, parameters: Mapping[str, float]) -> str:
+        """Return the number of a model in the table of the goals."""
+        if not parameters:
+            return "nominal"
+        return str(self._models().index(parameters) + 1)
+
+    def _model_lines(self) -> list[str]:
+        """Return the parameters of the numbered models."""
+        lines = []
+        for number, parameters in enumerate(self._models(), 1):
+            values = (f"{key} {value:.4g}" for key, value in parameters.items())
+            lines.append(f"model {number}: {', '.join(values)}")
+        return lines
 
     def _parameter_rows(self) -> list[list[str]]:
         """Return the table of the parameters."""
@@ -206,14 +225,12 @@ class Tuned(LinearController):
             f"stationarity {self.stationarity:.1e}; "
             f"{_counted(len(self.points))} in the search, {_counted(self.examined)} examined"
         )
-        return "\n\n".join(
-            (
-                folded([self._verdict()]),
-                grid(cut(self._goal_rows(), "see goals"), "lrrrl"),
-                grid(cut(self._parameter_rows(), "see parameters"), "lr"),
-                folded([search]),
-            )
-        )
+        goals = grid(cut(self._goal_rows(), "see goals"), "lrrrl")
+        parameters = grid(cut(self._parameter_rows(), "see parameters"), "lr")
+        parts = [folded([self._verdict()]), goals]
+        if lines := self._model_lines():
+            parts.append(folded(lines))
+        return "\n\n".join((*parts, parameters, folded([search])))
 
     def save(self, path: str | Path) -> None:
         """Write the law to a file, which `LinearController` and other tools read.

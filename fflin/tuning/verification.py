@@ -136,6 +136,8 @@ def _step_ratio(goal: Track, system: System, dt: float) -> float:
     """Return the largest ratio of the error of a step response to its template."""
     A, B, C, D = system
     n = len(A)
+    rows: Array = C
+    through: Array = D
     h = dt or goal.examined / (_STEPS * _FINER)
     if dt:
         rate = 2.0 / dt
@@ -146,14 +148,13 @@ def _step_ratio(goal: Track, system: System, dt: float) -> float:
     else:
         step = expm(h * np.block([[A, B], [np.zeros((1, n + 1))]]))
         advance, drive = step[:n, :n], step[:n, n:]
-        rows, through = C, D
     count = max(2, math.ceil(goal.examined / h - 1e-9))
     times = h * np.arange(count + 1)
     state = np.zeros(n)
     errors = np.zeros(count + 1)
     for k in range(count + 1):
         errors[k] = -float(rows[0] @ state + through[0, 0]) - 1.0
-        state = advance @ state + drive[:, 0]
+        state[:] = advance @ state + drive[:, 0]
     low, high = goal.bounds(times)
     ratios = np.where(errors > 0.0, errors / high, errors / low)
     return float(ratios[1:].max())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -91,7 +91,12 @@ def _polynomial(name: str, given: object) -> Array:
     return values
 
 
-def _of_system(name: str, given: object) -> Weight:
+def _first(given: object, key: str) -> object:
+    """Return the polynomial of the first input and output of a python-control system."""
+    return getattr(given, key)[0][0]
+
+
+def _of_system(name: str, given: Any) -> Weight:
     """Return the weight of a SciPy or python-control system."""
     from scipy import signal
 
@@ -99,16 +104,16 @@ def _of_system(name: str, given: object) -> Weight:
         if hasattr(given, "A"):
             top, bottom = signal.ss2tf(
                 given.A,
-                given.B,  # type: ignore[attr-defined]
-                given.C,  # type: ignore[attr-defined]
-                given.D,  # type: ignore[attr-defined]
+                given.B,
+                given.C,
+                given.D,
             )
             size = np.abs(top).max(initial=0.0)
             top = np.where(np.abs(top) > 1e-12 * size, top, 0.0)
         elif isinstance(getattr(given, "num", None), list):
-            top, bottom = given.num[0][0], given.den[0][0]  # type: ignore[attr-defined]
+            top, bottom = _first(given, "num"), _first(given, "den")
         else:
-            system = given if hasattr(given, "num") else given.to_tf()  # type: ignore[attr-defined]
+            system: Any = given if hasattr(given, "num") else given.to_tf()
             top, bottom = system.num, system.den
     except (AttributeError, IndexError, ValueError) as error:
         raise InputError(

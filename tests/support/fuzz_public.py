@@ -237,6 +237,53 @@ def light(folder):
             "limits": {"tau_b": 1.0},
             "disturbance": {"tau_b": vector},
         },
+        "Tunable": {"value": 1.0, "least": 0.5, "largest": 2.0, "name": "k"},
+        **{
+            key: {
+                **{"measured": "q_b", "inputs": "tau_b", "kp": 1.0, "kd": (1.0, 2.0)},
+                **{"lag": 0.1, "bandwidth": 1.0, "coupled": False, "name": "axis"},
+            }
+            for key in ("PD", "PID")
+        },
+        "LowPass": {"frequency": (1.0, 2.0), "order": 2, "damping": 0.7, "name": "f"},
+        "Lead": {"zero": 1.0, "pole": (2.0, 5.0), "name": "f"},
+        "Notch": {"frequency": (1.0, 2.0), "zero_damping": 0.1, "name": "f"},
+        "StaticGain": {
+            **{"measured": "q_b", "inputs": "tau_b", "pattern": None, "largest": 1.0},
+            "name": "k",
+        },
+        "StateSpaceLaw": {"order": 2, "measured": "q_b", "inputs": "tau_b"}
+        | {"feedthrough": True, "bandwidth": 1.0, "name": "k"},
+        "CustomLaw": {
+            "matrices": lambda parameters: ([], [], [], [[-1.0]]),
+            **{"parameters": {"k": (0.5, 1.0)}, "measured": "q_b.x"},
+            "inputs": "tau_b.x",
+        },
+        "MaxGain": {
+            **{"inputs": "tau_b", "outputs": {"q_b": 1.0}, "below": 1.0},
+            **{"band": (0.1, 1.0), "hard": True},
+        },
+        "RollOff": {"inputs": "q_b", "outputs": "tau_b", "above": 1.0, "below": 1.0}
+        | {"hard": False},
+        "Margin": {"disk": 0.7, "at": "outputs", "hard": True},
+        "Decay": {"rate": 0.1, "hard": True},
+        "Damping": {"ratio": 0.5, "band": (0.1, 1.0), "hard": True},
+        "Variance": {"inputs": {"tau_b": 1.0}, "outputs": {"q_b": 1.0}, "hard": True},
+        "Track": {
+            **{"output": "q_b.x", "settling": 5.0, "within": 0.1, "overshoot": 0.2},
+            **{"duration": 20.0, "hard": False},
+        },
+        "hinf": {
+            "lin": lin,
+            "goals": fflin.MaxGain({"tau_b": 1.0, "q_b": 1.0}, ("q_b", "tau_b")),
+            **{"measured": "q_b", "inputs": "tau_b"},
+        },
+        "tune": {
+            "plant": lin,
+            "structure": fflin.PD("q_b", "tau_b", rates="omega_b"),
+            "goals": fflin.Decay(0.1),
+            **{"dt": 0.1, "delay": 0.0, "q": q, "starts": 1, "steps": 2, "seed": 0},
+        },
         "load_dispersions": {"path": "nosuch.toml"},
         "load_inputs": {"path": "nosuch.toml"},
         "line_up": {"gain": gain, "lin": lin},

@@ -1,0 +1,233 @@
+"""Laws of robots: reports against independent computations, uncertain models, seeds, errors."""
+
+import math
+
+import numpy as np
+import pytest
+
+import fflin
+
+ROBOT = {
+    "lock": ["joint_*"],
+    "inputs": [fflin.BaseTorque()],
+    "stiffness": {"panel_*": 100.0},
+    "damping": {"panel_*": 1.0},
+    "outputs": [fflin.BasePose()],
+}
+GOALS = [
+    fflin.MaxGain({"tau_b": 0.01}, {"q_b": 1e-3}),
+    fflin.Margin(0.75, hard=True),
+    fflin.Decay(0.0035, hard=True),
+    fflin.RollOff({"q_b": 1e-4}, {"tau_b": 1.0}, above=8.0, below=5.0),
+    fflin.Variance({"q_b": 1e-5}, {"q_b": 1e-4, "tau_b": 0.5}, hard=True),
+]
+LAW = fflin.LowPass((1.0, 20.0), order=2) * fflin.PD("q_b", "tau_b", shared=True)
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return fflin.load("servicer_7dof", **ROBOT)
+
+
+@pytest.fixture(scope="module")
+def stiff():
+    """A satellite without flexible panels, so that its plant has few states."""
+    return fflin.load(
+        "servicer_7dof",
+        lock=["joint_*", "panel_*"],
+        inputs=[fflin.BaseTorque()],
+        outputs=[fflin.BasePose()],
+    )
+
+
+@pytest.fixture(scope="module")
+def tuned(stiff):
+    goals = [GOALS[0], GOALS[1], GOALS[3]]
+    return fflin.tune(fflin.linearize(stiff), LAW, goals, starts=1, steps=40)
+
+
+def swept(policy, matrices, inputs, outputs, frequencies):
+    """Gains of u and y to w: a disturbance at the input, computed without the code of tuning."""
+    A, B, C, _ = matrices
+    law = policy.system
+    loop = np.block([[A + B @ law.D @ C, B @ law.C], [law.B @ C, law.A]])
+    drive = np.vstack((B, np.zeros((len(law.A), B.shape[1]))))[:, inputs]
+    read = np.hstack((C, np.zeros((len(C), len(law.A)))))[outputs]
+    gains = []
+    for w in frequencies:
+        states = np.linalg.lstsq(1j * w * np.eye(len(loop)) - loop, drive, rcond=None)[
+            0
+        ]
+        gains.append(np.linalg.norm(read @ states, 2))
+    return np.array(gains)
+
+
+def test_the_report_states_the_gain_of_a_sweep_and_the_margin_of_margins(tuned):
+    gain, margin, _ = tuned.goals
+    lin = tuned.lin
+    matrices = lin.A, lin.B, lin.C, lin.D
+    gains = swept(tuned, matrices, range(3), range(3), np.geomspace(1e-3, 1e2, 200))
+    assert gains.max() * 0.01 / 1e-3 <= gain.worst * (1.0 + 1e-6)
+    assert gains.max() * 0.01 / 1e-3 >= gain.worst * 0.98
+    assert gain.value == pytest.approx(gain.check, rel=1e-6)
+    assert 0.75 / fflin.margins(tuned, lin).disk == pytest.approx(
+        margin.check, rel=1e-6
+    )
+    assert margin.met and "disk margin" in str(tuned)
+
+
+def test_a_tuned_law_flies_and_is_saved(tuned, stiff, tmp_path):
+    q0 = fflin.configuration(stiff, rpy=(5, 0, 0))
+    motion = fflin.simulate(stiff, tuned, q0=q0, duration=2.0)
+    assert motion.u.shape[1] == 3
+    tuned.save(tmp_path / "law.npz")
+    again = fflin.LinearController(str(tmp_path / "law.npz"), tuned.lin)
+    assert np.array_equal(again.system.A, tuned.system.A)
+
+
+def test_two_runs_with_one_seed_are_equal_bit_for_bit(stiff):
+    lin = fflin.linearize(stiff)
+    runs = [
+        fflin.tune(lin, LAW, GOALS[:2], starts=2, steps=10, seed=7) for _ in range(2)
+    ]
+    assert runs[0].parameters == runs[1].parameters
+    assert np.array_equal(runs[0].history, runs[1].history)
+
+
+def test_a_sampled_law_has_the_margins_of_the_sampled_loop(stiff):
+    lin = fflin.linearize(stiff)
+    policy = fflin.tune(
+        lin, LAW, fflin.Margin(1.0), dt=0.2, delay=0.1, starts=1, steps=20
+    )
+    assert policy.dt == 0.2
+    margin = fflin.margins(policy, policy.lin).disk
+    assert 1.0 / margin == pytest.approx(policy.goals[0].check, rel=1e-6)
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("dt", [None, 0.25])
+def test_no_goal_is_met_that_a_sweep_does_not_meet(robot, dt):
+    ranges = {"base.density": 0.2, "panel_left.density": 0.2}
+    ranges["panel_*.stiffness"] = {"range": 0.2, "tied": True}
+    uncertain = fflin.uncertain(robot, ranges)
+    policy = fflin.tune(uncertain, LAW, GOALS, dt=dt, delay=0.1 if dt else 0.0)
+    assert policy.met and policy.examined >= 209
+    lft = uncertain.lft()
+    corners = np.array(np.meshgrid(*[[-1.0, 1.0]] * 3)).reshape(3, -1).T
+    draws, _ = uncertain.draws(200, seed=99)
+    for deltas in np.vstack((corners, draws)):
+        lin = fflin.linearize(uncertain.at(uncertain.values(deltas)))
+        if dt is not None:
+            lin = lin.discretize(dt, 0.1)
+        # A few of the random models only, because the margins take long.
+        margins = fflin.margins(policy, lin)
+        assert margins.stable and margins.disk >= 0.75 * (1.0 - 5e-3)
+        if dt is not None:
+            continue
+        gains = swept(
+            policy, lft.at(deltas), range(3), range(3), np.geomspace(1e-3, 1e2, 2000)
+        )
+        assert gains.max() * 0.01 / 1e-3 <= 1.0
+
+
+@pytest.mark.exhaustive
+def test_the_gain_grows_with_the_ranges(robot):
+    values = []
+    for width in (0.05, 0.4):
+        uncertain = fflin.uncertain(robot, {"base.density": width})
+        policy = fflin.tune(uncertain, LAW, GOALS, starts=1)
+        values.append(policy.goals[0].value)
+    assert values[1] > values[0]
+
+
+def test_goals_that_contradict_each_other_are_named(stiff):
+    lin = fflin.linearize(stiff)
+    goals = [
+        fflin.MaxGain({"tau_b": 0.01}, {"q_b": 1e-6}, hard=True),
+        fflin.MaxGain({"q_b": 1e-2}, {"tau_b": 0.1}, hard=True),
+    ]
+    policy = fflin.tune(lin, LAW, goals, starts=1, steps=30)
+    assert not policy.met and policy.factor > 1.0
+    assert {*policy.conflict} == {goal.label for goal in goals}
+    assert "contradict" in str(policy)
+
+
+def test_a_step_response_follows_its_template(stiff):
+    goal = fflin.Track("q_b.x", settling=60.0, within=0.05, overshoot=0.4)
+    policy = fflin.tune(
+        fflin.linearize(stiff), LAW, [goal, fflin.Margin(0.5)], starts=1, steps=30
+    )
+    assert policy.goals[0].met
+    assert policy.goals[0].value == pytest.approx(policy.goals[0].check, rel=2e-2)
+
+
+REFUSED = {
+    "an unknown signal": (fflin.MaxGain("tau_x", "q_b"), LAW, "tau_x"),
+    "noise without a lag": (
+        fflin.Variance({"q_b": 1.0}, {"tau_b": 1.0}),
+        fflin.PD("q_b", "tau_b"),
+        "LowPass",
+    ),
+    "a filter alone": (fflin.Decay(0.1), fflin.LowPass(), "no signals"),
+    "a filter in a sum": (
+        fflin.Decay(0.1),
+        fflin.LowPass() + fflin.PD("q_b", "tau_b"),
+        "sum",
+    ),
+    "no free parameter": (
+        fflin.Decay(0.1),
+        fflin.PD("q_b", "tau_b", kp=1.0, kd=1.0, lag=0.1),
+        "fixed",
+    ),
+    "a pole without input": (
+        fflin.Decay(0.1),
+        fflin.PD("q_b.x", "tau_b.x") * fflin.LowPass(),
+        "pole",
+    ),
+}
+
+
+@pytest.mark.parametrize("key", REFUSED)
+def test_what_cannot_be_tuned_is_refused(key, stiff):
+    goal, structure, word = REFUSED[key]
+    lin = fflin.linearize(stiff)
+    if key == "a pole without input":
+        goal = fflin.MaxGain("tau_b", "q_b")
+    with pytest.raises(fflin.FflinError, match=word):
+        fflin.tune(lin, structure, goal, starts=1, steps=3)
+
+
+@pytest.mark.parametrize(
+    ("make", "word"),
+    [
+        (lambda: fflin.MaxGain("u", "y", below=-1.0), "positive"),
+        (lambda: fflin.MaxGain("u", "y", below=([1.0], [1.0, 1.0])), "degrees"),
+        (lambda: fflin.MaxGain("u", "y", below=([1.0, 0.0], [1.0, 1.0])), "zero"),
+        (lambda: fflin.MaxGain("u", "y", band=(2.0, 1.0)), "band"),
+        (lambda: fflin.Margin(2.5), "disk"),
+        (lambda: fflin.Damping(1.5), "ratio"),
+        (lambda: fflin.Track("y", 10.0, duration=5.0), "duration"),
+        (lambda: fflin.Variance("u", {"y": 1.0}), "inputs"),
+        (lambda: fflin.Tunable(3.0, least=4.0), "value"),
+        (lambda: fflin.Tunable(least=4.0, largest=1.0), "bounds"),
+        (lambda: fflin.PD("y", "u", ki=1.0), "ki"),
+        (lambda: fflin.CustomLaw(lambda k: (), {}, "y", "u"), "parameters"),
+    ],
+)
+def test_goals_and_structures_refuse_what_makes_no_sense(make, word):
+    with pytest.raises(fflin.InputError, match=word):
+        make()
+
+
+def test_hinf_meets_the_goals_of_tune(stiff):
+    lin = fflin.linearize(stiff)
+    goal = fflin.MaxGain({"tau_b": 0.01, "q_b": 1e-3}, {"q_b": 0.05, "tau_b": 1.0})
+    policy = fflin.hinf(lin, goal, measured="q_b")
+    least = fflin.tune(lin, LAW, goal, starts=1, steps=20).goals[0].value
+    assert policy.gamma <= least * 1.001
+    poles = np.sort(np.linalg.eigvals(policy.loop).real)
+    assert policy.order == 6 and math.isfinite(policy.gamma)
+    # No torque moves the position of the base, whose six poles are at zero.
+    assert poles[-7] < 0.0
+    with pytest.raises(fflin.InputError, match="band"):
+        fflin.hinf(lin, fflin.MaxGain("tau_b", "q_b", band=(1.0, 2.0)))
