@@ -476,8 +476,7 @@ def linearize(
         Inputs of the robot, see `effort`; zero by default.
     frame : {"hybrid", "local", "world", "lvlh", "hill"}, optional
         Axes of the base's velocities and wrenches, see `StateMap`; by default
-        "hybrid", or "lvlh" if the robot is in orbit. In orbit, "local" has the axes of
-        "lvlh" for the position, and base axes for the velocities and wrenches.
+        "hybrid", or "lvlh" if the robot is in orbit.
     reference : pin.SE3, optional
         Pose relative to which the attitude and position of the base are measured. The
         default is the base pose at the operating point, or the orbital frame if the
@@ -486,9 +485,7 @@ def linearize(
         Whether to return the error dynamics about a reference that moves through the
         operating point; see `Linearizer`.
     t : float
-        Time [s] for which the model holds, if the robot is in an elliptic orbit. In all other
-        cases, the model does not depend on time. See `EllipticOrbit` for the position of the robot
-        at t = 0.
+        Time [s] for which the model holds, if the orbit of the robot is elliptic.
 
     Returns
     -------
