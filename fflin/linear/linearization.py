@@ -528,8 +528,7 @@ def linearize(
         Inputs of the robot, see `effort`; zero by default.
     frame : {"hybrid", "local", "world", "lvlh", "hill"}, optional
         Axes of the base's velocities and wrenches, see `StateMap`; by default
-        "hybrid", or "lvlh" if the robot is in orbit. In orbit, "local" has the axes of
-        "lvlh" for the position, and base axes for the velocities and wrenches.
+        "hybrid", or "lvlh" if the robot is in orbit.
     reference : pin.SE3, optional
         Pose relative to which the attitude and position of the base are measured. The
         default is the base pose at the operating point, or the orbital frame if the
@@ -541,9 +540,7 @@ def linearize(
         Coordinates of the model of a robot with constraints, such as joint names; see
         `Linearizer`.
     t : float
-        Time [s] for which the model holds, if the robot is in an elliptic orbit. In all other
-        cases, the model does not depend on time. See `EllipticOrbit` for the position of the robot
-        at t = 0.
+        Time [s] for which the model holds, if the orbit of the robot is elliptic.
 
     Returns
     -------
