@@ -126,6 +126,8 @@ def inwards(work, tree):
             to + 4,
             ((xx + (py + pz), xy, xz), (yy + (px + pz), yz, zz + (px + py))),
         )
+        # Add the entries of M for this joint: one for each joint on the path to the base, and six
+        # for the base. `tree.target` and `tree.share` list them in this order.
         above = body
         while above > 0:
             place = places + above * PLACE

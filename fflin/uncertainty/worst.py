@@ -217,19 +217,21 @@ def _continuous_loops(
         if isinstance(gain, Policy):
             middle = loops.at_inputs(np.zeros(len(lft.repeats)), nu)
             scale = largest_scaled_gain(middle)[2]
-        # The rates of the states of a controller are no inputs that could be disturbed.
-        none = np.zeros(len(K) - nu)
-        half = np.hstack((0.5 * np.eye(nu), np.zeros((nu, len(none)))))
-        factors = np.concatenate((1.0 / scale, none))
-        disk = Channel(-scale[:, None] * K[:nu], half, factors)
+        # The inputs of the loop are those of the robot, and then the rates of the states of a
+        # controller, which cannot be disturbed. `Channel` goes from the scaled inputs to the scaled
+        # (S - T)/2, or to the outputs of the robot.
+        no_rates = np.zeros(len(K) - nu)
+        half_identity = np.hstack((0.5 * np.eye(nu), np.zeros((nu, len(no_rates)))))
+        factors = np.concatenate((1.0 / scale, no_rates))
+        disk = Channel(-scale[:, None] * K[:nu], half_identity, factors)
         through = np.zeros((len(lft.C2), len(K)))
-        whole = Channel(lft.C2, through, np.concatenate((np.ones(nu), none)))
+        to_outputs = Channel(lft.C2, through, np.concatenate((np.ones(nu), no_rates)))
         of_disk = loops.figures(disk)
         if isinstance(gain, Policy):
             # As in `margins`, the inputs of a policy have the best scaling of each loop. With
             # another scaling, the gain is at least as large, so `above` finds every worse loop.
             of_disk = of_disk._replace(exact=lambda row: loops.scaled(row, nu))
-        return [of_disk, loops.figures(whole)]
+        return [of_disk, loops.figures(to_outputs)]
 
     return loops, criteria
 

@@ -34,15 +34,19 @@ def rate(coefficients: Array, P: Array) -> Array:
 def joined(early: Array, late: Array) -> Array:
     """Return the transitions over pairs of successive intervals.
 
-    `early` and `late` are the transitions over the first and the second interval of each pair.
+    `early` and `late` are the transitions T, G and W over the first and the second interval of each
+    pair, see `transitions`.
     """
     (T, G, W), (T_late, G_late, W_late) = early, late
     n = T.shape[-1]
+    # Eliminate the state x and the costate l between the intervals. With l = W_late x + T_late' l1,
+    # the state is x = forward x0 - back l1, where (I + G W_late) [forward, back] = [T, G T_late'].
     right = np.concatenate((T, G @ T_late.mT), axis=-1)
     inner = np.linalg.solve(np.eye(n) + G @ W_late, right)
     forward, back = inner[..., :n], inner[..., n:]
-    G, W = G_late + T_late @ back, W + T.mT @ W_late @ forward
-    return np.array((T_late @ forward, _symmetric(G), _symmetric(W)))
+    G_both = G_late + T_late @ back
+    W_both = W + T.mT @ W_late @ forward
+    return np.array((T_late @ forward, _symmetric(G_both), _symmetric(W_both)))
 
 
 def stepped_back(transition: Array, P: Array) -> Array:

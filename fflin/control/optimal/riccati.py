@@ -428,7 +428,8 @@ class ModalMatrix:
         # The diagonal entries approximate the eigenvalues. Divide each column of the off-diagonal
         # part M by its approximate eigenvalue. By the Bauer-Fike theorem, the norm of the result
         # bounds the relative errors of the eigenvalues.
-        if np.linalg.norm(M / np.abs(values)) > 1e-7:
+        # A zero on the diagonal gives NaN, which fails the comparison too.
+        if not np.linalg.norm(M / np.abs(values)) <= 1e-7:
             return np.linalg.eigvals(F)
         real = self.values.imag == 0.0
         first = np.flatnonzero(self.values.imag)[::2]
