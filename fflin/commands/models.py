@@ -261,6 +261,15 @@ def model_report(lin: fflin.LinearModel) -> str:
         head += f", sampled every {lin.dt:g} s"
     head += f"; the operating point is {point}"
     parts = [folded([head, *_units(lin)])]
+    if lin.dependent:
+        parts.append(
+            folded(
+                [
+                    f"constraints of rank {lin.rank} determine {len(lin.dependent)} other states: "
+                    f"{listed(lin.dependent)}"
+                ]
+            )
+        )
     rates = lin.state_units if lin.dt else [_rate(unit) for unit in lin.state_units]
     # Report unstable poles only for a continuous model at an equilibrium. Away from an equilibrium,
     # poles do not determine stability. If A^2 = 0, do not compute the poles, because all of them
@@ -294,8 +303,9 @@ def model_report(lin: fflin.LinearModel) -> str:
     if of_states:
         parts.append("C = I, D = 0: the output is the state")
     c = lin.certificate
+    computation = "constrained" if lin.dependent else "ABA"
     parts.append(
-        f"relative error compared with ABA derivatives: A {c.route_A:.1e}, B "
+        f"relative error compared with {computation} derivatives: A {c.route_A:.1e}, B "
         f"{c.route_B:.1e}\nlargest entries: M M^-1 - I {c.inertia_residual:.1e}, f0 "
         f"{c.f0:.1e}\ncondition number of the scaled M: {c.condition:.1e}"
     )

@@ -1,6 +1,7 @@
 """Constrained accelerations and constraint forces, with their derivatives, in base axes.
 
-The accelerations a of the state's velocities satisfy M a + h = S u + J^T lam and J a + gamma = 0.
+The accelerations a satisfy M a + h = S u + J^T lam and J a + gamma = 0, see (17.2) and (17.3) of
+docs/derivation.md.
 The free accelerations and their derivatives, with lam = 0, come from `fflin.dynamics.rnea`.
 """
 
@@ -144,5 +145,5 @@ class ContactSolver:
         """Return dnu/dt (3.2) from the accelerations c without gravity."""
         rate = c.copy()
         rate[LINEAR] += self._state.gravity(q)
-        rate[LINEAR] -= np.cross(nu[ANGULAR], nu[LINEAR])
+        rate[LINEAR] -= skew(nu[ANGULAR]) @ nu[LINEAR]
         return rate

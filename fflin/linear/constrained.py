@@ -2,7 +2,8 @@
 
 With a basis G of the velocities that the constraints permit, the tangent of the state manifold in
 base axes is xi = G z1, dnu = G z2 + Y z1. Z maps these displacements to the coordinates of chart
-and frame, where P picks d independent coordinates, the same for positions and rates.
+and frame, where P picks d independent coordinates, the same for positions and rates. See (17.5) and
+(17.6) of docs/derivation.md.
 """
 
 from __future__ import annotations
@@ -66,13 +67,21 @@ class Reducer:
         self._state = closure.state
         self._moving = moving
         self._picked: Array | None = None
+        self._data = closure.state.robot.create_data()
+
+    @property
+    def independent(self) -> tuple[str, ...] | None:
+        """Names of the independent coordinates, or None if they are not yet chosen."""
+        if self._picked is None:
+            return self.given
+        return tuple(self._state.names[index] for index in self._picked)
 
     def reduction(
         self, chart: Chart, q: Array, v: Array, nu: Array, space: TangentSpace
     ) -> Reduction:
         """Return the reduction at a point; `nu` is v in state order."""
         state = self._state
-        M = state.project(pin.crba(state.robot.model, state.robot.create_data(), q).T)
+        M = state.project(pin.crba(state.robot.model, self._data, q).T)
         G = space.basis
         G = G @ np.linalg.inv(np.linalg.cholesky(G.T @ M @ G)).T
         by_position, by_rate, mixed = self._coordinates(chart, nu)

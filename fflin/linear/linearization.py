@@ -367,6 +367,8 @@ class Linearizer:
         make = partial(
             type(self), frame=state.frame, reference=reference, moving=moving
         )
+        if self._reducer is not None:
+            make = partial(make, independent=self._reducer.independent)
         return make, (self.robot,)
 
     def _anywhere(self, q: Array, v: Array, u: Array) -> LinearModel:
