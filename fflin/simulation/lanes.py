@@ -341,7 +341,7 @@ class LaneLoop:
                 for lane in going.nonzero()[0]:
                     t = done * times.dt
                     messages[lane] = self._ending(t, point.q[:, lane], v[lane])
-                    if not messages[lane] and not self._is_independent(int(lane)):
+                    if not self._is_independent(int(lane)):
                         messages[lane] = singular_at(t)
                 stop = np.array([float(stop_of(message)) for message in messages])
                 if done % statistics.span == 0:

@@ -475,8 +475,8 @@ def ending_of(plan: Plan, stop: StopConditions) -> Callable[[float, Array, Array
 def singular_at(t: float) -> str:
     """Return the message for constraints that become singular at time t [s]."""
     return (
-        f"stopped at t = {t:g} s: the constraints are singular, because one of them follows from "
-        "the others at this configuration; their forces are not determinate there"
+        f"diverged at t = {t:g} s: the constraints are singular, because one of them follows from "
+        "the others at this configuration, so their forces are not determinate there"
     )
 
 
