@@ -90,9 +90,9 @@ def hinf(
 
     The generalised plant contains the inputs and outputs of all goals, divided by their sizes and
     limits. The norm is that of all of them together, so that it is an upper bound of the value of
-    each goal. Small disturbances and outputs are added if the problem is singular. `gamma` is the norm
-    of the loop that is returned. With lightly damped modes or states of very different sizes, rounding
-    errors of the Riccati equations can end the search above the least norm.
+    each goal. Small disturbances and outputs are added if the problem is singular. `gamma` is the
+    norm of the loop that is returned. With lightly damped modes or states of very different sizes,
+    rounding errors of the Riccati equations can end the search above the least norm.
 
     Parameters
     ----------
