@@ -90,8 +90,9 @@ def hinf(
 
     The generalised plant contains the inputs and outputs of all goals, divided by their sizes and
     limits. The norm is that of all of them together, so that it is an upper bound of the value of
-    each goal. It is within 0.1 % of the least norm. Small disturbances and outputs are added if the
-    problem is singular.
+    each goal. Small disturbances and outputs are added if the problem is singular. `gamma` is the
+    norm of the loop that is returned. With lightly damped modes or states of very different sizes,
+    rounding errors of the Riccati equations can end the search above the least norm.
 
     Parameters
     ----------
@@ -117,7 +118,7 @@ def hinf(
     >>> lin = fflin.linearize(fflin.load("planar_detumble"))
     >>> goal = fflin.MaxGain({"tau_b": 0.01, "q_b": 1e-3}, {"q_b": 0.05, "tau_b": 1.0})
     >>> policy = fflin.hinf(lin, goal, measured="q_b", inputs="tau_b")
-    >>> 0.1 < policy.gamma < 10.0
+    >>> policy.gamma < 1.0
     True
     """
     instance("lin", lin, LinearModel, "a fflin.LinearModel")
