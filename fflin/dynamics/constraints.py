@@ -248,7 +248,7 @@ class Constraints:
             )
         )
         columns = twist_by_q, jacobian, rate_by_q, rate_by_v
-        return _Slopes(*(_of_frame(frame, x) for x in columns))
+        return _Slopes._make(_of_frame(frame, column) for column in columns)
 
     def _joint_jacobian(self, frame: Carried) -> Array:
         if frame.joint < ROOT:

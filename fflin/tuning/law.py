@@ -68,7 +68,7 @@ def static_law(D: Array, dD: Array) -> Law:
 
 def repeated(law: Law, width: int) -> Law:
     """Return a law of one channel that acts on each of `width` channels."""
-    return Law(*(_on_diagonal(matrix, width) for matrix in law))
+    return Law._make(_on_diagonal(matrix, width) for matrix in law)
 
 
 def _on_diagonal(matrix: Array, width: int) -> Array:
