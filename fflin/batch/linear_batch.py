@@ -383,7 +383,8 @@ class LinearBatch(ModelHeader):
 
     def _model(self, index: int) -> LinearModel:
         # fields without a value are None
-        common = {**dict.fromkeys(_MODEL), "added": (), "_delays": (), **self._asked}
+        empty = dict.fromkeys(_EMPTY_TUPLES, ())
+        common = {**dict.fromkeys(_MODEL), **empty, **self._asked}
         common |= {key: getattr(self, key) for key in (*TEXTS, "verified")}
         # `asarray` converts a row of a memory-mapped file to a plain array, without a copy.
         arrays = self._arrays().items()
@@ -439,6 +440,8 @@ class LinearBatch(ModelHeader):
 # the same at all points; a file stores them in its header.
 _KINDS = {item.name: str(item.type) for item in fields(LinearBatch)}
 _MODEL = {item.name for item in fields(LinearModel)} - {"verified"}
+# Fields of a model that are empty in a model of a batch.
+_EMPTY_TUPLES = ("added", "dependent", "_delays", "_lags", "_output_lags")
 _ARRAYS = [key for key, kind in _KINDS.items() if kind == "Array"]
 _OPTIONAL_ARRAYS = [key for key, kind in _KINDS.items() if kind == "Array | None"]
 TEXTS = [key for key, kind in _KINDS.items() if key in _MODEL and "Array" not in kind]

@@ -158,8 +158,9 @@ class GainSchedule(Schedule):
         """Return the report, which contains the sizes, the residual and the rule of the weights."""
         lines = [repr(self), f"weights: {self.weights or 'as given'}"]
         if self.period:
-            loop = multiplier_text(self.loop_multipliers)
-            lines.append(f"repeats after {self.period:.6g} s; closed loop: {loop}")
+            lines.append(f"repeats after {self.period:.6g} s")
+            if self.loop_multipliers.size:
+                lines[-1] += f"; closed loop: {multiplier_text(self.loop_multipliers)}"
         return folded(lines)
 
     def trajectory(self, robot: Robot) -> Trajectory:

@@ -6,7 +6,7 @@ import json
 import math
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import KW_ONLY, asdict, dataclass
+from dataclasses import KW_ONLY, asdict, dataclass, fields
 from functools import lru_cache
 from typing import Any, ClassVar, NamedTuple, TypeAlias
 
@@ -531,7 +531,8 @@ def checked_orbit(value: object) -> Orbit | None:
     # A mapping with one of these names describes an elliptic orbit.
     elliptic = {"perigee", "apogee", "eccentricity"} & set(value)
     if elliptic:
-        require_known("part of orbit", value, EllipticOrbit.__dataclass_fields__)
+        known = [item.name for item in fields(EllipticOrbit)]
+        require_known("part of orbit", value, known)
         if "perigee" not in value:
             raise InputError(
                 f"the orbit has {sorted(elliptic)[0]} but no perigee; give perigee [m]"

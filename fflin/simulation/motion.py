@@ -224,6 +224,12 @@ class Motion(StatesAndInputs, Design):
             raise InputError(
                 f"a motion has {count} times; every history needs as many rows"
             )
+        columns = self.constraint_forces.shape[-1]
+        if columns != len(self.constraint_names):
+            raise InputError(
+                f"constraint_forces has {columns} columns, expected one for each of the "
+                f"{len(self.constraint_names)} constraint_names"
+            )
         of_target = self.target.shape[-1] if self.target.ndim else 1
         if self.target.size and of_target != self.x.shape[1] != self.target.size:
             raise InputError(
