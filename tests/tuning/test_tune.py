@@ -219,7 +219,7 @@ def test_goals_and_structures_refuse_what_makes_no_sense(make, word):
         make()
 
 
-def norm_of_sweep(policy, frequencies):
+def norm_of_sweep(policy, points):
     """Largest gain of a loop from (0.01 tau_b, 1e-3 q_b) to (q_b / 0.05, tau_b)."""
     lin, law = policy.lin, policy.system
     A, B, C = lin.A, lin.B, lin.C
@@ -231,8 +231,8 @@ def norm_of_sweep(policy, frequencies):
     through = np.zeros((ny + nu, nu + ny))
     through[ny:, nu:] = 1e-3 * law.D[:, :ny]
     largest = 0.0
-    for w in frequencies:
-        states = np.linalg.solve(1j * w * np.eye(nx + nz) - loop, drive)
+    for point in points:
+        states = np.linalg.solve(point * np.eye(nx + nz) - loop, drive)
         largest = max(largest, np.linalg.norm(read @ states + through, 2))
     return largest
 
@@ -248,12 +248,22 @@ def optimal(robot):
 
 
 def test_the_norm_of_hinf_is_that_of_a_sweep(optimal):
-    swept = norm_of_sweep(optimal, np.geomspace(1e-3, 1e3, 300))
+    swept = norm_of_sweep(optimal, 1j * np.geomspace(1e-3, 1e3, 300))
     assert optimal.gamma * 0.99 <= swept <= optimal.gamma * (1.0 + 1e-6)
     poles = np.sort(np.linalg.eigvals(optimal.loop).real)
     # No torque moves the position of the base, whose six poles are at zero.
     assert optimal.order == 10 and poles[-7] < -1e-4
     assert np.abs(poles[-6:]).max() < 1e-6
+
+
+def test_the_norm_of_a_sampled_design_is_that_of_the_sampled_loop(stiff):
+    pytest.importorskip("slycot")
+    lin = fflin.linearize(stiff).discretize(0.2)
+    policy = fflin.hinf(lin, FULL, measured="q_b")
+    angles = np.concatenate((np.geomspace(1e-3, 0.5, 150), np.linspace(0.5, 3.14, 50)))
+    swept = norm_of_sweep(policy, np.exp(1j * angles))
+    assert policy.dt == 0.2
+    assert policy.gamma * 0.99 <= swept <= policy.gamma * (1.0 + 1e-6)
 
 
 def test_hinf_is_no_worse_than_tune(optimal):
