@@ -21,6 +21,7 @@ NEEDS = {
     "files": "pandas",
     "monte_carlo": "h5py",
     "sweeps": "h5py",
+    "tuning": "slycot",
     "uncertain_models": "slycot",
 }
 
