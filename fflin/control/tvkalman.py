@@ -114,8 +114,8 @@ def tvkalman(
         with located(
             "give P0, because no steady filter exists at the start of the trajectory"
         ):
-            noise = held_cost(lin.A.T, early, dt)
-            P = stationary_kalman(lin.discretize(dt), noise, V).P
+            per_sample = held_cost(lin.A.T, early, dt)
+            P = stationary_kalman(lin.discretize(dt), per_sample, V).P
     elif not periodic:
         P = weight("P0", P0, traj.state_names)
     held = list(transitions(traj, dt))

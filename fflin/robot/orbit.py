@@ -381,6 +381,7 @@ class EllipticOrbit:
 
     def at(self, t: float) -> OrbitState:
         """Return the rotation and the gravity gradient of the orbital frame at time t [s]."""
+        t = number("t", t)
         e = self.eccentricity
         n = self.mean_motion
         mean = _mean_anomaly(self.anomaly, e) + n * t

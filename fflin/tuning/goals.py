@@ -29,6 +29,16 @@ class Goal(ABC):
 
     The value of a goal is 1 or less if the goal holds. A hard goal is a constraint: the other goals
     are improved only as long as all hard goals hold.
+
+    Attributes
+    ----------
+    hard : bool
+        Whether the goal is a constraint.
+
+    Examples
+    --------
+    >>> isinstance(fflin.Margin(0.5), fflin.Goal)
+    True
     """
 
     hard: bool
