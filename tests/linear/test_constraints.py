@@ -203,6 +203,14 @@ def test_many_random_constraints_agree_with_both_computations(seed):
     assert check.ok, check
 
 
+def test_the_check_closes_constraints_without_placement_at_the_point_of_the_model():
+    robot = fflin.load("planar_detumble")
+    held = [fflin.Spherical("hand")]
+    q = fflin.configuration(robot, {"joint_2": 0.4})
+    lin = fflin.linearize(robot.replace(constraints=held), q)
+    assert fflin.check(robot.replace(constraints=held), lin).ok
+
+
 def test_the_check_sees_a_change_of_one_entry():
     """Of the largest entry of each array, by 1e-5 of it."""
     rng = np.random.default_rng(3)
@@ -329,6 +337,9 @@ def test_other_coordinates_than_the_motions_are_refused():
         fflin.linearize(robot, independent=["q_b.x", "q_b.y"])
     with pytest.raises(fflin.ConstraintError, match="do not determine the motion"):
         fflin.linearize(robot, independent=["r_b.z", "q_b.x", "q_b.y"])
+    for text in ("q_b", 3):
+        with pytest.raises(fflin.InputError, match="expected a list of coordinates"):
+            fflin.linearize(robot, independent=text)
     free = fflin.load("planar_detumble")
     with pytest.raises(fflin.InputError, match="has no constraints"):
         fflin.linearize(free, independent=["joint_1"])
