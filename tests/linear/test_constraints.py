@@ -211,6 +211,15 @@ def test_the_check_closes_constraints_without_placement_at_the_point_of_the_mode
     assert fflin.check(robot.replace(constraints=held), lin).ok
 
 
+@pytest.mark.parametrize("copies", [1, 2], ids=["independent", "redundant"])
+def test_springs_at_rest_agree_with_both_computations(copies):
+    # At rest, Pinocchio's solver does not iterate.
+    held = [fflin.Weld("base", name=f"c{number}") for number in range(copies)]
+    robot = fflin.load("planar_detumble", stiffness={"joint_*": 3.0}, constraints=held)
+    check = fflin.check(robot, fflin.linearize(robot))
+    assert check.ok, check
+
+
 def test_the_check_sees_a_change_of_one_entry():
     """Of the largest entry of each array, by 1e-5 of it."""
     rng = np.random.default_rng(3)
