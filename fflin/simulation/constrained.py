@@ -124,7 +124,7 @@ class Constrained:
     def wrenches(self, q: Array, forces: Array) -> Array:
         """Return the forces and torques (N, k) of all constraints from forces (N, r) of the rows.
 
-        Forces that redundant rows leave open are the smallest ones.
+        If redundant rows do not determine some forces, the smallest forces are returned.
         """
         full = np.zeros((len(q), self.constraints.count))
         full[:, self.kept] = forces
@@ -171,7 +171,7 @@ class Constrained:
         return q, self._state.spread(nu)
 
     def notes(self, q: Array) -> Iterator[str]:
-        """Yield a note if redundant rows leave some of the forces open at q."""
+        """Yield a note if redundant rows do not determine some of the forces at q."""
         if len(self.kept) == self.constraints.count:
             return
         apart = np.abs(self._determinate(q) - np.eye(self.constraints.count))
@@ -263,7 +263,7 @@ class Constrained:
         return slowed
 
     def _independent(self, q: Array) -> Indices:
-        """Return the indices of independent rows at q; raise an error if the rank is open."""
+        """Return the indices of independent rows at q; raise an error if the rank is ambiguous."""
         J = self._state.columns(self.constraints.jacobian(q))
         rows = np.flatnonzero(np.abs(J).max(axis=1) > _ZERO)
         M = self._state.project(pin.crba(self._model, self._data, q))
