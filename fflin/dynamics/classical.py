@@ -30,8 +30,8 @@ _MU, _ITERATIONS = 1e-3, 10
 
 # The solver does not iterate if the first solution is exact, such as at rest. Then its derivatives
 # have an error that is a power series in the regularisation. The sum of the derivatives with these
-# {factor of the regularisation: weight} has no error of first and second order.
-_EXTRAPOLATION = {1.0: 1.0 / 3.0, 0.5: -2.0, 0.25: 8.0 / 3.0}
+# {factor of the regularisation: weight} has only an error of fourth order.
+_EXTRAPOLATION = {1.0: -1 / 21, 0.5: 2 / 3, 0.25: -8 / 3, 0.125: 64 / 21}
 
 # Distance [m] between the two points that represent a hinge in Pinocchio.
 _HINGE = 0.5
