@@ -17,7 +17,7 @@ def test_the_picture_is_made_from_the_code_and_no_import_runs_up():
         "run python docs/scripts/rooms.py"
     )
     assert 'class="up"' not in picture
-    assert len(rooms["rooms"]()) == 14
+    assert len(rooms["rooms"]()) == 15
 
 
 def test_the_page_names_modules_and_files_that_exist():
