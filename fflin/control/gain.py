@@ -471,6 +471,12 @@ def model_of(gain: Gain, robot: Robot, made: str, reference: pin.SE3) -> LinearM
     """
     from fflin.linear.linearization import linearize
 
+    if robot.constraints:
+        raise InputError(
+            f"'{robot.name}' has constraints, so its gain needs the linear model, which a file of "
+            "a gain does not contain; linearise the robot in Python and use "
+            "fflin.StateFeedback(lin, gain)"
+        )
     states = without_past(gain.model_states)
     if states != gain.model_states and not gain.delay.any():
         raise InputError(

@@ -7,7 +7,7 @@ and the transformation X of twists from frame 2 to frame 1, the relative twist i
 
 .. math:: V = X V_2 - V_1.
 
-See (17.1) of docs/derivation.md.
+See (18.1) of docs/derivation.md.
 
 Each constraint sets some rows S of V to zero, in the axes of frame 1: :math:`S V = J \nu = 0`.
 Differentiated, this is :math:`J \dot\nu + \gamma = 0`. Twists have the linear part first, as in

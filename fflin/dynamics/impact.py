@@ -341,6 +341,7 @@ def capture(
         - the payload's inertia is not physically realisable;
         - the robot already has names with this prefix;
         - robot and payload have different gravity or orbits;
+        - robot or payload has constraints;
         - a wheel of the payload has momentum but no inertia.
     ModelError
         If the Pinocchio model of the robot or of the payload was modified after its creation.
@@ -371,6 +372,7 @@ def capture(
         ).require_unchanged()
         # a copy, since the payload may be the same object as the robot
         other = replace(payload)
+        refuse_constraints(other, "payloads")
         _require_same_environment(robot, other)
     if other.stored_momentum:
         raise InputError(

@@ -12,6 +12,7 @@ from fflin.base import html
 from fflin.base.errors import InputError
 from fflin.base.tables import folded, grid
 from fflin.base.validation import Array, instance, share
+from fflin.dynamics.constraints import Constraints
 from fflin.dynamics.coordinates import ANGULAR, LINEAR
 from fflin.dynamics.state import StateMap
 from fflin.linear.aba_route import (
@@ -233,6 +234,7 @@ def _comparisons(robot: Robot, lin: LinearModel) -> Iterator[Row]:
     state = StateMap(robot, reference=lin.reference, frame=lin.frame, t=lin.time)
     if robot.constraints:
         require_fit(lin, robot, state, sensed=True)
+        Constraints(robot).settle(lin.q)
         _require_independent(robot, lin)
         yield from ConstrainedReferences(robot, lin).rows(lin)
         return

@@ -63,6 +63,12 @@ class Reducer:
         self, closure: Closure, independent: Sequence[str] | None, *, moving: bool
     ) -> None:
         self.closure = closure
+        # Refuse a string, because it would be read as a sequence of names with one letter each.
+        if isinstance(independent, str) or not isinstance(independent, Sequence | None):
+            raise InputError(
+                f"independent is {independent!r}, expected a list of coordinates, such as "
+                "['q_b', 'left_1']"
+            )
         self.given = None if independent is None else tuple(independent)
         self._state = closure.state
         self._moving = moving

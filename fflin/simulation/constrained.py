@@ -63,7 +63,9 @@ class Constrained:
     outside : bool
         Whether a frame of the world holds the robot, so that its momentum is not constant.
     least : ndarray (1,)
-        Squared orthogonal fraction of the rows, see `kernel.constraints`; the smallest so far.
+        Squared orthogonal fraction of the rows, see `kernel.constraints`; the smallest so far. A
+        row that vanishes also reduces it: the squared length of a row in the metric of M^-1, as a
+        fraction of the squared length at the start.
     forces : ndarray (r,)
         Forces of the independent rows at the latest evaluation of the accelerations.
     """
@@ -78,6 +80,8 @@ class Constrained:
         self.constraints.settle(q)
         self.outside = robot.anchored
         self.kept = self._independent(q)
+        J = self._state.columns(self.constraints.jacobian(q)[self.kept])
+        self._start_squares = _squares(self._scaled(q, J)[1])
         self.names = tuple(
             f"{item.title}.{component}"
             for item in self.constraints.items
@@ -120,7 +124,7 @@ class Constrained:
     def wrenches(self, q: Array, forces: Array) -> Array:
         """Return the forces and torques (N, k) of all constraints from forces (N, r) of the rows.
 
-        Forces that redundant rows leave open are the smallest ones.
+        If redundant rows do not determine some forces, the smallest forces are returned.
         """
         full = np.zeros((len(q), self.constraints.count))
         full[:, self.kept] = forces
@@ -167,7 +171,7 @@ class Constrained:
         return q, self._state.spread(nu)
 
     def notes(self, q: Array) -> Iterator[str]:
-        """Yield a note if redundant rows leave some of the forces open at q."""
+        """Yield a note if redundant rows do not determine some of the forces at q."""
         if len(self.kept) == self.constraints.count:
             return
         apart = np.abs(self._determinate(q) - np.eye(self.constraints.count))
@@ -225,15 +229,22 @@ class Constrained:
 
     def _correction(self, q: Array, J: Array, error: Array) -> Correction:
         """Return the smallest change c (6 + n,) with J c = -error, in the metric of M at q."""
-        M = self._state.project(pin.crba(self._model, self._data, q))
-        factor, _ = dpotrf(M, 1)
-        # One column at a time, because OpenBLAS would wait for threads if there were several.
-        basis = np.concatenate([dtrtrs(factor, row, 1)[0] for row in J])
+        factor, rows = self._scaled(q, J)
+        fractions = _squares(rows) / self._start_squares
+        self.least[0] = min(self.least[0], fractions.min())
+        basis = rows.ravel()
         r, size = J.shape
         triangle, change, forces = np.zeros(r * r), np.zeros(size), np.zeros(r)
         kernel.orthonormalise(basis, triangle, self.least, r)
         kernel.respond(basis, triangle, error, change, forces)
         return Correction(dtrtrs(factor, change, 1, 1)[0], forces)
+
+    def _scaled(self, q: Array, J: Array) -> tuple[Array, Array]:
+        """Return the Cholesky factor L of M at q, and the rows (r, 6 + n) of J times L^-T."""
+        M = self._state.project(pin.crba(self._model, self._data, q))
+        factor, _ = dpotrf(M, 1)
+        # One row at a time, because OpenBLAS would wait for threads if there were several.
+        return factor, np.array([dtrtrs(factor, row, 1)[0] for row in J])
 
     def _nearer(self, q: Array) -> Array:
         """Return q after one Newton correction of the residual."""
@@ -252,7 +263,7 @@ class Constrained:
         return slowed
 
     def _independent(self, q: Array) -> Indices:
-        """Return the indices of independent rows at q; raise an error if the rank is open."""
+        """Return the indices of independent rows at q; raise an error if the rank is ambiguous."""
         J = self._state.columns(self.constraints.jacobian(q))
         rows = np.flatnonzero(np.abs(J).max(axis=1) > _ZERO)
         M = self._state.project(pin.crba(self._model, self._data, q))
@@ -315,3 +326,9 @@ def _on_body(tree: Tree, frame: Carried, rotation: pin.SE3) -> tuple[int, Array]
 def _packed(pose: pin.SE3) -> Array:
     """Return the columns of the rotation, and the translation, of a pose."""
     return np.concatenate((pose.rotation.ravel("F"), pose.translation))
+
+
+def _squares(rows: Array) -> Array:
+    """Return the squared lengths (r,) of rows (r, k)."""
+    squares: Array = np.einsum("ij,ij->i", rows, rows)
+    return squares

@@ -203,6 +203,25 @@ def test_many_random_constraints_agree_with_both_computations(seed):
     assert check.ok, check
 
 
+def test_the_check_closes_constraints_without_placement_at_the_point_of_the_model():
+    robot = fflin.load("planar_detumble")
+    held = [fflin.Spherical("hand")]
+    q = fflin.configuration(robot, {"joint_2": 0.4})
+    lin = fflin.linearize(robot.replace(constraints=held), q)
+    assert fflin.check(robot.replace(constraints=held), lin).ok
+
+
+@pytest.mark.parametrize("copies", [1, 2], ids=["independent", "redundant"])
+def test_springs_at_rest_agree_with_both_computations(copies):
+    # At rest, Pinocchio's solver does not iterate.
+    held = [fflin.Weld("base", name=f"c{number}") for number in range(copies)]
+    robot = fflin.load("planar_detumble", stiffness={"joint_*": 3.0}, constraints=held)
+    check = fflin.check(robot, fflin.linearize(robot))
+    assert check.ok, check
+    route = [x.error for x in check.rows if x.test == "constrained derivatives"]
+    assert max(route) < 1e-10
+
+
 def test_the_check_sees_a_change_of_one_entry():
     """Of the largest entry of each array, by 1e-5 of it."""
     rng = np.random.default_rng(3)
@@ -329,6 +348,9 @@ def test_other_coordinates_than_the_motions_are_refused():
         fflin.linearize(robot, independent=["q_b.x", "q_b.y"])
     with pytest.raises(fflin.ConstraintError, match="do not determine the motion"):
         fflin.linearize(robot, independent=["r_b.z", "q_b.x", "q_b.y"])
+    for text in ("q_b", 3):
+        with pytest.raises(fflin.InputError, match="expected a list of coordinates"):
+            fflin.linearize(robot, independent=text)
     free = fflin.load("planar_detumble")
     with pytest.raises(fflin.InputError, match="has no constraints"):
         fflin.linearize(free, independent=["joint_1"])

@@ -22,6 +22,9 @@ def lin(robot):
 PAYLOAD = pin.Inertia(1.0, np.zeros(3), np.eye(3))
 CALLS = {
     "capture": lambda robot, _: fflin.capture(robot, "tool_left", PAYLOAD),
+    "capture of a payload": lambda robot, _: fflin.capture(
+        fflin.load("planar_detumble"), "hand", robot
+    ),
     "effective_masses": lambda _, lin: fflin.effective_masses(lin),
     "equilibrium": lambda robot, _: fflin.equilibrium(robot),
     "from_tool": lambda robot, lin: fflin.from_tool(robot, "drake", lin.q),
@@ -29,6 +32,9 @@ CALLS = {
         robot, frame="tool_left"
     ),
     "jam": lambda robot, _: fflin.jam(robot, "left_1"),
+    "linearize_orbit": lambda robot, _: fflin.linearize_orbit(
+        robot.replace(orbit=500e3)
+    ),
     "linearize_trajectory": lambda robot, lin: fflin.linearize_trajectory(
         robot, [0.0, 1.0], [lin.q] * 2, [lin.v] * 2, [lin.u0] * 2
     ),
@@ -47,3 +53,15 @@ CALLS = {
 def test_a_function_without_support_names_the_constraints(name, robot, lin):
     with pytest.raises(fflin.InputError, match=r"not support constraints.*grasp"):
         CALLS[name](robot, lin)
+
+
+def test_a_gain_in_a_file_needs_the_linear_model(robot, lin, tmp_path):
+    gain = fflin.lqr(lin)
+    gain.save(tmp_path / "gain.npz")
+    loaded = fflin.Gain.load(tmp_path / "gain.npz")
+    with pytest.raises(
+        fflin.InputError, match=r"constraints.*StateFeedback\(lin, gain\)"
+    ):
+        fflin.write_c(loaded, tmp_path / "code", robot=robot)
+    policy = fflin.StateFeedback(lin, loaded)
+    np.testing.assert_array_equal(policy.feedback_gain, gain.K)

@@ -241,6 +241,13 @@ def test_a_run_into_a_singular_posture_stops_and_says_so():
         fflin.simulate(*turning(0.0)[:1], q0=turning(0.0)[1], duration=0.1, **STEPS)
 
 
+def test_a_row_that_vanishes_as_a_whole_is_a_singular_posture():
+    # After 0.2 s, the row along the links vanishes: it does not follow from other rows.
+    robot, q, v = turning(0.2)
+    motion = fflin.simulate(robot, q0=q, v0=v, duration=0.4, **STEPS)
+    assert motion.t[-1] < 0.251 and "singular" in motion.stopped
+
+
 def test_orbits_and_loops_go_together_and_the_world_is_refused():
     robot, q, v = dual_arm()
     circling = robot.replace(orbit=500e3)
