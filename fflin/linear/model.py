@@ -252,8 +252,8 @@ class LinearModel(ModelHeader, StateSpace):
     mean_motion : float
         Mean motion of the robot's orbit [rad/s]; 0 without an orbit.
     t : float or None
-        Time [s] for which the model holds, if the robot is in an elliptic orbit. None if the model
-        does not depend on time.
+        Time [s] for which the model holds, if the robot is in an elliptic orbit or has
+        magnetorquers. None if the model does not depend on time.
     added : tuple of str
         Names of the last states, which are not states of the robot: the forces of inputs with a
         lag, see `with_lags`, and the earlier commands of a model with delayed inputs, see
@@ -827,15 +827,17 @@ def refuse_sampled(dt: float, do: str) -> None:
 
 
 def refuse_frozen(lin: LinearModel, what: str) -> None:
-    """Raise `InputError` for a model in an elliptic orbit, which holds at one time only.
+    """Raise `InputError` for a model that holds at one time only.
+
+    The models of robots in elliptic orbits and of robots with magnetorquers depend on time.
 
     `what` is the function or the feature that needs a model for all times.
     """
     if lin.t is not None:
         raise InputError(
-            f"{what} needs a model that does not depend on time, but '{lin.robot}' is in an "
-            f"elliptic orbit, and the model holds only at t = {lin.t:g} s; use linearize_orbit, "
-            "then tvlqr or tvkalman with 'periodic'"
+            f"{what} needs a model that does not depend on time, but the model of '{lin.robot}' "
+            f"holds only at t = {lin.t:g} s, because of an elliptic orbit or of magnetorquers; use "
+            "linearize_orbit, then tvlqr or tvkalman with 'periodic'"
         )
 
 

@@ -181,6 +181,8 @@ class _Problem:
         # The inputs u cause the accelerations B u. All rows except the wheels' must vanish.
         scale = 1.0 / mobility[others]
         B = scale[:, None] * lin.B[nv:][others]
+        # Linear models require that the moments of magnetorquers are zero.
+        B[:, [number for _, number, _ in self.actuation.torquers]] = 0.0
         wanted = -scale * acceleration[others]
         u = np.linalg.lstsq(B, wanted, rcond=1e-12)[0]
         left = B @ u - wanted
