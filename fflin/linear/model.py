@@ -995,9 +995,9 @@ def _lagging_outputs(lin: LinearModel, lags: list[float]) -> LinearModel:
 
 
 def refuse_delayed(lin: LinearModel, what: str) -> None:
-    """Raise `InputError` for a model with delayed inputs; `what` is the subject of the message."""
+    """Raise `InputError` for a model with delays or lags; `what` is the subject of the message."""
     if lin.added:
         raise InputError(
             f"{what} needs a model with the states of the robot alone, but this model has "
-            f"{len(lin.added)} states of delayed inputs ({lin.added[0]}, ...); give lin.undelayed"
+            f"{len(lin.added)} states of delays or lags ({lin.added[0]}, ...); give lin.undelayed"
         )
