@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -13,7 +14,7 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base import html, svg
-from fflin.base.errors import InputError, optional_package
+from fflin.base.errors import FflinWarning, InputError, optional_package
 from fflin.base.names import by_name, input_keys, lag_name, past_name, undotted
 from fflin.base.validation import (
     Array,
@@ -752,6 +753,9 @@ class LinearModel(ModelHeader, StateSpace):
     def save(self, path: str | Path) -> None:
         """Write the model and its certificate to a file, atomically.
 
+        The file does not contain the sampling times and delays of outputs. If an output has them,
+        an `FflinWarning` is given, because `kalman` then designs for other sensors.
+
         Parameters
         ----------
         path : str or Path
@@ -768,6 +772,14 @@ class LinearModel(ModelHeader, StateSpace):
         """
         from fflin.linear.files import record_of, write_model
 
+        outputs = () if self._robot is None else self._robot.outputs
+        if any(item.sample is not None or item.delay for item in outputs):
+            warnings.warn(
+                "the file does not contain the sampling times and delays of the outputs, so kalman "
+                "of the loaded model assumes that each sample measures all outputs at once",
+                FflinWarning,
+                stacklevel=2,
+            )
         write_model(as_path(path), record_of(self), checksummed=self.verified)
 
     @staticmethod
