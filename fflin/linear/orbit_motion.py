@@ -14,6 +14,7 @@ from fflin.base.errors import EquilibriumError, InputError
 from fflin.base.process import in_one_thread
 from fflin.base.validation import Array, ArrayLike, count
 from fflin.dynamics.aba import Aba
+from fflin.dynamics.coordinates import refuse_constraints
 from fflin.dynamics.integrators import DEFAULT_INTEGRATOR
 from fflin.dynamics.state import StateMap
 from fflin.dynamics.state_rows import moving_error
@@ -81,7 +82,8 @@ def linearize_orbit(
     Raises
     ------
     InputError
-        If the robot is not in orbit, `motion` is unknown, or a free motion needs too many steps.
+        If the robot is not in orbit or has constraints, `motion` is unknown, or a free motion needs
+        too many steps.
     EquilibriumError
         If the inputs cannot hold the robot, the wheels gain momentum in every period, or no free
         periodic motion is found near q.
@@ -102,6 +104,7 @@ def linearize_orbit(
             "robot.replace(orbit=fflin.EllipticOrbit(perigee=..., apogee=...))"
         )
     assert robot.orbit is not None
+    refuse_constraints(robot, "linear models over an orbit")
     if motion not in ("held", "free"):
         raise InputError(f"motion is {motion!r}, expected 'held' or 'free'")
     steps = count("steps", steps, 8)

@@ -180,6 +180,9 @@ def test_models_of_magnetorquers_hold_at_their_time(cubesat):
             fflin.InputError, match="magnetorquers; use linearize_orbit"
         ):
             fflin.lqr(lin)
+    batch = fflin.sweep(cubesat, q[None])
+    with pytest.raises(fflin.InputError, match="lqr_batch does not support magnet"):
+        fflin.lqr_batch(batch, 1.0, 1.0)
     with pytest.raises(fflin.InputError, match="do not support magnetorquers"):
         fflin.uncertain(cubesat, {"base.mass": 0.1})
 
@@ -215,3 +218,19 @@ def test_a_trajectory_must_repeat_with_the_magnetic_field(cubesat):
     moments[1] = 0.1
     with pytest.raises(fflin.InputError, match="expected 0; linear"):
         Linearizer(cubesat, moving=True).along(*rest, moments)
+
+
+def test_magnetorquers_balance_no_forces(cubesat):
+    """An equilibrium and a motion at rest leave constant torques to the other inputs."""
+    wheels = [
+        x for x in fflin.load_inputs("cubesat") if isinstance(x, fflin.ReactionWheel)
+    ]
+    robot = cubesat.replace(inputs=[fflin.BaseTorque(), *RODS])
+    tilted = fflin.configuration(robot, rpy=(20, 0, 0))
+    point = fflin.equilibrium(robot, tilted)
+    assert np.abs(point.u[:3]).max() > 1e-9
+    assert not point.u[3:].any()
+    along = fflin.linearize_orbit(robot, tilted, steps=8)
+    assert not along.u[:, 3:].any()
+    mixed = fflin.linearize_orbit(cubesat.replace(inputs=[*wheels, *RODS]), steps=8)
+    assert not mixed.u[:, 3:].any()
