@@ -419,7 +419,7 @@ class Linearizer:
         made = {"A": A, "B": B, "q": q, "v": v, "u0": u, self._rate: rate} | seen
         for array in made.values():
             array.setflags(write=False)
-        time = t if state.varying else None
+        time = {"t": t} if state.varying else {}
         contact = self._accelerations.contact
         if self._reducer is not None and contact is not None:
             whole = LinearModel(self._fields | made)
@@ -428,9 +428,11 @@ class Linearizer:
             return LinearModel(
                 {**self._fields, "_computed": {}, **made, **fields}
                 | {"_inertia": partial(given, frozen(reduction.M))},
-                t=time,
+                **time,
             )
-        return LinearModel(self._fields | made, t=time)
+        if state.varying:
+            return LinearModel(self._fields | made, t=t)
+        return LinearModel(self._fields | made)
 
     def along(
         self, q: Array, v: Array, u: Array, t: Array | None = None
