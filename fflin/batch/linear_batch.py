@@ -382,8 +382,9 @@ class LinearBatch(ModelHeader):
         }
 
     def _model(self, index: int) -> LinearModel:
-        # fields without a value are None
-        common = {**dict.fromkeys(_MODEL), "added": (), "_delays": (), **self._asked}
+        # Fields without a value are None, or empty tuples.
+        empty = ("added", "dependent", "_delays", "_lags", "_output_lags")
+        common = {**dict.fromkeys(_MODEL), **dict.fromkeys(empty, ()), **self._asked}
         common |= {key: getattr(self, key) for key in (*TEXTS, "verified")}
         # `asarray` converts a row of a memory-mapped file to a plain array, without a copy.
         arrays = self._arrays().items()
