@@ -35,9 +35,12 @@ def past_name(samples: int, name: str) -> str:
     return f"past_{samples}.{name}"
 
 
+LAG = "lag."  # start of the names of the states of inputs and outputs with a lag
+
+
 def lag_name(name: str) -> str:
     """Return the name of the state that is the force of an input with a lag."""
-    return f"lag.{name}"
+    return f"{LAG}{name}"
 
 
 def without_past(states: tuple[str, ...]) -> tuple[str, ...]:

@@ -141,6 +141,10 @@ class GainBatch(Design):
         return RegularGridInterpolator(tuple(self._axes.values()), K, method="linear")
 
 
+# Unit of the inputs of magnetorquers alone.
+_MOMENT = "A m^2"
+
+
 def lqr_batch(batch: LinearBatch, Q: Weight, R: Weight) -> GainBatch:
     r"""Return the linear quadratic regulator about every point of a batch.
 
@@ -161,7 +165,7 @@ def lqr_batch(batch: LinearBatch, Q: Weight, R: Weight) -> GainBatch:
     Raises
     ------
     InputError
-        If a weight has a wrong size or sign.
+        If a weight has a wrong size or sign, or the robot has magnetorquers.
     EquilibriumError, StabilizabilityError
         If no regulator exists about a point; the message names the point.
 
@@ -178,6 +182,11 @@ def lqr_batch(batch: LinearBatch, Q: Weight, R: Weight) -> GainBatch:
             "the batch has no points; give a batch with at least one point"
         )
     batch[0].require_unchanged()
+    if _MOMENT in batch.input_units:
+        raise InputError(
+            "lqr_batch does not support magnetorquers, whose torques depend on time, but "
+            f"'{batch.robot}' has some; use linearize_orbit, then tvlqr with 'periodic'"
+        )
     Q = weight("Q", Q, batch.state_names)
     R = weight("R", R, input_keys(batch), definite=True)
     nv, nu = batch.B_lower.shape[1:]

@@ -20,7 +20,7 @@ from fflin.dynamics.outputs import Measuring
 from fflin.dynamics.state import StateMap, selection
 from fflin.linear.fit import require_fit
 from fflin.linear.model import LinearModel
-from fflin.linear.trajectory import Trajectory
+from fflin.linear.trajectory import Trajectory, refuse_periodic
 from fflin.robot.robot import Robot
 
 # Largest displacement of the base from the reference of its model [rad, m, rad/s, m/s].
@@ -54,6 +54,7 @@ class Following(Policy):
 
     def __post_init__(self) -> None:
         instance("trajectory", self.trajectory, Trajectory, "a fflin.Trajectory")
+        refuse_periodic(self.trajectory, "a law about a point that follows")
         if not self.law.sample_time:
             raise InputError(
                 f"the {self.law.kind} is continuous, expected a sampled law to follow a "

@@ -13,7 +13,7 @@ from fflin.control.multirate import MultirateCompensator
 from fflin.control.policies import Feedback, OutputSensing, at_samples
 from fflin.control.policy import Command, Noise, OutputForm, Predictor
 from fflin.control.sensed_laws import sensed
-from fflin.control.sensors import timing_of_robot
+from fflin.control.sensors import timing_of_model, timing_of_robot
 from fflin.dynamics.outputs import Measuring
 from fflin.dynamics.state import StateMap
 from fflin.linear.fit import about_point, require_fit
@@ -120,11 +120,18 @@ class MultirateFeedback(OutputSensing, Feedback):
         Raises
         ------
         InputError
-            If the robot has other states, inputs or measured outputs than the model.
+            If the robot has other states, inputs or measured outputs than the model, or its outputs
+            have other sampling times or delays.
         """
         lin = self.lin
         state = self.state_map(robot)
         require_fit(lin, robot, state, sensed=True)
+        known = lin._robot is not None
+        if known and timing_of_robot(state, lin.dt) != timing_of_model(lin):
+            raise InputError(
+                f"the outputs of '{robot.name}' have other sampling times or delays than the "
+                "outputs of the law's model; design the law for the sensors of this robot"
+            )
         terms = self.terms()
         at = at_samples(terms, lin.dt)
         measure = Measuring(state, lin.q)

@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import block_diag
 
-from fflin.base.errors import located
+from fflin.base.errors import InputError, located
 from fflin.base.process import in_one_thread
 from fflin.base.validation import Array, ArrayLike
 from fflin.control.kalman import disturbance, stationary_kalman
 from fflin.control.optimal import differential_riccati as riccati
+from fflin.control.sensors import timing_of_robot
 from fflin.control.trajectory_end import steady_end
 from fflin.control.tvlqr import (
     FilterSchedule,
@@ -20,6 +21,7 @@ from fflin.control.tvlqr import (
 )
 from fflin.control.weights import Weight, weight
 from fflin.dynamics.integrators import HEAVY, LIGHT, held_cost
+from fflin.dynamics.state import StateMap
 from fflin.linear.linear_trajectory import LinearTrajectory, along, transitions
 
 
@@ -72,8 +74,8 @@ def tvkalman(
     Raises
     ------
     InputError
-        If a size or value is wrong, if P overflows, or if the sampling time does not divide the
-        duration.
+        If a size or value is wrong, if P overflows, if the sampling time does not divide the
+        duration, or if outputs have their own sampling times or delays.
     UnknownNameError
         If a name does not exist.
     EquilibriumError, DetectabilityError
@@ -97,6 +99,12 @@ def tvkalman(
     (21, 18, 18)
     """
     dt = sample_time(traj, sample)
+    if not timing_of_robot(StateMap(traj.robot, frame="local"), dt).is_plain:
+        raise InputError(
+            f"tvkalman measures all outputs every {dt:g} s and at once, but outputs of "
+            f"'{traj.robot.name}' have their own sample or delay; design for the robot with "
+            "robot.replace(outputs=...) without these fields"
+        )
     V = weight("V", V, traj.output_names, definite=True)
     noise, columns = disturbance(traj, W, G)
     columns = np.broadcast_to(columns, (len(traj.t), *columns.shape[-2:]))

@@ -390,7 +390,8 @@ def tvlqr(
         If a name does not exist.
     EquilibriumError, StabilizabilityError
         If Qf is "steady", no inputs can hold the robot at the end point, and the robot does not
-        fall freely there. If Qf is "periodic", the inputs cannot stabilise the motion.
+        fall freely there. If Qf is "periodic", the inputs cannot stabilise the motion, or Q does
+        not weight an unstable motion.
 
     References
     ----------
@@ -474,7 +475,7 @@ def tvlqr(
         dt=dt,
         weights=rule,
         knots=traj.t,
-        loop_multipliers=multipliers,
+        loop_multipliers=_require_stable(traj, multipliers),
         orbit=orbit_text(traj.robot),
     )
     if dt:
@@ -541,7 +542,26 @@ def periodic_end(
         )
 
 
+# Largest multiplier of a loop that counts as stable. States that are not regulated have the
+# multiplier 1, with rounding errors.
+_LARGEST_MULTIPLIER = 1.001
+
 _UNSTABLE = "give other inputs, or zero weights for states that the inputs cannot hold"
+
+
+def _require_stable(traj: LinearTrajectory, multipliers: Array) -> Array:
+    """Return the multipliers of a loop.
+
+    Raise `StabilizabilityError` if the weights leave an unstable motion in a periodic loop.
+    """
+    largest = float(np.abs(multipliers).max(initial=0.0))
+    if largest > _LARGEST_MULTIPLIER:
+        raise StabilizabilityError(
+            f"the periodic regulator does not stabilise '{traj.robot.name}': the largest "
+            f"multiplier of the closed loop is {largest:.6g}, because Q does not weight an "
+            "unstable motion; give weights to all states"
+        )
+    return multipliers
 
 
 @contextmanager

@@ -16,7 +16,7 @@ from fflin.dynamics.state import selection
 from fflin.linear.holding import held_if_possible
 from fflin.linear.linearization import linearize
 from fflin.linear.model import LinearModel
-from fflin.robot.inputs import Thruster
+from fflin.robot.inputs import Thruster, lags_of
 from fflin.robot.robot import Robot
 
 LawT = TypeVar("LawT", bound=LinearLaw)
@@ -62,7 +62,8 @@ def unload_wheels(law: LawT, design: Robot, rate: float) -> LawT:
     ------
     InputError
         If the law already feeds back wheel speeds or does not measure them, `design` has other
-        states or outputs than the robot of the law or lacks its inputs, or the inputs of `design`
+        states or outputs than the robot of the law or lacks its inputs, the inputs have different
+        delays or lags, the model of the law contains lags, or the inputs of `design`
         cannot change all wheel speeds without accelerating the rest of the robot.
 
     Examples
@@ -127,6 +128,18 @@ def _models(law: LinearLaw, design: Robot) -> tuple[LinearModel, LinearModel]:
         raise InputError(
             f"the inputs of the law have the delays {listed(f'{x:g} s' for x in delays)}, expected "
             "one delay of all inputs, so that the external torque and the wheels act together"
+        )
+    if lin.lag.any() or lin.output_lag.any():
+        raise InputError(
+            "the model of the law contains lags, expected a model without with_lags; unload_wheels "
+            "adds commands of the wheels from which the law does not compute their lagging torques"
+        )
+    lags = set(lags_of(design.named_inputs))
+    if len(lags) > 1:
+        raise InputError(
+            f"the inputs of '{design.name}' have the lags {listed(f'{x:g} s' for x in lags)}, "
+            "expected one lag of all inputs, so that the external torque and the wheels act "
+            "together"
         )
     continuous = held_if_possible(
         linearize(design, lin.q, lin.v, frame=lin.frame, reference=lin.reference)

@@ -36,7 +36,6 @@ class Aba:
         # M^-1 in base axes, which the last call of `slopes` computed by ABA.
         self.inverse: Array = np.zeros((6 + robot.n, 6 + robot.n))
         self.field = state.field
-        self.t = 0.0  # time [s] at which the magnetic field is evaluated
         self._resists = bool(np.any(robot.springs))
         self._none = pin.StdVec_Force(robot.model.njoints, pin.Force.Zero())
         self._constraints: ClassicalConstraints | None = None
@@ -84,7 +83,7 @@ class Aba:
         `t` (N,) are the times [s] of the points, by default the time of `state`.
         """
         state = self.state
-        if t is not None and state.elliptic:
+        if t is not None and state.varying:
             rates = np.empty_like(v)
             for k, time in enumerate(t.tolist()):
                 state.move_to(time)
@@ -191,7 +190,7 @@ class Aba:
 
     def _magnetic_columns(self, q: Array) -> Array:
         """Return the generalised forces (6 + n, nu) of magnetorquers for unit inputs."""
-        flux = self.actuation.flux(self.t)
+        flux = self.actuation.flux(self.state.t)
         return self.actuation.magnetic_columns(self._data, q, flux)
 
     def _wrenches(self, q: Array, v: Array, u: Array) -> pin.StdVec_Force:

@@ -373,7 +373,7 @@ class Accelerations:
             self._of_damping += self._springs.damping
 
     def _turned_flux(self, q: Array) -> Array | None:
-        """Return the magnetic flux density (3,) at t = 0 for a base in its neutral attitude.
+        """Return the magnetic flux density (3,) for a base in its neutral attitude.
 
         It is turned together with the base, from the attitude of the base in q. Return None without
         magnetorquers.
@@ -382,7 +382,7 @@ class Accelerations:
             return None
         base = pin.XYZQUATToSE3(q[:7]).rotation
         root = self._model.jointPlacements[ROOT].rotation
-        flux: Array = root @ (root @ base).T @ self._actuation.flux(0.0)
+        flux: Array = root @ (root @ base).T @ self._actuation.flux(self._state.t)
         return flux
 
     def _gyroscopic(

@@ -51,7 +51,8 @@ class StateMap:
           Pinocchio's world is then the orbital frame, with the axes lvlh or hill. With local in
           orbit, it is the orbital frame with the axes lvlh.
     t : float
-        Time [s] for which `orbit` holds. It matters only in an elliptic orbit.
+        Time [s] for which `orbit` holds. It matters only in an elliptic orbit, and for
+        magnetorquers.
 
     Attributes
     ----------
@@ -115,8 +116,9 @@ class StateMap:
         self.in_reference = tuple(compress((ANGULAR, LINEAR), self.axes))
         # Acceleration field of the orbit, or None if the robot is not in orbit.
         self.field = OrbitField(robot, self.frame) if robot.orbit else None
-        # Whether the dynamics depend on time.
         self.elliptic = self.field is not None and self.field.elliptic
+        # Whether the dynamics depend on time.
+        self.varying = self.elliptic or kinds.has_magnetorquers(robot.inputs)
         self.move_to(t)
         self.nx = 12 + 2 * n
         self.groups = names.Groups(
@@ -183,7 +185,8 @@ class StateMap:
         self._aligned = bool((self._rotation == np.eye(3)).all())
 
     def move_to(self, t: float) -> None:
-        """Set the time t [s] for which `orbit` and the field hold; see `OrbitField.move_to`."""
+        """Set the time t [s] for which `orbit` and all fields hold; see `OrbitField.move_to`."""
+        self.t = t
         if self.field:
             self.field.move_to(t)
 
@@ -546,7 +549,7 @@ class Actuation:
         """Return B_u (6 + n, nu) at q, the generalised forces of unit inputs in base axes (6.1).
 
         `flux` (3,) is the magnetic flux density [T] in the axes in which q gives the attitude of
-        the base. By default, it is the flux density at t = 0 in the orbital frame.
+        the base. By default, it is the flux density at the time of `state` in the orbital frame.
         """
         if not (self.carried or self.torquers):
             return self.fixed
@@ -554,7 +557,7 @@ class Actuation:
         pin.computeJointJacobians(self._model, data, q)
         if self.torquers:
             self._write_torquers(
-                data, self.flux(0.0) if flux is None else flux, columns
+                data, self.flux(self.state.t) if flux is None else flux, columns
             )
         if not self.carried:
             return columns

@@ -14,7 +14,7 @@ from typing import NamedTuple
 from fflin.kernel.compiled import numba_is_there, without_numba
 from fflin.kernel.tree import batch_tree
 from fflin.robot.disturbance import PLATE
-from fflin.robot.inputs import Magnetorquer
+from fflin.robot.inputs import has_magnetorquers
 from fflin.robot.joints import ROOT
 from fflin.robot.orbit import is_elliptic
 from fflin.robot.robot import Robot
@@ -83,7 +83,7 @@ def _has_field_function(robot: Robot) -> bool:
 
 
 def _has_magnetorquer(robot: Robot) -> bool:
-    return any(isinstance(item, Magnetorquer) for item in robot.inputs)
+    return has_magnetorquers(robot.inputs)
 
 
 def _has_other_joint(robot: Robot) -> bool:

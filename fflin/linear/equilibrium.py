@@ -400,6 +400,11 @@ class _Balance:
         drift = lin.rate
         _require_steady(lin, drift)
         columns = actuation.columns(robot.create_data(), lin.q)
+        # The torques of magnetorquers change with time, so they hold no equilibrium.
+        torquers = [index for _, index, _ in actuation.torquers]
+        if torquers:
+            columns = columns.copy()
+            columns[:, torquers] = 0.0
         M = lin.M
         acceleration = drift[-len(lin.M) :]
         inverse = np.linalg.inv(M)

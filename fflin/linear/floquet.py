@@ -17,9 +17,9 @@ NEGLIGIBLE = 1e-16
 def multipliers(factors: Array) -> Complex:
     r"""Return the eigenvalues (nx,) of :math:`\Phi_N \cdots \Phi_1`, the largest first.
 
-    The product itself is not formed, because its small eigenvalues would be lost beside the large
-    ones. Instead, groups of factors are the blocks of a cyclic matrix, see (17.4). Its eigenvalues
-    are the roots of the multipliers, and their magnitudes differ far less.
+    The product itself is not formed, because rounding errors of its large eigenvalues would hide
+    the small ones. Instead, groups of factors are the blocks of a cyclic matrix, see (17.4). Its
+    eigenvalues are the roots of the multipliers, and their magnitudes differ far less.
 
     Parameters
     ----------
@@ -52,8 +52,8 @@ def _grouped(factors: Array) -> list[Array]:
 def _powers(roots: Complex, count: int) -> Complex:
     """Return the multipliers for the eigenvalues of a cyclic matrix with `count` blocks.
 
-    Each multiplier has `count` roots, which differ by rotations of 2 pi / count. They are found by
-    rotating one root, the largest that is left, and taking the nearest of the others.
+    Each multiplier has `count` roots, which differ by rotations of 2 pi / count. The function
+    rotates the largest remaining root, and takes the nearest root for each rotation.
     """
     left = list(roots[np.argsort(-np.abs(roots), kind="stable")])
     turns = np.exp(2j * np.pi * np.arange(1, count) / count)

@@ -419,6 +419,7 @@ class Linearizer:
         made = {"A": A, "B": B, "q": q, "v": v, "u0": u, self._rate: rate} | seen
         for array in made.values():
             array.setflags(write=False)
+        time = {"t": t} if state.varying else {}
         contact = self._accelerations.contact
         if self._reducer is not None and contact is not None:
             whole = LinearModel(self._fields | made)
@@ -426,9 +427,10 @@ class Linearizer:
             fields = reduced_fields(state, reduction, whole)
             return LinearModel(
                 {**self._fields, "_computed": {}, **made, **fields}
-                | {"_inertia": partial(given, frozen(reduction.M))}
+                | {"_inertia": partial(given, frozen(reduction.M))},
+                **time,
             )
-        if state.elliptic:
+        if state.varying:
             return LinearModel(self._fields | made, t=t)
         return LinearModel(self._fields | made)
 
@@ -438,8 +440,10 @@ class Linearizer:
         """Return A, B, C, D and y (N, ..) about N valid points, with the inputs u in base axes.
 
         Each model must be relative to the base placement at its point. t (N,) are the times [s],
-        which matter only in an elliptic orbit.
+        which matter only in an elliptic orbit, and for magnetorquers.
         """
+        for inputs in u:
+            _require_no_moment(self.prepared.actuation, inputs)
         ready = self.prepared
         lower = self._lower
         count = len(q)
@@ -540,7 +544,8 @@ def linearize(
         Coordinates of the model of a robot with constraints, such as joint names; see
         `Linearizer`.
     t : float
-        Time [s] for which the model holds, if the orbit of the robot is elliptic.
+        Time [s] for which the model holds, if the orbit of the robot is elliptic or an input is
+        a magnetorquer.
 
     Returns
     -------

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -13,7 +14,7 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base import html, svg
-from fflin.base.errors import InputError, optional_package
+from fflin.base.errors import FflinWarning, InputError, optional_package
 from fflin.base.names import by_name, input_keys, lag_name, past_name, undotted
 from fflin.base.validation import (
     Array,
@@ -252,8 +253,8 @@ class LinearModel(ModelHeader, StateSpace):
     mean_motion : float
         Mean motion of the robot's orbit [rad/s]; 0 without an orbit.
     t : float or None
-        Time [s] for which the model holds, if the robot is in an elliptic orbit. None if the model
-        does not depend on time.
+        Time [s] for which the model holds, if the robot is in an elliptic orbit or has
+        magnetorquers. None if the model does not depend on time.
     added : tuple of str
         Names of the last states, which are not states of the robot: the forces of inputs with a
         lag, see `with_lags`, and the earlier commands of a model with delayed inputs, see
@@ -752,6 +753,9 @@ class LinearModel(ModelHeader, StateSpace):
     def save(self, path: str | Path) -> None:
         """Write the model and its certificate to a file, atomically.
 
+        The file does not contain the sampling times and delays of outputs. If an output has them,
+        an `FflinWarning` is given, because `kalman` then designs for other sensors.
+
         Parameters
         ----------
         path : str or Path
@@ -768,6 +772,14 @@ class LinearModel(ModelHeader, StateSpace):
         """
         from fflin.linear.files import record_of, write_model
 
+        outputs = () if self._robot is None else self._robot.outputs
+        if any(item.sample is not None or item.delay for item in outputs):
+            warnings.warn(
+                "the file does not contain the sampling times and delays of the outputs, so kalman "
+                "of the loaded model assumes that each sample measures all outputs at once",
+                FflinWarning,
+                stacklevel=2,
+            )
         write_model(as_path(path), record_of(self), checksummed=self.verified)
 
     @staticmethod
@@ -827,15 +839,17 @@ def refuse_sampled(dt: float, do: str) -> None:
 
 
 def refuse_frozen(lin: LinearModel, what: str) -> None:
-    """Raise `InputError` for a model in an elliptic orbit, which holds at one time only.
+    """Raise `InputError` for a model that holds at one time only.
+
+    The models of robots in elliptic orbits and of robots with magnetorquers depend on time.
 
     `what` is the function or the feature that needs a model for all times.
     """
     if lin.t is not None:
         raise InputError(
-            f"{what} needs a model that does not depend on time, but '{lin.robot}' is in an "
-            f"elliptic orbit, and the model holds only at t = {lin.t:g} s; use linearize_orbit, "
-            "then tvlqr or tvkalman with 'periodic'"
+            f"{what} needs a model that does not depend on time, but the model of '{lin.robot}' "
+            f"holds only at t = {lin.t:g} s, because of an elliptic orbit or of magnetorquers; use "
+            "linearize_orbit, then tvlqr or tvkalman with 'periodic'"
         )
 
 
@@ -993,9 +1007,9 @@ def _lagging_outputs(lin: LinearModel, lags: list[float]) -> LinearModel:
 
 
 def refuse_delayed(lin: LinearModel, what: str) -> None:
-    """Raise `InputError` for a model with delayed inputs; `what` is the subject of the message."""
+    """Raise `InputError` for a model with delays or lags; `what` is the subject of the message."""
     if lin.added:
         raise InputError(
             f"{what} needs a model with the states of the robot alone, but this model has "
-            f"{len(lin.added)} states of delayed inputs ({lin.added[0]}, ...); give lin.undelayed"
+            f"{len(lin.added)} states of delays or lags ({lin.added[0]}, ...); give lin.undelayed"
         )

@@ -82,8 +82,8 @@ def linearize_orbit(
     Raises
     ------
     InputError
-        If the robot is not in orbit or has constraints, `motion` is unknown, or a free motion
-        needs too many steps.
+        If the robot is not in orbit or has constraints, `motion` is unknown, or a free motion needs
+        too many steps.
     EquilibriumError
         If the inputs cannot hold the robot, the wheels gain momentum in every period, or no free
         periodic motion is found near q.
@@ -184,6 +184,8 @@ class _Problem:
         # The inputs u cause the accelerations B u. All rows except the wheels' must vanish.
         scale = 1.0 / mobility[others]
         B = scale[:, None] * lin.B[nv:][others]
+        # Linear models require that the moments of magnetorquers are zero.
+        B[:, [number for _, number, _ in self.actuation.torquers]] = 0.0
         wanted = -scale * acceleration[others]
         u = np.linalg.lstsq(B, wanted, rcond=1e-12)[0]
         left = B @ u - wanted

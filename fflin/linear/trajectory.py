@@ -56,6 +56,9 @@ _ACCURACY, _MOST_STEPS = 1e-8, 128
 # Two durations with at most this relative difference count as equal.
 _SAME_TIME = 1e-9
 
+# Relative difference of magnetic fields that count as equal.
+_SAME_FIELD = 1e-6
+
 # Assumed rounding errors. _POSITION_ROUNDING is the error of a position, relative to the largest
 # position. An acceleration is a sum of terms. _SUM_ROUNDING is the error of this sum, relative to
 # the sum of the magnitudes of the terms.
@@ -197,6 +200,19 @@ class Trajectory(Design):
             self._require_period()
         super().__post_init__()
 
+    def _require_periodic_field(self) -> None:
+        """Raise `InputError` if the magnetic field does not repeat after `period`."""
+        flux = self.actuation.flux
+        for t in self.t.tolist():
+            before, after = flux(t), flux(t + self.period)
+            difference = np.linalg.norm(after - before)
+            if difference > _SAME_FIELD * np.linalg.norm(before):
+                raise InputError(
+                    f"period is {self.period:g} s, but the magnetic field at t = {t:g} s differs "
+                    "from the field one period later; give a period of the field, which is the "
+                    "period of the orbit for field='dipole'"
+                )
+
     def _require_period(self) -> None:
         """Raise `InputError` if the motion does not repeat after `period`."""
         period = number("period", self.period)
@@ -212,6 +228,8 @@ class Trajectory(Design):
                     f"period is {period:g} s, but the field of the elliptic orbit repeats after "
                     f"{self.robot.orbit.period:g} s; give a multiple of this period"
                 )
+        if self.actuation.torquers:
+            self._require_periodic_field()
         apart = pin.difference(self.robot.model, self.q[0], self.q[-1])
         wheels = [joint.idx_v for joint in self.robot.joints if joint.unbounded]
         apart[wheels] = 0.0

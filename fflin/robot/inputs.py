@@ -375,6 +375,11 @@ KINDS: tuple[type[Input], ...] = (
 )
 
 
+def has_magnetorquers(inputs: Iterable[Input]) -> bool:
+    """Return whether an input is a magnetorquer, so that the dynamics depend on time."""
+    return any(isinstance(item, Magnetorquer) for item in inputs)
+
+
 def three_numbers(what: str, value: object) -> tuple[float, float, float]:
     """Return three finite floats; raise `InputError` if the value is anything else."""
     try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, NamedTuple
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 import numpy as np
 
 from fflin.base import html
-from fflin.base.errors import InputError
+from fflin.base.errors import FflinWarning, InputError
 from fflin.base.names import by_name, input_keys
 from fflin.base.process import in_one_thread
 from fflin.base.rotation import rotation_matrix
@@ -31,11 +32,12 @@ from fflin.control.data_sheet import output_keys
 from fflin.control.gain import Gain
 from fflin.control.margins import ClosedLoop, delayed_model, law_in_loop
 from fflin.control.policy import Policy, System
+from fflin.dynamics.coordinates import refuse_elliptic
 from fflin.dynamics.disturbance import phasors_of
 from fflin.dynamics.state import StateMap
 from fflin.dynamics.state_rows import attitude_rotations
 from fflin.linear.model import LinearModel
-from fflin.robot.disturbance import BASE
+from fflin.robot.disturbance import BASE, plates_of
 from fflin.robot.inputs import BaseForce, BaseTorque, Input
 from fflin.robot.joints import ROOT
 from fflin.simulation.motion import Motion
@@ -269,7 +271,7 @@ def error_budget(
     robot : Robot, optional
         Robot whose field `disturbance` contains further causes, at the attitude of `lin`. In orbit,
         constants in inertial axes are sinusoids with the rate of the orbit. Flat plates are left
-        out.
+        out, with an `FflinWarning`.
     limit_cycle : bool
         Whether the part of the errors of `motion` that the linear superposition does not explain is
         a further cause, "simulated minus superposed". The motion must contain the same causes. Its
@@ -404,6 +406,14 @@ def _disturbances(
     if robot is None:
         return {}
     instance("robot", robot, Robot, "a Robot")
+    refuse_elliptic(robot, "error budgets")
+    if plates_of(robot.disturbance):
+        warnings.warn(
+            f"'{robot.name}' has flat plates, whose drag and solar pressure the error budget does "
+            "not contain; give their largest torque as disturbance={'tau_b': ...}",
+            FflinWarning,
+            stacklevel=3,
+        )
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
     root = robot.model.jointPlacements[ROOT].rotation
     attitude = root @ rotation_matrix(lin.q[3:7])

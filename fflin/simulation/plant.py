@@ -111,7 +111,7 @@ class Plant(Aba):
         the total power [W] of inputs, disturbance and dampers, and of the change of an elliptic
         orbit's field.
         """
-        if self.state.elliptic:
+        if self.state.varying:
             self.state.move_to(t)
         if self._faulty:
             given = np.empty(len(u))
@@ -125,9 +125,7 @@ class Plant(Aba):
         if self._plain and self.disturbance is None:
             tau = self._columns.dot(u)
             return pin.aba(self._model, self._data, q, v, tau), tau[:6]
-        self.t = t
-        flux = self.actuation.flux(t) if self.actuation.torquers else None
-        force = self.actuation.columns(self._data, q, flux) @ u
+        force = self.actuation.columns(self._data, q) @ u
         disturbed = None
         if self.disturbance is not None:
             begin, h = self.step

@@ -16,7 +16,7 @@ from fflin.base.writing import as_path
 from fflin.control.gain import Gain, gain_matrix
 from fflin.dynamics.coordinates import refuse_constraints
 from fflin.linear.files import record_of
-from fflin.linear.model import LinearModel, refuse_frozen
+from fflin.linear.model import LinearModel, refuse_delayed, refuse_frozen
 from fflin.uncertainty.derivatives import ModelDerivatives
 from fflin.uncertainty.parameters import Parameter, Parameters
 
@@ -381,7 +381,7 @@ def sensitivity(lin: LinearModel) -> Sensitivity:
     Raises
     ------
     InputError
-        If the model was loaded from a file.
+        If the model was loaded from a file, or contains delays or lags.
     ModelError
         If the robot's Pinocchio model (``robot.model``) was modified after the robot was created.
 
@@ -399,6 +399,7 @@ def sensitivity(lin: LinearModel) -> Sensitivity:
         )
     refuse_constraints(robot, "sensitivities")
     refuse_frozen(lin, "sensitivity")
+    refuse_delayed(lin, "sensitivity")
     if robot.orbit and lin.frame == "local":
         raise InputError(
             f"sensitivities in base axes are defined only without an orbit, but '{robot.name}' is "

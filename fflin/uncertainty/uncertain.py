@@ -22,6 +22,7 @@ from fflin.base.validation import (
 from fflin.dynamics.coordinates import refuse_constraints, refuse_elliptic
 from fflin.dynamics.state import StateMap
 from fflin.linear.linearization import Prepared, linearize
+from fflin.robot.inputs import has_magnetorquers
 from fflin.robot.robot import Robot
 from fflin.uncertainty.derivatives import WEIGH
 from fflin.uncertainty.lft import LFT, Block, Range, linear_fractional
@@ -301,6 +302,7 @@ def uncertain(robot: Robot, ranges: Mapping[str, object]) -> Uncertain:
     instance("robot", robot, Robot, "a fflin.Robot").require_unchanged()
     refuse_constraints(robot, "uncertain models")
     refuse_elliptic(robot, "uncertain models")
+    _refuse_magnetorquers(robot)
     given: dict[str, object] = {}
     for key, value in by_name("ranges", ranges, "parameter").items():
         if isinstance(value, Mapping) and "range" not in value:
@@ -396,3 +398,12 @@ def _tied(key: str, ranges: list[Range], value: object) -> Block:
         for interval in ranges
     )
     return Block(key, "1", 1.0, relative, tuple(scaled))
+
+
+def _refuse_magnetorquers(robot: Robot) -> None:
+    """Raise `InputError` if an input is a magnetorquer, because B then depends on time."""
+    if has_magnetorquers(robot.inputs):
+        raise InputError(
+            "uncertain models do not support magnetorquers, whose torques depend on time, but "
+            f"'{robot.name}' has some; remove them with robot.replace(inputs=...)"
+        )

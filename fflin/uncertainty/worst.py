@@ -12,6 +12,7 @@ import numpy as np
 
 from fflin.base import html
 from fflin.base.errors import InputError
+from fflin.base.names import LAG
 from fflin.base.process import Progress, in_one_thread
 from fflin.base.tables import folded
 from fflin.base.validation import Array, Mask, shaped
@@ -143,10 +144,26 @@ class Worst(html.Reported):
 
 
 @in_one_thread
+def _refuse_lags(gain: object) -> None:
+    """Raise `InputError` if a gain or policy was designed for a model with lags."""
+    lagging = False
+    if isinstance(gain, Gain):
+        lagging = any(name.startswith(LAG) for name in gain.state_names)
+    if isinstance(gain, Policy) and gain.model is not None:
+        lagging = bool(gain.model.lag.any() or gain.model.output_lag.any())
+    if lagging:
+        raise InputError(
+            "the search for worst loops does not support lags, but the law was designed for a "
+            "model with lags; give a law of a model without with_lags, or check this law by "
+            "fflin.margins at samples of the robot"
+        )
+
+
 def searched(
     model: Uncertain, lft: LFT, gain: object, samples: int, seed: int
 ) -> Worst:
     """Search for the worst closed loops; see `Uncertain.worst`."""
+    _refuse_lags(gain)
     sampled = sampled_law(gain)
     loops: Loops | SampledLoops
     if sampled is None:

@@ -9,7 +9,9 @@ import pytest
 import fflin
 from fflin.dynamics.magnetic import MagneticField
 from fflin.dynamics.orbital import OrbitField
+from fflin.linear.linearization import Linearizer
 from fflin.robot.orbit import DIPOLES
+from tests.support.marks import exhaustive
 from tests.support.robots import random_point
 
 INCLINATION, LATITUDE = 1.2, 0.7
@@ -161,3 +163,74 @@ def test_errors(cubesat):
     rod = fflin.Magnetorquer((1, 0, 0), arm.joint_names[-1])
     arm = arm.replace(orbit=ORBIT, inputs=[rod])
     refused("moves relative", lambda: fflin.BDot(1.0).bind(arm))
+
+
+def test_models_of_magnetorquers_hold_at_their_time(cubesat):
+    """At each time, the torque of a unit moment along s is s x b with the flux b of that time."""
+    q = fflin.configuration(cubesat, rpy=(30, 20, 50))
+    R = pin.XYZQUATToSE3(q[:7]).rotation
+    field = OrbitField(cubesat, "lvlh").magnetic
+    for t in (0.0, 1500.0):
+        lin = fflin.linearize(cubesat, q, t=t)
+        expected = np.cross(np.eye(3), R.T @ field.at(t)).T
+        assert lin.M[:3, :3] @ lin.B[6:9] == pytest.approx(expected, abs=1e-18)
+        assert lin.t == t
+        assert fflin.check(cubesat, lin).ok
+        with pytest.raises(
+            fflin.InputError, match="magnetorquers; use linearize_orbit"
+        ):
+            fflin.lqr(lin)
+    batch = fflin.sweep(cubesat, q[None])
+    with pytest.raises(fflin.InputError, match="lqr_batch does not support magnet"):
+        fflin.lqr_batch(batch, 1.0, 1.0)
+    with pytest.raises(fflin.InputError, match="do not support magnetorquers"):
+        fflin.uncertain(cubesat, {"base.mass": 0.1})
+
+
+def test_the_periodic_model_of_magnetorquers_follows_the_field(cubesat):
+    along = fflin.linearize_orbit(cubesat, steps=32)
+    field = OrbitField(cubesat, "lvlh").magnetic
+    for k in (0, 5, 32):
+        expected = np.cross(np.eye(3), field.at(along.t[k])).T
+        lin = along[k]
+        assert lin.M[:3, :3] @ along.B[k, 6:9] == pytest.approx(expected, abs=1e-18)
+        assert lin.t == along.t[k]
+    assert along.check().ok
+
+
+@exhaustive
+def test_a_periodic_regulator_of_magnetorquers_alone_stabilises_the_attitude(cubesat):
+    along = fflin.linearize_orbit(cubesat, steps=32)
+    law = fflin.tvlqr(along, 1.0, 1e4, "periodic", sample=ORBIT.period / 64)
+    q0 = along.q[0].copy()
+    q0[3:7] = fflin.configuration(cubesat, rpy=(2, -1, 1))[3:7]
+    options = {"duration": ORBIT.period, "dt": ORBIT.period / 128}
+    motion = fflin.simulate(cubesat, law, q0=q0, engine="python", **options)
+    assert motion.attitude_error[-1] < 0.1 * motion.attitude_error[0]
+
+
+def test_a_trajectory_must_repeat_with_the_magnetic_field(cubesat):
+    rest = np.tile(cubesat.neutral(), (3, 1)), np.zeros((3, 6))
+    moments = np.zeros((3, 3))
+    with pytest.raises(fflin.InputError, match="period of the field"):
+        times = [0.0, 50.0, 100.0]
+        fflin.Trajectory(cubesat, times, *rest, moments, hold="smooth", period=100.0)
+    moments[1] = 0.1
+    with pytest.raises(fflin.InputError, match="expected 0; linear"):
+        Linearizer(cubesat, moving=True).along(*rest, moments)
+
+
+def test_magnetorquers_balance_no_forces(cubesat):
+    """An equilibrium and a motion at rest leave constant torques to the other inputs."""
+    wheels = [
+        x for x in fflin.load_inputs("cubesat") if isinstance(x, fflin.ReactionWheel)
+    ]
+    robot = cubesat.replace(inputs=[fflin.BaseTorque(), *RODS])
+    tilted = fflin.configuration(robot, rpy=(20, 0, 0))
+    point = fflin.equilibrium(robot, tilted)
+    assert np.abs(point.u[:3]).max() > 1e-9
+    assert not point.u[3:].any()
+    along = fflin.linearize_orbit(robot, tilted, steps=8)
+    assert not along.u[:, 3:].any()
+    mixed = fflin.linearize_orbit(cubesat.replace(inputs=[*wheels, *RODS]), steps=8)
+    assert not mixed.u[:, 3:].any()

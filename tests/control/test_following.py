@@ -357,3 +357,12 @@ def test_a_planned_slew_with_spinning_wheels_is_followed_and_held():
     )
     assert motion.attitude_error.max() < 0.02
     assert motion.attitude_error[-1] < 1e-3
+
+
+def test_a_law_about_a_point_does_not_follow_a_periodic_trajectory():
+    robot = fflin.load("cubesat", inputs=[fflin.BaseTorque()], orbit=600e3)
+    model = fflin.linearize(robot).discretize(10.0)
+    law = fflin.StateFeedback(model, np.zeros((3, 12)))
+    along = fflin.linearize_orbit(robot, steps=8)
+    with pytest.raises(fflin.InputError, match="follows needs a trajectory that ends"):
+        law.follow(along)

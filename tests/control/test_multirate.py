@@ -404,3 +404,22 @@ def test_the_filter_is_consistent(samples):
             if name.startswith("bias."):
                 inside = np.abs(errors[:, index]) < 1.96 * size[index]
                 assert 0.93 < inside.mean() < 0.97
+
+
+def test_designs_for_other_sensors_are_refused(tmp_path):
+    _, lin, compensator = designed()
+    law = fflin.MultirateFeedback(lin, compensator)
+    other, _ = satellite(sensors(sample=0.5))
+    with pytest.raises(fflin.InputError, match="other sampling times or delays"):
+        law.bind(other)
+    with pytest.warns(fflin.FflinWarning, match="does not contain the sampling times"):
+        lin.save(tmp_path / "model.npz")
+
+
+def test_filters_along_trajectories_refuse_slow_sensors():
+    robot, _ = satellite()
+    rest = np.tile(robot.neutral(), (3, 1)), np.zeros((3, robot.nv)), np.zeros((3, 3))
+    motion = fflin.Trajectory(robot, [0.0, 0.5, 1.0], *rest)
+    along = fflin.linearize_trajectory(robot, motion)
+    with pytest.raises(fflin.InputError, match="tvkalman measures all outputs every"):
+        fflin.tvkalman(along, 1e-8, 1e-8, sample=0.05)

@@ -232,3 +232,14 @@ def test_a_file_keeps_a_periodic_schedule(schedule, along, tmp_path):
     with pytest.raises(fflin.InputError, match="another orbit"):
         back.trajectory(other)
     assert block_diag(schedule.Q, schedule.R).shape == (18, 18)
+
+
+def test_weights_that_leave_an_unstable_motion_are_refused():
+    """Without weights, the minimal solution of the Riccati equation is zero."""
+    orbit = fflin.EllipticOrbit(perigee=500e3, apogee=1900e3)
+    robot = fflin.load("cubesat", inputs=[fflin.BaseTorque()], orbit=orbit)
+    along = fflin.linearize_orbit(robot, steps=24)
+    with pytest.raises(fflin.StabilizabilityError, match="not weight an unstable"):
+        fflin.tvlqr(
+            along, np.zeros((12, 12)), 1e8, "periodic", sample=orbit.period / 60
+        )

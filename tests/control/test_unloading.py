@@ -1,5 +1,7 @@
 """Unloading of wheels by external torques, beside laws with integrals, filters and delays."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -254,3 +256,13 @@ def test_laws_and_robots_that_cannot_unload_are_refused():
     mixed = fflin.StateFeedback(late, fflin.lqr(late))
     with pytest.raises(fflin.InputError, match="expected one delay of all inputs"):
         fflin.unload_wheels(mixed, design, RATE)
+    slow = [replace(wheel, lag=0.5) for wheel in alone.inputs]
+    lagging = alone.replace(inputs=slow)
+    aware = fflin.linearize(lagging).with_lags().discretize(SAMPLE)
+    with pytest.raises(fflin.InputError, match="model of the law contains lags"):
+        fflin.unload_wheels(fflin.StateFeedback(aware, fflin.lqr(aware)), design, RATE)
+    unaware = fflin.linearize(lagging).discretize(SAMPLE)
+    law = fflin.StateFeedback(unaware, fflin.lqr(unaware))
+    torque = lagging.replace(inputs=[fflin.BaseTorque(), *slow])
+    with pytest.raises(fflin.InputError, match="expected one lag of all inputs"):
+        fflin.unload_wheels(law, torque, RATE)

@@ -184,3 +184,16 @@ def test_gravity_gradient_turns_a_body_at_perigee_by_the_closed_form():
     expected = np.linalg.solve(I, torque - np.cross(spin, I @ spin))
     expected -= now.rate_change * z
     assert np.allclose(lin.f0[6:9], expected, rtol=0.0, atol=1e-14)
+
+
+def test_constrained_robots_have_models_at_a_time_but_not_over_an_orbit():
+    orbit = fflin.EllipticOrbit(perigee=500e3, apogee=1900e3)
+    weld = fflin.Weld("tool_left", "tool_right")
+    robot = fflin.load("dual_arm", constraints=[weld], orbit=orbit)
+    q = fflin.closed(robot, robot.neutral())
+    lin = fflin.linearize(robot, q, t=100.0)
+    assert lin.t == 100.0
+    with pytest.raises(fflin.InputError, match="does not depend on time"):
+        fflin.lqr(lin)
+    with pytest.raises(fflin.InputError, match="over an orbit do not support constr"):
+        fflin.linearize_orbit(robot, q)

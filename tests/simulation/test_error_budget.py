@@ -395,3 +395,18 @@ def test_an_amplitude_may_be_a_vector_with_one_phase():
     for wrong in (1.0, (1.0, 2.0, 3.0), ((1.0, 2.0), 0.1)):
         with pytest.raises(InputError, match="periodic 'tau_b'"):
             fflin.error_budget(gain, lin, periodic={"tau_b": wrong})
+
+
+def test_a_budget_warns_of_plates_and_refuses_elliptic_orbits():
+    robot = fflin.load("cubesat", inputs=[fflin.BaseTorque()], orbit=600e3)
+    model = fflin.linearize(robot).discretize(10.0)
+    gain = fflin.lqr(model, {"q_b": 1.0, "omega_b": 1.0}, 1e6)
+    law = fflin.StateFeedback(model, gain)
+    plate = {"area": 0.1, "normal": (1, 0, 0), "density": 1e-11}
+    lit = robot.replace(disturbance={"plate": [plate]})
+    causes = {"disturbance": {"tau_b.x": 1e-6}}
+    with pytest.warns(fflin.FflinWarning, match="flat plates"):
+        fflin.error_budget(law, model, robot=lit, **causes)
+    elliptic = robot.replace(orbit=fflin.EllipticOrbit(perigee=500e3, apogee=900e3))
+    with pytest.raises(fflin.InputError, match="error budgets do not support elliptic"):
+        fflin.error_budget(law, model, robot=elliptic, **causes)
