@@ -195,5 +195,5 @@ def test_constrained_robots_have_models_at_a_time_but_not_over_an_orbit():
     assert lin.t == 100.0
     with pytest.raises(fflin.InputError, match="does not depend on time"):
         fflin.lqr(lin)
-    with pytest.raises(fflin.InputError, match="over an orbit do not support constr"):
+    with pytest.raises(fflin.InputError, match="over one orbit do not support constr"):
         fflin.linearize_orbit(robot, q)

@@ -39,7 +39,9 @@ def test_invalid_text_gives_an_error_with_a_valid_example():
         parse_output("base:tool")
     with pytest.raises(fflin.UnknownNameError, match="'momentm'"):
         parse_output("momentm")
-    with pytest.raises(fflin.UnknownNameError, match="state, base, star_tracker, joints"):
+    with pytest.raises(
+        fflin.UnknownNameError, match="state, base, star_tracker, joints"
+    ):
         parse_output("")
 
 
