@@ -511,7 +511,7 @@ def _check_field(field: object, body: str) -> None:
     """Raise `InputError` if a magnetic field is neither known nor a function nor None."""
     if field is None or callable(field):
         return
-    if field != "dipole":
+    if not isinstance(field, str) or field != "dipole":
         raise InputError(
             f"field is {field!r}, expected 'dipole' or a function of time [s] and position [m] "
             "that returns the flux density (3,) [T]"

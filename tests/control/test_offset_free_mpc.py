@@ -112,7 +112,7 @@ def test_estimators_that_do_not_fit_are_refused(satellite, designs):
 def test_a_model_with_delayed_inputs_is_refused(designs):
     """The prediction would leave the delay out without a message."""
     lin, _, _ = designs
-    with pytest.raises(fflin.InputError, match="delayed inputs"):
+    with pytest.raises(fflin.InputError, match="delays or lags"):
         fflin.mpc(lin.discretize(SAMPLE, delay=0.1), horizon=5)
 
 
