@@ -105,7 +105,7 @@ def linearize_orbit(
         )
     assert robot.orbit is not None
     refuse_constraints(robot, "linear models over one orbit")
-    if motion not in ("held", "free"):
+    if not isinstance(motion, str) or motion not in ("held", "free"):
         raise InputError(f"motion is {motion!r}, expected 'held' or 'free'")
     steps = count("steps", steps, 8)
     times = np.linspace(0.0, robot.orbit.period, steps + 1)

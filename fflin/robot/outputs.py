@@ -421,10 +421,10 @@ class ConstraintForce(Output):
     components: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
-        if isinstance(self.components, str):
+        given = self.components
+        if given is not None and not isinstance(given, tuple | list):
             raise InputError(
-                f"components is {self.components!r}, expected a tuple of names: write "
-                f"({self.components!r},)"
+                f"components is {given!r}, expected a tuple of names such as ('force.x',)"
             )
         require_known("component of a constraint force", self.chosen, FORCES)
 
