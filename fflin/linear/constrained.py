@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from scipy.linalg import qr
 
 from fflin.base.errors import ConstraintError, InputError, listed
 from fflin.base.names import matching
@@ -139,6 +138,8 @@ class Reducer:
         `positions` and `rates` (6 + n, d) are the motions of unit kinetic energy, and `size` is
         the square root of the inertia of each coordinate.
         """
+        from scipy.linalg import qr
+
         count = positions.shape[1]
         weighted = size[:, None] * rates
         if self._picked is None and self.given is None:

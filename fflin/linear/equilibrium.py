@@ -174,11 +174,10 @@ def equilibrium(
         Whether the base may be tilted under gravity, by less than 90 deg. A base that moves is
         never tilted.
     disturbed : bool
-        Whether the inputs also balance the constant part of `Robot.disturbance`, and its flat
-            plates at t = 0. Such inputs show
-        what the actuators must hold. By default, the inputs are the inputs of a control law, which
-        does not know the disturbance; a linear model does not contain it either. Inertial axes are
-        those at t = 0.
+        Whether the inputs also balance the constant part of `Robot.disturbance`, and the forces of
+        its flat plates at t = 0. Such inputs show what the actuators must hold. By default, the
+        inputs are the inputs of a control law, which does not know the disturbance; a linear model
+        does not contain it either. Inertial axes are those at t = 0.
 
     Returns
     -------

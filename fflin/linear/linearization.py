@@ -534,32 +534,26 @@ def linearize(
         Axes of the base's velocities and wrenches, see `StateMap`; by default
         "hybrid", or "lvlh" if the robot is in orbit.
     reference : pin.SE3, optional
-        Pose relative to which the attitude and position of the base are measured. The
-        default is the base pose at the operating point, or the orbital frame if the
-        robot is in orbit.
+        Pose relative to which the base is measured: by default the base pose at the
+        operating point, or the orbital frame if the robot is in orbit.
     moving : bool
-        Whether to return the error dynamics about a reference that moves through the
-        operating point; see `Linearizer`.
+        Whether to return error dynamics about a moving reference; see `Linearizer`.
     independent : sequence of str, optional
-        Coordinates of the model of a robot with constraints, such as joint names; see
-        `Linearizer`.
+        Coordinates of the model of a robot with constraints, see `Linearizer`.
     t : float
-        Time [s] for which the model holds, if the orbit of the robot is elliptic or an input is
-        a magnetorquer.
+        Time [s] of the model, in an elliptic orbit or with magnetorquers.
 
     Returns
     -------
     LinearModel
-        Linear model, with the equations in `Linearizer`. To linearise about many
-        operating points, use `Linearizer`.
+        Model with the equations in `Linearizer`, which is faster for many points.
 
     Raises
     ------
     InputError
         If an argument has a wrong size or value.
     ConstraintError
-        If the constraints of the robot are not closed at q, v violates them, or the rank of the
-        constraints changes near q.
+        If q or v violates the constraints, or the rank of these changes near q.
     ChartError
         If the base is rotated by 180 deg from the reference.
     SingularInertiaError
@@ -573,8 +567,6 @@ def linearize(
     >>> lin = fflin.linearize(robot, fflin.configuration(robot, {"joint_2": 0.4}))
     >>> lin.A.shape, lin.B.shape
     ((18, 18), (18, 9))
-    >>> lin.is_equilibrium(1e-9)
-    True
     """
     linearizer = Linearizer(
         robot, frame=frame, reference=reference, moving=moving, independent=independent
