@@ -325,7 +325,9 @@ class Linearizer:
     ) -> LinearModel:
         """Linearise about a point; see `linearize` for the arguments and errors."""
         robot = self.robot
-        t = number("t", t)
+        # The default time needs no check, which would take long compared with a model at rest.
+        if t.__class__ is not float or t != 0.0:
+            t = number("t", t)
         q = robot.neutral() if q is None else robot.checked_configuration(q).copy()
         known = v is None and u is None and self._known
         still_v, still_u = self._still
@@ -335,7 +337,6 @@ class Linearizer:
             if u is None
             else vector("u", u, len(still_u), "the robot's inputs").copy()
         )
-        _require_no_moment(self.prepared.actuation, u)
         with self._lock:
             if known:
                 B = np.zeros(self._shape_B)
@@ -343,6 +344,7 @@ class Linearizer:
                 B.setflags(write=False)
                 q.setflags(write=False)
                 return LinearModel(self._fields, B=B, q=q)
+            _require_no_moment(self.prepared.actuation, u)
             if self._closure is not None:
                 q = self._closure.configuration(q)
                 v = self._closure.velocity(q, v)
