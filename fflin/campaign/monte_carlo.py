@@ -162,7 +162,7 @@ def monte_carlo(
         File to write, .h5 or .npz. The unfinished results of a .h5 file are kept in NAME.part.
         After a crash, the same call resumes from the intact chunks in NAME.part. If the file
         already contains all of these runs, it is read and nothing is simulated, even if its goals
-        differ.
+        differ. With `until`, a complete file is not read, and the runs are simulated again.
     overwrite : bool
         Whether to replace the file `out` if a call with different arguments wrote it. By default,
         such a file is not replaced, and a `FileError` is raised.

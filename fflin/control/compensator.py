@@ -9,9 +9,8 @@ import numpy as np
 from fflin.base import html
 from fflin.base.tables import folded
 from fflin.base.validation import Array, Poles, Vector
-from fflin.control.estimator import BIAS, DISTURBANCE, added_notes, names_of, time_of
+from fflin.control.estimator import EstimatingDesign, added_notes, time_of
 from fflin.control.gain import (
-    ModelDesign,
     folded_poles,
     poles_figure,
     summary_of_poles,
@@ -21,7 +20,7 @@ from fflin.linear.model import ControlSystem, state_space
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Compensator(ModelDesign):
+class Compensator(EstimatingDesign):
     r"""Output-feedback compensator ``d(z)/dt = A z + B (y - y0)``, ``u - u0 = C z``.
 
     For a sampled model, ``A z + B (y - y0)`` is the value of z at the next sample. The state z is
@@ -68,16 +67,6 @@ class Compensator(ModelDesign):
     # Files of earlier versions do not contain E.
     E: Array = field(default_factory=lambda: np.zeros((0, 0)))
     slow_bias: str = ""
-
-    @property
-    def disturbances(self) -> tuple[str, ...]:
-        """Names of the states that are estimated disturbances."""
-        return names_of(DISTURBANCE, self.state_names)
-
-    @property
-    def biases(self) -> tuple[str, ...]:
-        """Names of the states that are estimated biases of outputs."""
-        return names_of(BIAS, self.state_names)
 
     def _report(self) -> str:
         """Return the report with the sizes and the poles of the closed loop."""

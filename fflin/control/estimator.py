@@ -25,7 +25,22 @@ DISTURBANCE, BIAS = "disturbance.", "bias."
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Estimator(ModelDesign):
+class EstimatingDesign(ModelDesign):
+    """Design whose states may contain estimates of disturbances and biases."""
+
+    @property
+    def disturbances(self) -> tuple[str, ...]:
+        """Names of the states that are estimated disturbances."""
+        return names_of(DISTURBANCE, self.state_names)
+
+    @property
+    def biases(self) -> tuple[str, ...]:
+        """Names of the states that are estimated biases of outputs."""
+        return names_of(BIAS, self.state_names)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Estimator(EstimatingDesign):
     r"""Steady-state Kalman filter for the deviations of the state from the operating point.
 
     With u and y as deviations from u0 and y0, the estimate xh of x - x0 follows
@@ -90,16 +105,6 @@ class Estimator(ModelDesign):
     y0: Vector
     output_names: tuple[str, ...]
     estimated: tuple[str, ...]
-
-    @property
-    def disturbances(self) -> tuple[str, ...]:
-        """Names of the states that are estimated disturbances."""
-        return names_of(DISTURBANCE, self.state_names)
-
-    @property
-    def biases(self) -> tuple[str, ...]:
-        """Names of the states that are estimated biases of outputs."""
-        return names_of(BIAS, self.state_names)
 
     def _report(self) -> str:
         """Return the report with the poles and the states that are not estimated."""

@@ -10,9 +10,9 @@ from scipy.linalg import block_diag
 from fflin.base import html
 from fflin.base.tables import folded, grid
 from fflin.base.validation import Array, Mask, Poles, Vector
-from fflin.control.estimator import BIAS, DISTURBANCE, added_notes, names_of
+from fflin.control.estimator import EstimatingDesign, added_notes
 from fflin.control.filter_problem import FilterProblem
-from fflin.control.gain import ModelDesign, summary_of_poles
+from fflin.control.gain import summary_of_poles
 from fflin.control.optimal.periodic_filter import PeriodicSolution, periodic_filter
 from fflin.control.sensors import SensorTiming
 
@@ -26,7 +26,7 @@ class _PeriodPoles:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class _Periodic(ModelDesign):
+class _Periodic(EstimatingDesign):
     """Design with matrices for each of the N samples of a period."""
 
     poles: Poles
@@ -41,16 +41,6 @@ class _Periodic(ModelDesign):
     def period(self) -> float:
         """Time [s] after which the matrices repeat."""
         return self.samples * self.dt
-
-    @property
-    def disturbances(self) -> tuple[str, ...]:
-        """Names of the states that are estimated disturbances."""
-        return names_of(DISTURBANCE, self.state_names)
-
-    @property
-    def biases(self) -> tuple[str, ...]:
-        """Names of the states that are estimated biases of outputs."""
-        return names_of(BIAS, self.state_names)
 
     def _summary(self) -> str:
         """Return the number of poles and the slowest decay."""

@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import KW_ONLY, asdict, dataclass, fields
 from functools import lru_cache
-from typing import Any, ClassVar, NamedTuple, TypeAlias
+from typing import Any, ClassVar, NamedTuple, TypeAlias, TypeVar
 
 from fflin.base.errors import FflinWarning, InputError, require_known
 from fflin.base.validation import (
@@ -191,14 +191,7 @@ class CircularOrbit:
     @classmethod
     def from_json(cls, text: str) -> CircularOrbit:
         """Return the orbit from the JSON text of `to_json`, with bit-for-bit equal values."""
-        try:
-            parts = json.loads(text)
-            n = parts.pop("mean_motion")
-            orbit = cls(**parts)
-        except (AttributeError, KeyError, TypeError, json.JSONDecodeError):
-            raise InputError(f"{text!r} is not the JSON text of an orbit") from None
-        object.__setattr__(orbit, "mean_motion", positive("mean_motion", n))
-        return orbit
+        return _restored(cls, text, "mean_motion")
 
     def __str__(self) -> str:
         return (
@@ -409,14 +402,7 @@ class EllipticOrbit:
     @classmethod
     def from_json(cls, text: str) -> EllipticOrbit:
         """Return the orbit from the JSON text of `to_json`, with bit-for-bit equal values."""
-        try:
-            parts = json.loads(text)
-            apogee = parts.pop("apogee")
-            orbit = cls(**parts)
-        except (AttributeError, KeyError, TypeError, json.JSONDecodeError):
-            raise InputError(f"{text!r} is not the JSON text of an orbit") from None
-        object.__setattr__(orbit, "apogee", positive("apogee", apogee))
-        return orbit
+        return _restored(cls, text, "apogee")
 
     def __str__(self) -> str:
         return (
@@ -428,6 +414,22 @@ class EllipticOrbit:
 
 
 Orbit: TypeAlias = CircularOrbit | EllipticOrbit
+_Kind = TypeVar("_Kind", CircularOrbit, EllipticOrbit)
+
+
+def _restored(kind: type[_Kind], text: str, derived: str) -> _Kind:
+    """Return the orbit from its JSON text, with its own value of the field `derived`.
+
+    The constructor computes this field from the others, with a rounding error.
+    """
+    try:
+        parts = json.loads(text)
+        value = parts.pop(derived)
+        orbit = kind(**parts)
+    except (AttributeError, KeyError, TypeError, json.JSONDecodeError):
+        raise InputError(f"{text!r} is not the JSON text of an orbit") from None
+    object.__setattr__(orbit, derived, positive(derived, value))
+    return orbit
 
 
 def _require_ellipse(e: float) -> None:
