@@ -2,11 +2,12 @@
 
 Sphinx runs a page only if its source changed since the last build. A cell that shows an HTML page
 of fflin contains this page in its output. In the site, each such HTML page is a file of its own,
-which the browser loads when the reader scrolls to it.
+which the browser loads when the reader scrolls to it. All of them share one file with the viewer.
 """
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import subprocess
@@ -169,6 +170,37 @@ def write_hero(app: Sphinx, error: Exception | None) -> None:
     target.write_text(text.replace("</body>", _HERO), "utf-8")
 
 
+_VIEWER = re.compile(r'<script type="text/plain" id="meshcat">(.*?)</script>', re.DOTALL)
+# Puts the viewer, as text, in the place of the script that loads it.
+_SHARED = """(() => {{
+  const viewer = document.createElement("script");
+  viewer.type = "text/plain";
+  viewer.id = "meshcat";
+  viewer.textContent = {text};
+  document.currentScript.replaceWith(viewer);
+}})();
+"""
+
+
+def share_viewer(app: Sphinx, error: Exception | None) -> None:
+    """Write the viewer, most of each HTML page of a scene, to one file that all pages load."""
+    folder = Path(app.outdir) / "pages"
+    target = folder / "viewer.js"
+    for file in folder.rglob("*.html"):
+        page = file.read_text("utf-8")
+        found = _VIEWER.search(page)
+        if found is None:
+            continue
+        text = _SHARED.format(text=json.dumps(found[1]))
+        if not target.exists() or target.read_text("utf-8") != text:
+            target.write_text(text, "utf-8")
+        up = "../" * len(file.parent.relative_to(folder).parts)
+        page = page.replace(found[0], f'<script src="{up}viewer.js"></script>')
+        # "file:" is the address of a site that is read from disk.
+        page = page.replace("script-src ", "script-src 'self' file: ", 1)
+        file.write_text(page, "utf-8")
+
+
 def setup(app: Sphinx) -> dict[str, Any]:
     """Register with Sphinx."""
     # Read and write pages on all cores, without -j auto: running the tutorials takes longest.
@@ -185,4 +217,5 @@ def setup(app: Sphinx) -> dict[str, Any]:
     app.connect("html-page-context", name_figures)
     app.connect("build-finished", remove_strays)
     app.connect("build-finished", write_hero)
+    app.connect("build-finished", share_viewer, priority=900)  # after all pages are written
     return {"version": "1", "parallel_read_safe": True, "parallel_write_safe": True}
