@@ -24,7 +24,7 @@ _SILENT, _NEAR = 1e-9, 1e-6
 
 # Newton's method: residual [m, rad] at which q counts as closed from the start, step at which the
 # iteration ends, and largest residual at its end per metre of distance from the world's origin.
-_CLOSED, _ARRIVED, _LEFT = 1e-13, 1e-11, 1e-11
+CLOSED, _ARRIVED, _LEFT = 1e-13, 1e-11, 1e-11
 
 # Relative singular values of J, with rows and columns in comparable units. Values above _REGULAR
 # count for the rank, and values below _ZERO are rounding errors. A value between them means that
@@ -138,10 +138,10 @@ class Closure:
         start, at = q, q
         fixed = np.zeros(6 + self.state.robot.n, dtype=bool)
         size = np.sqrt(self._inertia(q).diagonal())
-        row_scale = self._row_scale(q)
+        row_scale, _ = self.scales(q)
         for _ in range(_STEPS):
             residual = self.constraints.residual(at)
-            if np.abs(residual).max() <= _CLOSED:
+            if np.abs(residual).max() <= CLOSED:
                 return at
             columns = np.where(fixed, 0.0, 1.0 / size)
             J = self.state.columns(self.constraints.jacobian(at))
@@ -188,22 +188,22 @@ class Closure:
     def _inertia(self, q: Array) -> Array:
         return self.state.project(pin.crba(self._model, self._data, q).T)
 
-    def _row_scale(self, q: Array) -> Array:
-        """Return the scale (rows,) of the rows: 1 for lengths, radius of gyration for angles."""
-        M = self._inertia(q)
-        mass = float(np.mean(M.diagonal()[3:6]))
-        radius = float(np.sqrt(np.mean(M.diagonal()[:3]) / mass))
-        pairs = self.constraints.pairs
-        is_angular = [pair.selected[:, 3:].any(axis=1) for pair in pairs]
-        return np.where(np.concatenate(is_angular), radius, 1.0)
+    def scales(self, q: Array) -> tuple[Array, Array]:
+        """Return the scales of the rows (rows,) and columns (6 + n,) of J to comparable units.
+
+        The scale of a row is 1 for lengths, and the radius of gyration for angles. In the scaled
+        columns, all coordinates have the inertia of the whole robot.
+        """
+        inertia = self._inertia(q).diagonal()
+        mass = float(inertia[3:6].mean())
+        radius = float(np.sqrt(inertia[:3].mean() / mass))
+        rows = np.where(self.constraints.angular, radius, 1.0)
+        return rows, np.sqrt(mass / inertia)
 
     def tangent(self, q: Array) -> TangentSpace:
         """Return the tangent space at a closed q (nq,); raise an error for a singular posture."""
         J = self.state.columns(self.constraints.jacobian(q))
-        M = self._inertia(q)
-        mass = float(np.mean(M.diagonal()[3:6]))
-        columns = np.sqrt(mass / M.diagonal())
-        row_scale = self._row_scale(q)
+        row_scale, columns = self.scales(q)
         U, sizes, Vt = np.linalg.svd(row_scale[:, None] * J * columns)
         relative = sizes / max(sizes[0], _LEAST)
         rank = int(np.count_nonzero(relative > _REGULAR))

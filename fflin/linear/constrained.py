@@ -18,7 +18,7 @@ import pinocchio as pin
 from fflin.base.errors import ConstraintError, InputError, listed
 from fflin.base.names import matching
 from fflin.base.rotation import skew
-from fflin.base.validation import Array, frozen
+from fflin.base.validation import Array, Indices, frozen
 from fflin.dynamics.closure import Closure, TangentSpace
 from fflin.dynamics.coordinates import ANGULAR, LINEAR, Chart
 from fflin.dynamics.state import StateMap
@@ -47,7 +47,7 @@ class Reduction:
         Inertia of the independent coordinates.
     """
 
-    kept: Array
+    kept: Indices
     T: Array
     M: Array
 
@@ -71,7 +71,7 @@ class Reducer:
         self.given = None if independent is None else tuple(independent)
         self._state = closure.state
         self._moving = moving
-        self._picked: Array | None = None
+        self._picked: Indices | None = None
         self._data = closure.state.robot.create_data()
 
     @property
@@ -132,7 +132,7 @@ class Reducer:
         solved: Array = np.linalg.pinv(space.rows) @ space.selected @ by_q
         return solved
 
-    def _independent(self, size: Array, positions: Array, rates: Array) -> Array:
+    def _independent(self, size: Array, positions: Array, rates: Array) -> Indices:
         """Return the indices (d,) of the independent coordinates.
 
         `positions` and `rates` (6 + n, d) are the motions of unit kinetic energy, and `size` is
@@ -166,7 +166,7 @@ class Reducer:
             )
         return picked
 
-    def _named(self, count: int) -> Array:
+    def _named(self, count: int) -> Indices:
         """Return the indices of the coordinates that the user named."""
         state = self._state
         names = state.names[: state.nx // 2]
