@@ -12,7 +12,7 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import ConstraintError, FflinWarning, InputError, listed
-from fflin.base.validation import Array, ArrayLike, instance
+from fflin.base.validation import Array, ArrayLike, Indices, instance
 from fflin.dynamics.constraints import Constraints
 from fflin.dynamics.state import StateMap
 from fflin.robot.fields import travel_of
@@ -36,6 +36,8 @@ _LEAST = 1e-3
 # A rank is constant nearby if no motion on the manifold accelerates redundant rows by more than
 # this fraction of the motion's own accelerations.
 _CONSTANT = 1e-7
+
+_NONE: Indices = np.zeros(0, dtype=np.intp)
 
 # Newton's method: largest number of steps, and largest step [rad] of a rotation.
 _STEPS, _LONGEST = 100, 0.5
@@ -132,11 +134,15 @@ class Closure:
         pair = next(x for x in pairs if x.rows.start <= index < x.rows.stop)
         return pair.constraint.title
 
-    def nearest(self, q: Array) -> Array:
-        """Return the closed configuration nearest to q (nq,), within the joint limits."""
+    def nearest(self, q: Array, kept: Indices = _NONE) -> Array:
+        """Return the closed configuration nearest to q (nq,), within the joint limits.
+
+        The coordinates with the indices `kept` do not change.
+        """
         low, high = self._travel(q)
         start, at = q, q
         fixed = np.zeros(6 + self.state.robot.n, dtype=bool)
+        fixed[kept] = True
         size = np.sqrt(self._inertia(q).diagonal())
         row_scale, _ = self.scales(q)
         for _ in range(_STEPS):

@@ -81,6 +81,14 @@ class Reducer:
             return self.given
         return tuple(self._state.names[index] for index in self._picked)
 
+    @property
+    def names(self) -> dict[str, tuple[str, ...]]:
+        """Names and units of the independent states, and names of the others, once chosen."""
+        state, picked = self._state, self._picked
+        assert picked is not None
+        kept = [*picked, *(picked + state.nx // 2)]
+        return _state_names(state, kept)
+
     def reduction(
         self, chart: Chart, q: Array, v: Array, nu: Array, space: TangentSpace
     ) -> Reduction:
@@ -186,8 +194,6 @@ def reduced_fields(
 ) -> dict[str, Any]:
     """Return the fields of a model in the independent states from the model in all states."""
     kept, T = reduction.kept, reduction.T
-    names = [state.names[i] for i in kept]
-    chosen = set(names)
     arrays = {
         "A": whole.A[kept] @ T,
         "B": whole.B[kept],
@@ -202,6 +208,17 @@ def reduced_fields(
         arrays["drift"] = whole.drift[kept]
     return {
         **{key: frozen(array) for key, array in arrays.items()},
+        **_state_names(state, kept),
+    }
+
+
+def _state_names(
+    state: StateMap, kept: Sequence[int] | Indices
+) -> dict[str, tuple[str, ...]]:
+    """Return the names of states that are in the model and of states that are not."""
+    names = [state.names[i] for i in kept]
+    chosen = set(names)
+    return {
         "state_names": tuple(names),
         "state_units": tuple(state.units[i] for i in kept),
         "dependent": tuple(name for name in state.names if name not in chosen),

@@ -34,9 +34,6 @@ from fflin.robot.robot import Robot
 # values, the computation of eigenvalues would overflow.
 LARGEST = 1e200
 
-# Fields with the names of the states in models of robots with constraints.
-_NAMES = ("state_names", "state_units", "dependent")
-
 _REFERENCE_CHART: Chart = ReferenceChart()
 
 
@@ -363,6 +360,25 @@ class Linearizer:
             with np.errstate(over="ignore", invalid="ignore"):
                 return self._anywhere(q, v, u, t)
 
+    @property
+    def constrained(self) -> bool:
+        """Whether the robot has constraints."""
+        return self._closure is not None
+
+    @property
+    def independent(self) -> tuple[str, ...]:
+        """Independent coordinates of a robot with constraints, once they are chosen."""
+        if self._reducer is None:
+            return ()
+        return self._reducer.independent or ()
+
+    @property
+    def constrained_names(self) -> dict[str, tuple[str, ...]]:
+        """Names and units of the states of a robot with constraints; empty without constraints."""
+        if self._reducer is None:
+            return {}
+        return self._reducer.names
+
     def write_by_u(self, q: Array, out: Array) -> None:
         """Write the lower half of B (6 + n, nu) about a valid q at rest; see `Prepared.free`."""
         inertia = self._accelerations.inertia
@@ -439,8 +455,7 @@ class Linearizer:
             reduction = self._reducer.reduction(chart, q, v, nu, contact.space)
             fields = reduced_fields(state, reduction, whole)
             if self._rest is not None and self._rest.waits:
-                names = {key: fields[key] for key in _NAMES}
-                self._rest.choose(reduction.kept, q, self._fields | names)
+                self._rest.choose(reduction.kept, q, self._fields | self._reducer.names)
             return LinearModel(
                 {**self._fields, "_computed": {}, **made, **fields}
                 | {"_inertia": partial(given, frozen(reduction.M))},
