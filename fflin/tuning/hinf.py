@@ -377,9 +377,7 @@ def _controller(
     A, B, C, D, y_sizes, u_sizes = prepared
     nu, ny = len(u_sizes), len(y_sizes)
     try:
-        design = _slycot().sb10fd(
-            len(A), B.shape[1], len(C), nu, ny, level, A, B, C, D
-        )
+        design = _slycot().sb10fd(len(A), B.shape[1], len(C), nu, ny, level, A, B, C, D)
     except ArithmeticError:
         return None
     Ak, Bk, Ck, Dk = design[:4]
