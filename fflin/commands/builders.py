@@ -513,7 +513,7 @@ def budget_of(
     arguments: Namespace,
 ) -> fflin.ErrorBudget:
     """Return the error budget of a simulated loop."""
-    if policy is None or policy.model is None or policy.linear_law() is None:
+    if policy is None or policy.model is None or not policy.laws_of_period():
         raise InputError(
             "--budget needs a linear regulator about a point; remove --budget, or the options for "
             "MPC, trajectories or --free"
