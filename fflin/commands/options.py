@@ -197,8 +197,8 @@ ABOUT: dict[str, str] = {
     "weld": "weld a frame to the frame TO or, without TO, to inertial space, in the pose that they "
     "have at the operating point. The welds are added to the constraints in robot.toml",
     "independent": "coordinate that the linear model of a robot with constraints keeps. NAME is a "
-    "coordinate, a group or a pattern, such as q_b or left_1; repeat the option for each. By default, "
-    "the coordinates are chosen automatically",
+    "coordinate, a group or a pattern, such as q_b or left_1; repeat the option for each. By "
+    "default, the coordinates are chosen automatically",
     "xacro": "value of an argument of a xacro file",
     "orbit": "circular orbit at an altitude [m], or elliptic orbit with the heights [m] of perigee "
     "and apogee, above a central body: earth (default), moon, mars ... The world is then the "
