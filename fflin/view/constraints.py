@@ -116,9 +116,10 @@ def _pose(robot: Robot, data: pin.Data, name: str) -> pin.SE3:
 
 def _axes(robot: Robot, data: pin.Data, item: Constraint) -> Array:
     """Return the axes (3, 3), in the world, in which the force of a constraint is given."""
-    placement = item.placement
-    if placement is None:
-        return _pose(robot, data, item.frame).rotation
-    if item.to is None:
-        return placement.rotation
-    return (_pose(robot, data, item.to) * placement).rotation
+    pose = item.placement
+    if pose is None:
+        pose = _pose(robot, data, item.frame)
+    elif item.to is not None:
+        pose = _pose(robot, data, item.to) * pose
+    rotation: Array = pose.rotation
+    return rotation
