@@ -116,6 +116,13 @@ def load_robot(arguments: Namespace) -> fflin.Robot:
     if welds := getattr(arguments, "weld", None):
         added = [fflin.Weld(frame, to) for frame, to in welds]
         given["constraints"] = [*robot.constraints, *added]
+    if independent := getattr(arguments, "independent", None):
+        if not given.get("constraints", robot.constraints):
+            raise InputError(
+                f"--independent needs constraints, but '{robot.name}' has none; add --weld, or "
+                "remove --independent"
+            )
+        given["independent"] = independent
     return robot.merged(given)
 
 
