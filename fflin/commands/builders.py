@@ -120,6 +120,13 @@ def load_robot(arguments: Namespace) -> fflin.Robot:
     if welds := getattr(arguments, "weld", None):
         added = [fflin.Weld(frame, to) for frame, to in welds]
         given["constraints"] = [*robot.constraints, *added]
+    if independent := getattr(arguments, "independent", None):
+        if not given.get("constraints", robot.constraints):
+            raise InputError(
+                f"--independent needs constraints, but '{robot.name}' has none; add --weld, or "
+                "remove --independent"
+            )
+        given["independent"] = independent
     robot = robot.merged(given)
     units = {
         joint.name: joint.unit
@@ -529,7 +536,7 @@ def budget_of(
     arguments: Namespace,
 ) -> fflin.ErrorBudget:
     """Return the error budget of a simulated loop."""
-    if policy is None or policy.model is None or policy.linear_law() is None:
+    if policy is None or policy.model is None or not policy.laws_of_period():
         raise InputError(
             "--budget needs a linear regulator about a point; remove --budget, or the options for "
             "MPC, trajectories or --free"

@@ -217,7 +217,7 @@ def _margins_of(policy: object, settings: Mapping[str, Any]) -> tuple[object, st
     from fflin.control.margins import margins_at_once
     from fflin.control.policy import Policy
 
-    if not isinstance(policy, Policy) or policy.linear_law() is None:
+    if not isinstance(policy, Policy) or not policy.laws_of_period():
         return None, ""
     margins = margins_at_once(policy, settings.get("delay"), settings.get("sample"))
     if margins is None:
