@@ -25,8 +25,6 @@ CALLS = {
     "capture of a payload": lambda robot, _: fflin.capture(
         fflin.load("planar_detumble"), "hand", robot
     ),
-    "effective_masses": lambda _, lin: fflin.effective_masses(lin),
-    "equilibrium": lambda robot, _: fflin.equilibrium(robot),
     "from_tool": lambda robot, lin: fflin.from_tool(robot, "drake", lin.q),
     "generalized_jacobian": lambda robot, _: fflin.generalized_jacobian(
         robot, frame="tool_left"
