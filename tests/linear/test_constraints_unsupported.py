@@ -33,9 +33,6 @@ CALLS = {
     "linearize_orbit": lambda robot, _: fflin.linearize_orbit(
         robot.replace(orbit=500e3)
     ),
-    "linearize_trajectory": lambda robot, lin: fflin.linearize_trajectory(
-        robot, [0.0, 1.0], [lin.q] * 2, [lin.v] * 2, [lin.u0] * 2
-    ),
     "plan": lambda robot, _: fflin.plan(robot, {}, duration=10.0),
     "relative_equilibria": lambda robot, _: fflin.relative_equilibria(robot),
     "sensitivity": lambda _, lin: fflin.sensitivity(lin),
