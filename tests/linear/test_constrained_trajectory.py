@@ -10,6 +10,9 @@ from tests.support.marks import exhaustive
 
 BENT = {"left_1": 0.4, "left_2": 0.7, "right_1": -0.3, "right_2": -0.6}
 
+# Weights on the 8 positions and on their rates: errors decay within about 0.1 s.
+STIFF = np.repeat((1e7, 1e4), 8)
+
 
 @pytest.fixture(scope="module")
 def loop():
@@ -47,26 +50,23 @@ def transition(along):
     return whole
 
 
-@pytest.mark.parametrize("columns", exhaustive((6,), (0, 7, 10, 15)))
-def test_the_transition_matrix_is_the_derivative_of_the_motion(loop, columns):
+@pytest.mark.parametrize("column", exhaustive(6, 0, 7, 10, 15))
+def test_the_transition_matrix_is_the_derivative_of_the_motion(loop, column):
     robot, motion, along = loop
     state = fflin.StateMap(robot, frame="local")
     picked = [state.names.index(name) for name in along.state_names]
     Phi = transition(along)
     step = 1e-4
-    for column in columns:
-        ends = []
-        for sign in (1.0, -1.0):
-            e = np.zeros(len(picked))
-            e[column] = sign * step
-            end = flown(robot, *displaced(robot, along, e))
-            error = moving_error(
-                state, motion.q[-1], motion.v[-1], end.q[-1], end.v[-1]
-            )
-            ends.append(error[picked])
-        difference = (ends[0] - ends[1]) / (2.0 * step)
-        size = np.abs(Phi[:, column]).max()
-        np.testing.assert_allclose(Phi[:, column], difference, atol=2e-6 * size)
+    ends = []
+    for sign in (1.0, -1.0):
+        e = np.zeros(len(picked))
+        e[column] = sign * step
+        end = flown(robot, *displaced(robot, along, e))
+        error = moving_error(state, motion.q[-1], motion.v[-1], end.q[-1], end.v[-1])
+        ends.append(error[picked])
+    difference = (ends[0] - ends[1]) / (2.0 * step)
+    size = np.abs(Phi[:, column]).max()
+    np.testing.assert_allclose(Phi[:, column], difference, atol=2e-6 * size)
 
 
 def test_the_knots_are_models_about_the_moving_reference(loop):
@@ -86,7 +86,7 @@ def test_the_knots_are_models_about_the_moving_reference(loop):
 def test_a_sampled_regulator_acts_as_the_linear_model_predicts(loop):
     """The initial error e is small, and the motion differs by the order of its square."""
     robot, motion, along = loop
-    schedule = fflin.tvlqr(along, 2000.0, 0.01, Qf=30.0, sample=0.1)
+    schedule = fflin.tvlqr(along, STIFF, 0.01, Qf=30.0, sample=0.1)
     policy = fflin.TrajectoryFeedback(motion.trajectory(), schedule)
     e = np.zeros(len(along.state_names))
     e[[0, 6]] = 2e-4, 3e-4
@@ -104,20 +104,11 @@ def test_a_sampled_regulator_acts_as_the_linear_model_predicts(loop):
 
 
 @pytest.mark.exhaustive
-def test_a_continuous_regulator_brings_a_closed_loop_back(loop):
-    robot, motion, along = loop
+def test_a_continuous_regulator_solves_its_riccati_equation(loop):
+    _, _, along = loop
     schedule = fflin.tvlqr(along, 2000.0, 0.01, Qf=30.0)
-    policy = fflin.TrajectoryFeedback(motion.trajectory(), schedule)
-    e = np.zeros(len(along.state_names))
-    e[[0, 6]] = 0.02, 0.03
-    start = displaced(robot, along, e)
-    state = fflin.StateMap(robot, frame="local")
-    errors = []
-    for law in (policy, None):
-        end = flown(robot, *start, law)
-        error = moving_error(state, motion.q[-1], motion.v[-1], end.q[-1], end.v[-1])
-        errors.append(np.linalg.norm(error[:14]))
-    assert errors[0] < 0.5 * errors[1]
+    assert schedule.residual < 1e-3
+    np.testing.assert_allclose(schedule.P[-1], 30.0 * np.eye(16), atol=1e-9)
 
 
 def test_the_default_regulator_holds_the_end(loop):
