@@ -291,6 +291,26 @@ def test_the_norm_of_a_sampled_design_is_that_of_the_sampled_loop(stiff):
     assert policy.gamma * 0.99 <= swept <= policy.gamma * (1.0 + 1e-6)
 
 
+def test_a_reduced_controller_keeps_the_goals_in_a_sweep(optimal):
+    reduced = optimal.reduced()
+    assert reduced.order < optimal.order and reduced.gamma <= 1.0
+    swept = norm_of_sweep(reduced, 1j * np.geomspace(1e-2, 10.0, 3000))
+    assert reduced.gamma * 0.99 <= swept <= reduced.gamma * (1.0 + 1e-6)
+    poles = np.sort(np.linalg.eigvals(reduced.loop).real)
+    assert poles[-7] < -1e-4
+
+
+def test_a_reduced_controller_may_have_a_given_order_or_norm(optimal):
+    near = optimal.reduced(below=1.01 * optimal.gamma)
+    assert near.order == 8 and near.gamma <= 1.01 * optimal.gamma
+    # Two of the ten states do not matter, so the norm of order 8 is that of full order.
+    assert optimal.reduced(8).gamma == pytest.approx(optimal.gamma, rel=1e-3)
+    with pytest.raises(fflin.InputError, match="order 0"):
+        optimal.reduced(0)
+    with pytest.raises(fflin.InputError, match="order"):
+        optimal.reduced(10)
+
+
 def test_hinf_is_no_worse_than_tune(optimal):
     law = fflin.PD("q_b", "tau_b", shared=True)
     tuned = fflin.tune(optimal.lin, law, FULL, starts=1, steps=15)
