@@ -159,7 +159,8 @@ _SATURATION = (
 
 # {option or ARGUMENT: help}. A key "COMMAND OPTION" applies to this command only.
 ABOUT: dict[str, str] = {
-    "ROBOT": "robot name listed by `fflin robots`, or path of a URDF or robot.toml",
+    "ROBOT": "robot name listed by `fflin robots`, or path of a URDF, an MJCF "
+    "file (.xml) or a robot.toml",
     "joint": "position of a joint [rad|m]. The default is the position in robot.toml or, if there "
     "is none, the neutral position",
     "rpy": "base attitude: roll, pitch, yaw [deg] about fixed axes",
