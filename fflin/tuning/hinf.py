@@ -80,6 +80,14 @@ class HInfinity(LinearController):
         self.gamma = gamma
         self.order = len(law.A)
 
+    def __repr__(self) -> str:
+        time = f"dt={self.dt:g} s" if self.dt else "continuous"
+        (nu, ny) = self.system.D.shape
+        return (
+            f"HInfinity('{self.lin.robot}', gamma={self.gamma:.4g}, order={self.order}, ny={ny}, "
+            f"nu={nu}, {time})"
+        )
+
 
 @in_one_thread
 def hinf(
