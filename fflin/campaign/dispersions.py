@@ -26,17 +26,25 @@ from fflin.campaign.spreads import SEED, SEEDS, Inverse, inverse_of
 from fflin.control.data_sheet import output_keys
 from fflin.control.policy import Command, Policy, bound
 from fflin.dynamics.coordinates import PIN_ANGULAR, PIN_LINEAR
+from fflin.dynamics.disturbance import Plate
 from fflin.dynamics.state import StateMap
 from fflin.kernel.forward import ActuatorFaults
 from fflin.kernel.tree import Tree, batch_tree
 from fflin.linear.model import LinearModel
-from fflin.robot.disturbance import UNITS, DisturbanceTerm, terms_of
+from fflin.robot.disturbance import (
+    PLATE,
+    UNITS,
+    DisturbanceTerm,
+    plates_of,
+    terms_of,
+)
 from fflin.robot.equipment.assembly import first_impossible, turned_to
 from fflin.robot.fields import warn_of_degrees
 from fflin.robot.inputs import JointTorque, ReactionWheel, Thruster
 from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.mass_properties import properties, varied
 from fflin.robot.robot import Robot
+from fflin.simulation.extension import DRAG, SUNLIGHT
 from fflin.simulation.lanes import DISTURBANCE, disturbances_of, noise_generator
 from fflin.simulation.plan import Times
 from fflin.simulation.plant import Plant
@@ -55,7 +63,17 @@ _OF_SENSORS = ("sensor", "noise")
 _DISTURBANCES = tuple(f"{name}.{axis}" for name in UNITS for axis in "xyz")
 # Kind of the relative changes of the amplitudes of periodic disturbances.
 _AMPLITUDE = "amplitude"
-_FACTORS = ("mass", "inertia", "density", "frequency", _AMPLITUDE, *_OF_SPRINGS)
+# Kinds of the relative changes of the forces on flat plates.
+_OF_PLATES = (DRAG, SUNLIGHT)
+_FACTORS = (
+    "mass",
+    "inertia",
+    "density",
+    "frequency",
+    _AMPLITUDE,
+    *_OF_PLATES,
+    *_OF_SPRINGS,
+)
 
 
 class Column(NamedTuple):
@@ -96,6 +114,7 @@ class Dispersions:
             "frequency": modes,
             DISTURBANCE: _DISTURBANCES,
             _AMPLITUDE: _periodic(robot),
+            **{kind: names for kind, (names, _) in _plates(plant).items()},
         }
         kinds = [*self._known]
         self._known |= {
@@ -164,17 +183,8 @@ class Dispersions:
         """
         robot = self._plant.robot
         names = self._known[kind]
-        if kind in _OF_SENSORS and not names:
-            named = self._policy.inner.kind if self._policy else "None"
-            raise InputError(
-                f"'{next(iter(spreads))}.{kind}' is dispersed, but the policy ({named}) has no "
-                "sensors; use a StateFeedback, OutputFeedback or LinearController"
-            )
-        if kind == _AMPLITUDE and not names:
-            raise InputError(
-                f"'{next(iter(spreads))}.{kind}' is dispersed, but '{robot.name}' has no periodic "
-                "disturbance; give the robot one, with amplitude= and frequency="
-            )
+        if not names:
+            self._refuse(kind, next(iter(spreads)))
         if kind in ("noise", "delay") and not self._times.sample:
             raise InputError(
                 f"{kind} is dispersed, but the policy is continuous, and {kind} applies only to "
@@ -213,6 +223,27 @@ class Dispersions:
             for axis, letter in enumerate(_AXES.get(kind, " ")):
                 name = f"{title}.{letter}".rstrip(". ")
                 self.columns.append(Column(name, kind, targets, axis, inverse))
+
+    def _refuse(self, kind: str, key: str) -> None:
+        """Raise `InputError` for a dispersion of a kind of which there are no quantities."""
+        robot = self._plant.robot
+        what = f"'{key}.{kind}' is dispersed, but"
+        if kind in _OF_SENSORS:
+            named = self._policy.inner.kind if self._policy else "None"
+            raise InputError(
+                f"{what} the policy ({named}) has no sensors; use a StateFeedback, OutputFeedback "
+                "or LinearController"
+            )
+        if kind == _AMPLITUDE:
+            raise InputError(
+                f"{what} '{robot.name}' has no periodic disturbance; give the robot one, with "
+                "amplitude= and frequency="
+            )
+        if kind in _OF_PLATES:
+            raise InputError(
+                f"{what} no flat plate of '{robot.name}' has {kind}; give it one in the table "
+                "[[disturbance.plate]]"
+            )
 
     def _warn_of_degrees(self) -> None:
         """Warn of dispersions of joint positions and rates that look like degrees."""
@@ -455,6 +486,21 @@ class Dispersions:
         factors[:, at] += self._of(_AMPLITUDE, drawn)
         return dict(zip(UNITS, np.split(factors, len(UNITS), axis=1), strict=True))
 
+    def _plate_forces(self, drawn: Array) -> dict[str, Array]:
+        """Return {kind of force: forces (N, k) [N]} of the flat plates, if they are dispersed."""
+        return {
+            kind: forces * self._plate_factors(kind, drawn)
+            for kind, (_, forces) in _plates(self._plant).items()
+            if kind in self._kinds
+        }
+
+    def _plate_factors(self, kind: str, drawn: Array) -> Array:
+        """Return the factors (N, k) of drag or solar pressure on all flat plates."""
+        forces = _plates(self._plant)[kind][1]
+        factors = np.ones((len(drawn), len(forces)))
+        factors[:, forces > 0.0] += self._of(kind, drawn)
+        return factors
+
     def delays(self, drawn: Array) -> Array:
         """Return the total delays (N, k) in integration steps, with the columns of `Times.delays`.
 
@@ -511,6 +557,7 @@ class Dispersions:
             # The last two terms are the dispersed constants, in the order of `_DISTURBANCES`.
             vectors[:, -len(_DISTURBANCES) :] = self._of(DISTURBANCE, drawn)
             runs[DISTURBANCE] = vectors
+        runs |= self._plate_forces(drawn)
         if "delay" in self._kinds:
             runs["delay"] = self.delays(drawn)
         return runs
@@ -538,6 +585,9 @@ class Dispersions:
         if self._kinds & {DISTURBANCE, _AMPLITUDE}:
             factors = {name: x[0] for name, x in self._amplitudes(rows).items()}
             robot = _disturbed(robot, self._of(DISTURBANCE, rows)[0], factors)
+        if self._kinds & {*_OF_PLATES}:
+            plates = [self._plate_factors(kind, rows)[0] for kind in _OF_PLATES]
+            robot = _with_plates(robot, *plates)
         if policy and self._kinds & {*_OF_SENSORS}:
             errors = (self._of(kind, rows)[0] for kind in (*_OF_SENSORS, "seed"))
             policy = with_sensor_errors(policy, *errors)
@@ -582,6 +632,36 @@ def _periodic(robot: Robot) -> tuple[str, ...]:
         amplitudes = zip("xyz", term.amplitude, strict=True)
         names.update(f"{name}.{axis}" for axis, amplitude in amplitudes if amplitude)
     return tuple(name for name in _DISTURBANCES if name in names)
+
+
+def _plates(plant: Plant) -> dict[str, tuple[tuple[str, ...], Array]]:
+    """Return {kind of force: (names, forces (k,) [N])} of the k flat plates of a robot.
+
+    The names, such as plate_1, are those of the plates on which the force acts.
+    """
+    plates = [Plate(plate, plant.field) for plate in plates_of(plant.robot.disturbance)]
+    forces = {
+        DRAG: np.array([plate.drag for plate in plates]),
+        SUNLIGHT: np.array([plate.sunlight for plate in plates]),
+    }
+    return {
+        kind: (tuple(f"{PLATE}_{at + 1}" for at in np.flatnonzero(values)), values)
+        for kind, values in forces.items()
+    }
+
+
+def _with_plates(robot: Robot, drag: Array, sunlight: Array) -> Robot:
+    """Return a robot whose flat plates have drag and solar pressure multiplied by factors (k,)."""
+    plates = zip(plates_of(robot.disturbance), drag, sunlight, strict=True)
+    scaled = tuple(
+        replace(
+            plate,
+            density=plate.density * float(of_drag),
+            solar_pressure=plate.solar_pressure * float(of_sunlight),
+        )
+        for plate, of_drag, of_sunlight in plates
+    )
+    return replace(robot, disturbance={**robot.disturbance, PLATE: scaled})
 
 
 def _disturbed(robot: Robot, drawn: Array, factors: Mapping[str, Array]) -> Robot:

@@ -123,6 +123,8 @@ def monte_carlo(
           `Robot.disturbance`, in its default axes. ``tau_b.amplitude`` and ``F_b.amplitude``:
           relative changes of the amplitudes of the periodic terms of `Robot.disturbance`, one for
           each component, such as ``tau_b.x.amplitude``.
+        - ``plate_1.drag`` and ``plate_1.sunlight``: relative changes of drag and of solar pressure
+          on the flat plates of `Robot.disturbance`, which are numbered from 1.
         - ``NAME.sensor``: constant offset in the measurement of a state that a `StateFeedback`
           reads, or of an output that an `OutputFeedback`, `LinearController` or
           `TrajectoryOutputFeedback` measures. ``NAME.noise``: white noise added to this measurement

@@ -33,6 +33,7 @@ from fflin.kernel.compiled import kernel
 from fflin.kernel.tree import LANES, laid_out
 from fflin.robot.robot import Robot
 from fflin.simulation import lanes
+from fflin.simulation.extension import extension_of, is_extended
 from fflin.simulation.motion import Motion
 from fflin.simulation.plan import Plan, SimulationOptions, law_of
 from fflin.simulation.report import SETTLED, THERE, is_late, settled_at
@@ -228,6 +229,8 @@ class CampaignJob:
         left: list[object] = [arguments]
         if plan.plant.constrained is not None:
             left.append(lanes.constraints_of(plan))
+        if is_extended(plan):
+            left.append(extension_of(plan))
         while left:  # the arrays and numbers in nested tuples
             value = left.pop()
             if isinstance(value, tuple):
