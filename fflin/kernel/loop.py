@@ -458,11 +458,7 @@ def _advance(arguments, orbit, constraints, extension, clock, last, every, rows,
             t = step * h + method.nodes[stage]
             if law.kind != NOTHING and (channel.sample == 0 or stage == 0):
                 _command(work, arguments, orbit, extension, t, step, stage)
-            given = _lagged(extension, method, point, stage)
-            forward.apply_faults(
-                robot.faults, robot.triads, step * h, h, given, point.pushing
-            )
-            forward.turn_held(robot, point)
+            _drive(robot, extension, method, point, step * h, stage)
             to = (1 + stage) * len(point.nu)
             forward.accelerate(
                 work, robot, orbit, extension, point, t, method.rates, to
@@ -491,12 +487,19 @@ def _advance(arguments, orbit, constraints, extension, clock, last, every, rows,
             break
 
 
-def _lagged(extension, method, point, stage):
-    """Return the inputs that act at a stage, which follow the commands with their lags."""
+def _drive(robot, extension, method, point, t, stage):
+    """Write the inputs that act at a stage, after lags and faults, to `point.pushing`.
+
+    t [s] is the start of the step.
+    """
+    faults, h = robot.faults, method.h
     if extension is None:
-        return point.u
-    lag_inputs(extension.actuators, method.speed, point.u, stage)
-    return extension.actuators.acting
+        forward.apply_faults(faults, robot.triads, t, h, point.u, point.pushing)
+    else:
+        lag = extension.actuators
+        lag_inputs(lag, method.speed, point.u, stage)
+        forward.apply_faults(faults, robot.triads, t, h, lag.acting, point.pushing)
+    forward.turn_held(robot, point)
 
 
 def _observe(work, arguments, extension, step, stage):
