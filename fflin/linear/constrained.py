@@ -23,6 +23,7 @@ from fflin.dynamics.closure import Closure, TangentSpace
 from fflin.dynamics.coordinates import ANGULAR, LINEAR, Chart
 from fflin.dynamics.state import StateMap
 from fflin.linear.model import LinearModel
+from fflin.robot.constraints import checked_independent
 
 # Coordinates are independent if the smallest singular value of their rows of the basis, in units of
 # equal kinetic energy, is at least _INDEPENDENT.
@@ -62,13 +63,9 @@ class Reducer:
         self, closure: Closure, independent: Sequence[str] | None, *, moving: bool
     ) -> None:
         self.closure = closure
-        # Refuse a string, because it would be read as a sequence of names with one letter each.
-        if isinstance(independent, str) or not isinstance(independent, Sequence | None):
-            raise InputError(
-                f"independent is {independent!r}, expected a list of coordinates, such as "
-                "['q_b', 'left_1']"
-            )
-        self.given = None if independent is None else tuple(independent)
+        self.given: tuple[str, ...] | None = closure.state.robot.independent or None
+        if independent is not None:
+            self.given = checked_independent(independent)
         self._state = closure.state
         self._moving = moving
         self._picked: Array | None = None
