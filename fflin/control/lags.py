@@ -50,10 +50,20 @@ def lags_of_robot(robot: Robot, state: StateMap, *, outputs: bool) -> Lags:
     names = Actuation(state).names
     late = _positive(names, list(lags_of(robot.named_inputs)))
     sensed: dict[str, float] = {}
-    if outputs and robot.outputs:
+    if outputs:
         sensors = sensors_by_signal(state).items()
         sensed = {name: sensor.lag for name, sensor in sensors if sensor.lag}
     return Lags(late, sensed)
+
+
+def robot_lags(law: Policy | Gain, lin: LinearModel) -> Lags:
+    """Return the lags of the robot of a model, of the outputs only if a law measures them."""
+    robot = lin._robot
+    if robot is None:
+        return NO_LAGS
+    state = StateMap(robot, reference=lin.reference, frame=lin.frame)
+    outputs = isinstance(law, Policy) and law.senses_outputs
+    return lags_of_robot(robot, state, outputs=outputs)
 
 
 def designed_lags(law: Policy | Gain) -> Lags:

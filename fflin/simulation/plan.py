@@ -37,6 +37,7 @@ from fflin.control.channel import (
     saturation,
     warn_beyond,
 )
+from fflin.control.lags import lag_difference, lags_of_robot
 from fflin.control.policies import Feedback
 from fflin.control.policy import (
     Policy,
@@ -169,7 +170,10 @@ class Plan:
         limits += _signals(plant, self.q, self.v, dt, duration)
         pace = Pace(limits, self.method, duration)
         late = delays_of(policy, plant, options.delay)
-        self.times = times = times_of(options, duration, sample, pace, late)
+        times = times_of(options, duration, sample, pace, late)
+        self.times = times = times._replace(
+            notes=(*times.notes, *_lag_notes(policy, plant))
+        )
         if policy and times.sample:
             policy = policy.held_for(times.sample * times.dt)
         self.policy = policy
@@ -544,6 +548,15 @@ def step_of(
         steps = int(np.ceil(duration / dt))
         dt = duration / steps
     return dt, steps, mode
+
+
+def _lag_notes(policy: Policy | None, plant: Plant) -> tuple[str, ...]:
+    """Return a note on lags of the robot for which the law was not designed, if there are any."""
+    if policy is None or policy.model is None or policy.commanded_robot is not None:
+        return ()
+    lags = lags_of_robot(plant.robot, plant.state, outputs=policy.senses_outputs)
+    note = lag_difference(policy, lags, "the motion")
+    return (note,) if note else ()
 
 
 def times_of(
