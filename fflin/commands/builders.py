@@ -509,8 +509,7 @@ def with_errors(
         sizes[name] = np.zeros(len(policy.sensors))
         for index, value in by_name("measured signal", by_key, policy.sensors).items():
             sizes[name][index] = value
-    seed = np.zeros(1)
-    return with_sensor_errors(policy.fresh(), sizes["bias"], sizes["noise"], seed)
+    return with_sensor_errors(policy.fresh(), sizes["bias"], sizes["noise"], 0.0)
 
 
 def budget_of(

@@ -181,6 +181,8 @@ def simulate(arguments: Namespace) -> Report:
     measuring = with_errors(policy, arguments)
     if measuring is not policy:
         settings.pop("linear", None)  # the linear model has no sensor errors
+    if arguments.no_noise:
+        settings["noise"] = 0.0
     motion = fflin.simulate(
         robot, measuring, every=arguments.every, engine=arguments.engine, **settings
     )
@@ -260,6 +262,8 @@ def montecarlo(arguments: Namespace) -> Report:
     settings.pop("linear", None)  # the runs are not compared with a linear model
     for name in ("runs", "seed", "until", "width", "confidence", "workers", "threads"):
         settings[name] = getattr(arguments, name)
+    if arguments.no_noise:
+        settings["noise"] = 0.0
     settings["histories"] = _ROWS if arguments.plot else 0
     settings["out"] = None if is_table else path
     with going_on(path, "runs") as progress:

@@ -95,7 +95,7 @@ OPTIONS: dict[str, dict[str, str]] = {
     "simulate": {
         **_LOOP,
         SIMULATION: f"{_LOOP[SIMULATION]} every engine",
-        "pointing errors": "pointing accuracy budget noise bias",
+        "pointing errors": "pointing accuracy budget noise bias no-noise",
         OUTPUT: f"plot show output-file html {_PICTURES}",
     },
     "export": {"": "FILE", OUTPUT: "output-folder robot limits name real"},
@@ -110,7 +110,7 @@ OPTIONS: dict[str, dict[str, str]] = {
     "montecarlo": {
         **_LOOP,
         "": "ROBOT DISPERSIONS",
-        "runs": "runs seed until width confidence workers threads",
+        "runs": "runs seed until width confidence workers threads no-noise",
         "pointing errors": "pointing accuracy",
         OUTPUT: f"goal worst plot output-file force html {_PICTURES}",
     },
@@ -344,6 +344,7 @@ ABOUT: dict[str, str] = {
     "normal variable. NAME is a state, or an output for --controller, a group or a quantity such "
     "as gyroscope",
     "bias": "constant error of a measured signal, named as in --noise",
+    "no-noise": "leave out the noise and the drifting biases that the outputs of the robot declare",
     "json": "print the results as one JSON object",
     # Options of one command.
     "init output-file": "save the robot file (by default the URDF's name with .toml, in the "

@@ -37,6 +37,7 @@ from fflin.control.channel import (
     saturation,
     warn_beyond,
 )
+from fflin.control.data_sheet import Deviations
 from fflin.control.policies import Feedback
 from fflin.control.policy import (
     Policy,
@@ -45,6 +46,7 @@ from fflin.control.policy import (
     defined_by_user,
     initial_inputs,
 )
+from fflin.control.sensor_errors import SensorErrors, declared_errors
 from fflin.control.tracking import prepared
 from fflin.dynamics import points
 from fflin.dynamics.coordinates import ORBITAL, Frame
@@ -105,6 +107,8 @@ class SimulationOptions:
     every: int | None = None
     progress: bool | None = None
     engine: str | None = None
+    noise: float = 1.0
+    seed: int = 0
 
 
 class Times(NamedTuple):
@@ -172,6 +176,8 @@ class Plan:
         self.times = times = times_of(options, duration, sample, pace, late)
         if policy and times.sample:
             policy = policy.held_for(times.sample * times.dt)
+        # Errors that the outputs of the robot declare, or None.
+        self.errors, policy = _with_errors(policy, state, times, options)
         self.policy = policy
         # `reference` is a function of time that returns q, v and u of the motion that the policy
         # follows, or None.
@@ -274,6 +280,26 @@ class Plan:
         return channelled(
             law, speeds, self.limits, self.initial, times.sample, times.delays, correct
         )
+
+
+def _with_errors(
+    policy: Policy | None, state: StateMap, times: Times, options: SimulationOptions
+) -> tuple[Deviations | None, Policy | None]:
+    """Return the errors that the outputs of a robot declare, and the law that receives them."""
+    factor = number("noise", options.noise)
+    if factor < 0.0:
+        raise InputError(f"noise is {factor:g}, expected a factor of at least 0")
+    seed = whole("seed", options.seed, 0)
+    if policy is None or not factor:
+        return None, policy
+    sample = times.sample * times.dt
+    errors = declared_errors(policy, state, sample)
+    if errors is None:
+        return None, policy
+    errors = errors.scaled(factor)
+    steps = math.sqrt(sample) * errors.drift
+    function = SensorErrors(np.zeros(len(steps)), errors.noise, steps, seed)
+    return errors, policy.with_sensor_errors(function)
 
 
 def _signals(
