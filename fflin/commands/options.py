@@ -82,6 +82,12 @@ OPTIONS: dict[str, dict[str, str]] = {
         OUTPUT: "output-file plot",
     },
     "tvlqr": {**_ALONG, CONTROLLER: f"{_WEIGHTS} dt qf", OUTPUT: "output-file"},
+    "tune": {
+        **_AT_POINT,
+        CONTROLLER: "law goal vary sample delay allocate",
+        "search": "starts steps seed",
+        OUTPUT: "output-file plot",
+    },
     "plan": {
         "": "ROBOT",
         ROBOT: _SYSTEM,
@@ -141,6 +147,7 @@ COMMON = {
     "lqr": "joint velocity equilibrium inputs frame weights q r bryson sample reduce wheel-speeds "
     "output-file plot",
     "tvlqr": "trajectory hold strict weights q r bryson sample qf inputs frame output-file",
+    "tune": "law goal vary sample delay starts seed joint inputs output output-file plot",
     "plan": "joint rpy position velocity target-joint target-rpy target-position target-velocity "
     "duration knots hold free-end r limits limit guess inputs output-file",
     "simulate": "joint rpy target-joint target-rpy trajectory weights q r sample mpc gain "
@@ -258,6 +265,12 @@ ABOUT: dict[str, str] = {
     "(y - y0)",
     "mpc": "use model predictive control (MPC) with the limits of the robot; MPC requires --sample",
     "horizon": "number of samples in the horizon of --mpc",
+    "law": "law to tune, such as 'pd measured=q_b inputs=wheel lag=[0.1,1]'. TYPE is pd, pid, "
+    "static_gain or state_space, or a filter: low_pass, lead or notch. The sum of all laws is in "
+    "series with all filters. Keys and values are those of [[tune.law]] in robot.toml, which this "
+    "option replaces. A number fixes a parameter, [least,largest] bounds it",
+    "starts": "number of starts of the search; 3 by default",
+    "steps": "largest number of steps of each search; 300 by default",
     "free": "simulate the robot without a regulator and without inputs",
     "delay": "delay [s] between a sample and the application of the command that is computed from "
     "this sample. The regulator is designed for this delay. Without --sample, its sample time is "
@@ -311,7 +324,7 @@ ABOUT: dict[str, str] = {
     "runs",
     "show": "show only these curves in --plot. NAME is a state, input, group or pattern, such as "
     "q_m or '*.hinge_*'",
-    "FILE": f"gain, compensator or gain schedule saved by fflin: {_SAVED}",
+    "FILE": f"gain, compensator, gain schedule or tuned law saved by fflin: {_SAVED}",
     "output-folder": "folder for the code; a missing folder is created",
     "robot": "robot for which FILE was designed: a name listed by `fflin robots`, or the path of a "
     "URDF or robot.toml. The default is the robot that FILE names",
@@ -377,6 +390,18 @@ ABOUT: dict[str, str] = {
     "lqr plot": "plot the poles, the loop gain of each input and the stability margins to FILE",
     "tvlqr dt": "former name of --sample",
     "tvlqr output-file": "save the gains to FILE",
+    "tune goal": "requirement, such as 'margin disk=0.75 hard=true' or 'max_gain "
+    "inputs={tau_b=0.01} outputs={q_b=1e-3}'. TYPE is max_gain, roll_off, margin, decay, damping, "
+    "variance or track. Keys and values are those of [[tune.goal]] in robot.toml, which this "
+    "option replaces",
+    "tune vary": "range of an uncertain parameter over which the goals must hold, as in `fflin "
+    "uncertain`. This option replaces [tune.vary] in robot.toml",
+    "tune sample": "sample time of the law [s]; the law is continuous by default",
+    "tune delay": "delay of the inputs [s]. Without --sample, the sample time is T",
+    "tune seed": "random seed of the starts; 0 by default",
+    "tune output-file": "save the law to FILE",
+    "tune plot": "plot the gains of all goals with their limits, the Nichols plot of the loops, "
+    "and the search to FILE",
     "plan hold": "inputs between knots: constant (previous, default) or linearly interpolated "
     "(linear)",
     "plan r": "weight on an input, a group or a pattern. The default is 1/limit^2",

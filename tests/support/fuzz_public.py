@@ -60,6 +60,13 @@ def _objects():
     lin = fflin.linearize(robot)
     gain = fflin.lqr(lin, 1.0, 1.0)
     filtered = fflin.kalman(lin, 1.0, 1.0)
+    tuned = fflin.tune(
+        lin,
+        fflin.PD("q_b", "tau_b", rates="omega_b"),
+        fflin.Decay(0.1),
+        starts=1,
+        steps=2,
+    )
     t = np.array([0.0, 0.01, 0.02])
     rows = {
         "q": np.tile(robot.neutral(), (3, 1)),
@@ -242,6 +249,7 @@ def light(folder):
             key: {
                 **{"measured": "q_b", "inputs": "tau_b", "kp": 1.0, "kd": (1.0, 2.0)},
                 **{"lag": 0.1, "bandwidth": 1.0, "coupled": False, "name": "axis"},
+                "distribution": np.eye(3),
             }
             for key in ("PD", "PID")
         },
@@ -284,6 +292,7 @@ def light(folder):
             "goals": fflin.Decay(0.1),
             **{"dt": 0.1, "delay": 0.0, "q": q, "starts": 1, "steps": 2, "seed": 0},
         },
+        "plot_tuned": {"tuned": tuned, "path": "tuned.png", "axes": None},
         "load_dispersions": {"path": "nosuch.toml"},
         "load_inputs": {"path": "nosuch.toml"},
         "line_up": {"gain": gain, "lin": lin},
