@@ -60,13 +60,6 @@ def _objects():
     lin = fflin.linearize(robot)
     gain = fflin.lqr(lin, 1.0, 1.0)
     filtered = fflin.kalman(lin, 1.0, 1.0)
-    tuned = fflin.tune(
-        lin,
-        fflin.PD("q_b", "tau_b", rates="omega_b"),
-        fflin.Decay(0.1),
-        starts=1,
-        steps=2,
-    )
     t = np.array([0.0, 0.01, 0.02])
     rows = {
         "q": np.tile(robot.neutral(), (3, 1)),
@@ -292,7 +285,7 @@ def light(folder):
             "goals": fflin.Decay(0.1),
             **{"dt": 0.1, "delay": 0.0, "q": q, "starts": 1, "steps": 2, "seed": 0},
         },
-        "plot_tuned": {"tuned": tuned, "path": "tuned.png", "axes": None},
+        "plot_tuned": {"tuned": None, "path": None, "axes": None},
         "load_dispersions": {"path": "nosuch.toml"},
         "load_inputs": {"path": "nosuch.toml"},
         "line_up": {"gain": gain, "lin": lin},

@@ -1,6 +1,7 @@
 """Laws and goals as tables of a robot file and as text of the command line."""
 
 import math
+from inspect import signature
 
 import numpy as np
 import pytest
@@ -8,6 +9,9 @@ import pytest
 import fflin
 from fflin.tuning.plant import signals_of
 from fflin.tuning.specification import (
+    FILTERS,
+    GOALS,
+    LAWS,
     check_signals,
     goals_of,
     structure_of,
@@ -156,3 +160,64 @@ def test_a_robot_without_torque_needs_the_key_inputs():
     robot = fflin.load("cubesat", inputs=[fflin.BaseForce()])
     with pytest.raises(fflin.InputError, match="inputs: F_b"):
         structure_of([table_of("pd")], fflin.linearize(robot))
+
+
+STRANGE = (
+    3,
+    -1.0,
+    True,
+    "x",
+    [],
+    [[1]],
+    [{}],
+    {},
+    {"a": {"b": [1]}},
+    math.nan,
+    [1, 2, 3],
+)
+TABLES = {
+    "pd": {"measured": "q_b", "inputs": "wheel"},
+    "pid": {"measured": "q_b", "inputs": "wheel"},
+    "static_gain": {"measured": "q_b", "inputs": "wheel"},
+    "state_space": {"order": 1},
+    "low_pass": {},
+    "lead": {},
+    "notch": {"frequency": 1.0},
+    "max_gain": {"inputs": "wheel", "outputs": "q_b"},
+    "roll_off": {"inputs": "wheel", "outputs": "q_b", "above": 1.0, "below": 1.0},
+    "margin": {"disk": 0.5},
+    "decay": {"rate": 0.1},
+    "damping": {"ratio": 0.1},
+    "variance": {"inputs": {"wheel": 1.0}, "outputs": {"q_b": 1.0}},
+    "track": {"output": "q_b.x", "settling": 10.0},
+}
+
+
+def strange_tables():
+    """Each table with each of its keys replaced by each strange value."""
+    for kind, table in TABLES.items():
+        make = {**LAWS, **FILTERS, **GOALS}[kind]
+        for key in (*signature(make).parameters, "type"):
+            for value in STRANGE:
+                yield kind, {"type": kind, **table, key: value}
+
+
+@pytest.mark.exhaustive
+def test_strange_values_are_accepted_or_refused_in_one_line(lin):
+    faults = []
+    for kind, table in strange_tables():
+        laws, goals = [{"type": "pd"}], []
+        if kind in GOALS:
+            goals = [table]
+        elif kind in FILTERS:
+            laws.append(table)
+        else:
+            laws = [table]
+        try:
+            check_signals(structure_of(laws, lin), goals_of(goals), lin)
+        except fflin.FflinError as error:
+            if "\n" in str(error):
+                faults.append((table, str(error)))
+        except Exception as error:
+            faults.append((table, repr(error)))
+    assert not faults, faults[:5]
