@@ -31,10 +31,14 @@ from fflin.robot.constraints import checked_constraints
 from fflin.robot.disturbance import checked_disturbance
 from fflin.robot.inputs import (
     KINDS,
+    BaseForce,
+    BaseTorque,
     Input,
     JointTorque,
+    Magnetorquer,
     Range,
     ReactionWheel,
+    Thruster,
     named_inputs,
     three_numbers,
 )
@@ -51,7 +55,12 @@ RULES = ("urdf", "identity")
 
 def input_keys_of(robot: RobotData) -> tuple[str, ...]:
     """Return the name GROUP.ENTRY of each input, such as "thrust.NAME"; see `names.input_keys`."""
-    pairs = ((item.GROUP, name) for item, names in robot.named_inputs for name in names)
+    return _keys_of(robot.named_inputs)
+
+
+def _keys_of(named: Iterable[tuple[Input, tuple[str, ...]]]) -> tuple[str, ...]:
+    """Return the name GROUP.ENTRY of each named input."""
+    pairs = ((item.GROUP, name) for item, names in named for name in names)
     keys = []
     for group, name in pairs:
         key = name if name.startswith(f"{group}.") else f"{group}.{name}"
@@ -283,7 +292,7 @@ def _weights(value: object, robot: RobotData) -> dict[str, object]:
     The keys of the mappings are names, groups or patterns of states and inputs. `integral` contains
     names of states or outputs, or a mapping {name: weight of the integral}.
     """
-    states, inputs = state_keys(robot.joint_names), input_keys_of(robot)
+    states, inputs = state_keys(robot.joint_names), _weighted_inputs(robot)
     both = (*states, *inputs)
     kinds = {
         "q": ("state", states),
@@ -314,6 +323,19 @@ def _weights(value: object, robot: RobotData) -> dict[str, object]:
     if given.get("integral"):
         checked["integral"] = _integrated(given["integral"])
     return checked
+
+
+def _weighted_inputs(robot: RobotData) -> tuple[str, ...]:
+    """Return the names and groups of the inputs that may have weights.
+
+    The commands of a design with base torque and force may be allocated to thrusters and
+    magnetorquers, so a robot with such inputs may have weights of the base torque and force.
+    """
+    keys = input_keys_of(robot)
+    if not any(isinstance(item, Thruster | Magnetorquer) for item in robot.inputs):
+        return keys
+    of_base = _keys_of(named_inputs((BaseTorque(), BaseForce())))
+    return tuple(dict.fromkeys((*keys, *of_base)))
 
 
 def _integrated(value: object) -> object:
