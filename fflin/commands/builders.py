@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import fflin
 from fflin.base.errors import InputError, UnknownNameError, located
+from fflin.base.figures import CurveStyle, joint_styles
 from fflin.base.names import joints_by_name, rates_by_name
 from fflin.commands import DONE, NO_ORBIT
 
@@ -70,7 +71,10 @@ class Report:
 
 
 def load_robot(arguments: Namespace) -> fflin.Robot:
-    """Load the robot, and apply the options that override its settings."""
+    """Load the robot, and apply the options that override its settings.
+
+    `arguments.joint_colors` becomes {joint: colour}, for the tables of the report on a terminal.
+    """
     given = {
         name: value
         for name in ("passive", "gravity", "orbit", "stiffness", "damping")
@@ -116,7 +120,26 @@ def load_robot(arguments: Namespace) -> fflin.Robot:
     if welds := getattr(arguments, "weld", None):
         added = [fflin.Weld(frame, to) for frame, to in welds]
         given["constraints"] = [*robot.constraints, *added]
-    return robot.merged(given)
+    if independent := getattr(arguments, "independent", None):
+        if not given.get("constraints", robot.constraints):
+            raise InputError(
+                f"--independent needs constraints, but '{robot.name}' has none; add --weld, or "
+                "remove --independent"
+            )
+        given["independent"] = independent
+    robot = robot.merged(given)
+    units = {
+        joint.name: joint.unit
+        for joint in robot.joints
+        if joint.name not in robot.wheels
+    }
+    arguments.joint_colors = colors_of(joint_styles(units))
+    return robot
+
+
+def colors_of(styles: Mapping[str, CurveStyle]) -> dict[str, str]:
+    """Return the colours of the curves that have one; the colour of all others is grey."""
+    return {name: style.color for name, style in styles.items() if style.is_named}
 
 
 def limits_of_options(
@@ -591,7 +614,7 @@ def budget_of(
     arguments: Namespace,
 ) -> fflin.ErrorBudget:
     """Return the error budget of a simulated loop."""
-    if policy is None or policy.model is None or policy.linear_law() is None:
+    if policy is None or policy.model is None or not policy.laws_of_period():
         raise InputError(
             "--budget needs a linear regulator about a point; remove --budget, or the options for "
             "MPC, trajectories or --free"

@@ -21,6 +21,7 @@ from fflin.commands.builders import (
     along,
     budget_of,
     check_pictures,
+    colors_of,
     designed,
     limits_of_options,
     load_robot,
@@ -178,6 +179,7 @@ def simulate(arguments: Namespace) -> Report:
 
     example: fflin simulate ets_vii --rpy 30 0 0 --duration 60 --html loop.html --plot loop.png
     """
+    from fflin.simulation.plots import JOINTS, styles_of
     from fflin.simulation.report import motion_record, motion_report
 
     window = _window(arguments)
@@ -199,6 +201,7 @@ def simulate(arguments: Namespace) -> Report:
         arguments.plot: partial(motion.plot, show=show or None),
         **pictures(robot, lambda: motion, arguments),
     }
+    arguments.joint_colors = colors_of(styles_of(motion).get(JOINTS[0], {}))
     code = FELL_SHORT if motion.stopped else DONE
     interrupted = ""
     if motion.stopped.startswith("interrupted"):
@@ -227,7 +230,7 @@ def _margins_of(policy: object, settings: Mapping[str, Any]) -> tuple[object, st
     from fflin.control.margins import margins_at_once
     from fflin.control.policy import Policy
 
-    if not isinstance(policy, Policy) or policy.linear_law() is None:
+    if not isinstance(policy, Policy) or not policy.laws_of_period():
         return None, ""
     margins = margins_at_once(policy, settings.get("delay"), settings.get("sample"))
     if margins is None:

@@ -16,7 +16,9 @@ TRAJECTORY, CONTROLLER, SIMULATION = "trajectory", "controller", "simulation"
 _POSE = "joint rpy position velocity"
 _TARGET = "target-joint target-rpy target-position target-velocity"
 _INPUTS = "effort equilibrium tilt relative-equilibrium"
-_SYSTEM = "lock weld xacro orbit stiffness damping gravity passive inputs output"
+_SYSTEM = (
+    "lock weld independent xacro orbit stiffness damping gravity passive inputs output"
+)
 _TRAJECTORY = "trajectory hold strict"
 _PATH = f"{_TRAJECTORY} periodic motion"
 _WEIGHTS = "weights q r bryson sample reduce wheel-speeds"
@@ -208,6 +210,9 @@ ABOUT: dict[str, str] = {
     "position. In every option, NAME can also be a pattern such as 'hinge_*'",
     "weld": "weld a frame to the frame TO or, without TO, to inertial space, in the pose that they "
     "have at the operating point. The welds are added to the constraints in robot.toml",
+    "independent": "coordinate that the linear model of a robot with constraints keeps. NAME is a "
+    "coordinate, a group or a pattern, such as q_b or left_1; repeat the option for each. By "
+    "default, the coordinates are chosen automatically",
     "xacro": "value of an argument of a xacro file",
     "orbit": "circular orbit at an altitude [m], or elliptic orbit with the heights [m] of perigee "
     "and apogee, above a central body: earth (default), moon, mars ... The world is then the "

@@ -245,6 +245,7 @@ FORMS: dict[str, Form] = {
     "stiffness": _OF_JOINT,
     "damping": _OF_JOINT,
     "passive": _NAMES,
+    "independent": _NAMES,
     "integral": _NAMES,
     "free-end": _NAMES,
     "show": _NAMES,

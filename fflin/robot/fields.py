@@ -27,7 +27,7 @@ from fflin.base.validation import (
     number,
     numbers,
 )
-from fflin.robot.constraints import checked_constraints
+from fflin.robot.constraints import checked_constraints, checked_independent
 from fflin.robot.disturbance import checked_disturbance
 from fflin.robot.inputs import (
     KINDS,
@@ -383,6 +383,7 @@ def _parts(what: str, value: object, known: Sequence[str]) -> dict[str, object]:
 FIELDS: dict[str, Callable[[object, RobotData], Any] | None] = {
     **dict.fromkeys(("passive", "wheel_joints", "inputs", "appendages")),
     "constraints": lambda value, _: checked_constraints(value),
+    "independent": lambda value, _: checked_independent(value),
     "outputs": _outputs,
     **{name: partial(_of_joints, name) for name in ("stiffness", "damping", "rest")},
     "gravity": lambda value, _: three_numbers("gravity", value),
