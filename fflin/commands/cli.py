@@ -204,7 +204,8 @@ def finish(report: Report, arguments: argparse.Namespace) -> int:
                 if path.suffix in _PAGES:
                     line += f": {path.stat().st_size / 1e6:.2f} MB"
                 lines.append(line)
-            print(color_report("\n".join(lines)))
+            colors = getattr(arguments, "joint_colors", None)
+            print(color_report("\n".join(lines), colors))
     if report.interrupted:
         raise KeyboardInterrupt("; ".join(messages))
     return report.code

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from argparse import Namespace
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
@@ -20,6 +21,7 @@ from fflin.commands.builders import (
     along,
     budget_of,
     check_pictures,
+    colors_of,
     designed,
     limits_of_options,
     load_robot,
@@ -49,6 +51,11 @@ _ALLOCATED = (
     "--no-allocate designs the thrusts themselves"
 )
 
+_MAGNETIC = (
+    "allocation: magnetorquers realise the part of tau_b across the magnetic field, in `fflin "
+    "simulate --gain` too; simulate several orbits to see whether the loop is stable"
+)
+
 _NOT_ALLOCATED = (
     "no allocation: the gains command each thruster, in `fflin simulate` too, and negative thrust "
     "is cut at zero"
@@ -68,7 +75,8 @@ def lqr(arguments: Namespace) -> Report:
         x for x in str(gain).split("\n\n") if not x.startswith("warning: ")
     )
     if design is not robot:
-        text += f"\n\n{folded([_ALLOCATED])}"
+        thrusters = any(isinstance(x, fflin.Thruster) for x in robot.inputs)
+        text += f"\n\n{folded([_ALLOCATED if thrusters else _MAGNETIC])}"
     result = {
         **record_of(gain),
         "margins": gain.margins,
@@ -99,7 +107,7 @@ def tune(arguments: Namespace) -> Report:
 
 
 def tvlqr(arguments: Namespace) -> Report:
-    """Design a time-varying linear quadratic regulator along a trajectory.
+    """Design a time-varying linear quadratic regulator along a trajectory or over an orbit.
 
     example: fflin tvlqr planar_detumble --trajectory plan.csv --hold previous --sample 0.1 -o
     gains.npz
@@ -107,7 +115,10 @@ def tvlqr(arguments: Namespace) -> Report:
     why = "along a trajectory no reduced model is needed, because the finite-horizon cost exists"
     refuse(arguments, ("reduce",), why)
     along = models_along(arguments)
-    Qf = once("--qf", arguments.qf) or "steady"
+    Qf: dict[str, float] | str = once("--qf", arguments.qf) or "steady"
+    if along.period:
+        refuse(arguments, ("qf",), "the cost of --periodic N has no end")
+        Qf = "periodic"
     schedule = fflin.tvlqr(
         along, Qf=Qf, sample=arguments.sample, weights=weights_of(arguments)
     )
@@ -195,6 +206,7 @@ def simulate(arguments: Namespace) -> Report:
 
     example: fflin simulate ets_vii --rpy 30 0 0 --duration 60 --html loop.html --plot loop.png
     """
+    from fflin.simulation.plots import JOINTS, styles_of
     from fflin.simulation.report import motion_record, motion_report
 
     window = _window(arguments)
@@ -216,6 +228,7 @@ def simulate(arguments: Namespace) -> Report:
         arguments.plot: partial(motion.plot, show=show or None),
         **pictures(robot, lambda: motion, arguments),
     }
+    arguments.joint_colors = colors_of(styles_of(motion).get(JOINTS[0], {}))
     code = FELL_SHORT if motion.stopped else DONE
     interrupted = ""
     if motion.stopped.startswith("interrupted"):
@@ -224,6 +237,9 @@ def simulate(arguments: Namespace) -> Report:
     record = motion_record(motion)
     record["margins"], line = _margins_of(policy, settings)
     if line:
+        text += f"\n{folded([line])}"
+    if arguments.bdot is not None and not motion.stopped:
+        record["detumbling_time"], line = _detumbling_of(motion)
         text += f"\n{folded([line])}"
     if window is not None and not motion.stopped:
         pointing = motion.pointing(window, accuracy=arguments.accuracy)
@@ -241,7 +257,7 @@ def _margins_of(policy: object, settings: Mapping[str, Any]) -> tuple[object, st
     from fflin.control.margins import margins_at_once
     from fflin.control.policy import Policy
 
-    if not isinstance(policy, Policy) or policy.linear_law() is None:
+    if not isinstance(policy, Policy) or not policy.laws_of_period():
         return None, ""
     margins = margins_at_once(policy, settings.get("delay"), settings.get("sample"))
     if margins is None:
@@ -254,6 +270,18 @@ def _margins_of(policy: object, settings: Mapping[str, Any]) -> tuple[object, st
         f"{margins.phase:.3g} deg (disk margin {margins.disk:.3g})"
     )
     return margins, line
+
+
+def _detumbling_of(motion: fflin.Motion) -> tuple[float, str]:
+    """Return the detumbling time [s] of a motion, and a line on it."""
+    orbit = motion.orbit
+    assert orbit is not None
+    time = fflin.detumbling_time(motion)
+    bound = f"{4.0 * orbit.mean_motion:.3g} rad/s, four times the orbital rate"
+    line = f"detumbled after {time:.5g} s"
+    if not math.isfinite(time):
+        return time, f"not detumbled: the mean rate over one orbit is not below {bound}"
+    return time, f"{line}: the mean rate over one orbit is below {bound}"
 
 
 def _window(arguments: Namespace) -> float | None:
@@ -347,7 +375,10 @@ def validity(arguments: Namespace) -> Report:
             saturation = "saturated at the limits of the robot"
         text += f"\n{folded([f'inputs were {saturation}'])}"
     if design is not robot:
-        text += "\nan ideal torque and force on the base replace the thrusters (--no-allocate)"
+        text += (
+            "\nideal torques and forces on the base replace the thrusters and magnetorquers "
+            "(--no-allocate)"
+        )
     files = {arguments.plot: lambda path: fflin.plot_validity(result, path)}
     return Report(robot.name, result, text, files)
 

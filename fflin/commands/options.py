@@ -16,8 +16,11 @@ TRAJECTORY, CONTROLLER, SIMULATION = "trajectory", "controller", "simulation"
 _POSE = "joint rpy position velocity"
 _TARGET = "target-joint target-rpy target-position target-velocity"
 _INPUTS = "effort equilibrium tilt relative-equilibrium"
-_SYSTEM = "lock weld xacro orbit stiffness damping gravity passive inputs output"
+_SYSTEM = (
+    "lock weld independent xacro orbit stiffness damping gravity passive inputs output"
+)
 _TRAJECTORY = "trajectory hold strict"
+_PATH = f"{_TRAJECTORY} periodic motion"
 _WEIGHTS = "weights q r bryson sample reduce wheel-speeds"
 _SCENE = "scene tool follow"
 _PICTURES = f"png gif times {_SCENE} fps speed"
@@ -28,9 +31,9 @@ _LOOP = {
     "": "ROBOT",
     "start": f"{_POSE} offset",
     "target": f"{_TARGET} {_INPUTS}",
-    TRAJECTORY: _TRAJECTORY,
+    TRAJECTORY: _PATH,
     CONTROLLER: f"{_WEIGHTS} integral schedule gain controller negative-feedback allocate mpc "
-    "horizon free limits limit delay",
+    "horizon bdot free limits limit delay",
     SIMULATION: "duration dt step method frame",
     ROBOT: _SYSTEM,
 }
@@ -49,10 +52,16 @@ OPTIONS: dict[str, dict[str, str]] = {
     },
     "linearize": {
         **_AT_POINT,
+        POINT: f"{_AT_POINT[POINT]} time",
         OUTPUT: "dt for output-file plot",
-        TRAJECTORY: _TRAJECTORY,
+        TRAJECTORY: _PATH,
     },
-    "check": {**_AT_POINT, TRAJECTORY: _TRAJECTORY, OUTPUT: "tolerance plot"},
+    "check": {
+        **_AT_POINT,
+        POINT: f"{_AT_POINT[POINT]} time",
+        TRAJECTORY: _PATH,
+        OUTPUT: "tolerance plot",
+    },
     "analyze": {**_AT_POINT, OUTPUT: "plot"},
     "modes": {**_AT_POINT, OUTPUT: "plot html"},
     "equilibrium": {**_AT_POINT, OUTPUT: "output-file"},
@@ -81,7 +90,13 @@ OPTIONS: dict[str, dict[str, str]] = {
         CONTROLLER: f"{_WEIGHTS} integral delay dt allocate",
         OUTPUT: "output-file plot",
     },
-    "tvlqr": {**_ALONG, CONTROLLER: f"{_WEIGHTS} dt qf", OUTPUT: "output-file"},
+    "tvlqr": {
+        **_ALONG,
+        TRAJECTORY: f"frame {_PATH}",
+        POINT: "joint rpy position",
+        CONTROLLER: f"{_WEIGHTS} dt qf",
+        OUTPUT: "output-file",
+    },
     "tune": {
         **_AT_POINT,
         CONTROLLER: "law goal vary sample delay allocate",
@@ -129,8 +144,8 @@ DESCRIPTIONS = {
 # {command: options that its short help lists}. For a command without an entry, the short help lists
 # all options.
 COMMON = {
-    "linearize": "joint rpy position velocity effort equilibrium frame reference inputs dt for "
-    "trajectory output-file plot",
+    "linearize": "joint rpy position velocity effort equilibrium time frame reference inputs dt "
+    "for trajectory periodic output-file plot",
     "check": "joint rpy position velocity effort equilibrium frame reference inputs trajectory "
     "tolerance plot",
     "analyze": "joint rpy velocity equilibrium relative-equilibrium orbit stiffness inputs output "
@@ -146,7 +161,8 @@ COMMON = {
     "limit frame inputs output-file plot",
     "lqr": "joint velocity equilibrium inputs frame weights q r bryson sample reduce wheel-speeds "
     "output-file plot",
-    "tvlqr": "trajectory hold strict weights q r bryson sample qf inputs frame output-file",
+    "tvlqr": "trajectory periodic hold strict weights q r bryson sample qf inputs frame "
+    "output-file",
     "tune": "law goal vary sample delay starts seed joint inputs output output-file plot",
     "plan": "joint rpy position velocity target-joint target-rpy target-position target-velocity "
     "duration knots hold free-end r limits limit guess inputs output-file",
@@ -201,6 +217,9 @@ ABOUT: dict[str, str] = {
     "position. In every option, NAME can also be a pattern such as 'hinge_*'",
     "weld": "weld a frame to the frame TO or, without TO, to inertial space, in the pose that they "
     "have at the operating point. The welds are added to the constraints in robot.toml",
+    "independent": "coordinate that the linear model of a robot with constraints keeps. NAME is a "
+    "coordinate, a group or a pattern, such as q_b or left_1; repeat the option for each. By "
+    "default, the coordinates are chosen automatically",
     "xacro": "value of an argument of a xacro file",
     "orbit": "circular orbit at an altitude [m], or elliptic orbit with the heights [m] of perigee "
     "and apogee, above a central body: earth (default), moon, mars ... The world is then the "
@@ -220,6 +239,16 @@ ABOUT: dict[str, str] = {
     "trajectory": f"use the trajectory in FILE: {_SAVED} or .csv; see "
     "fflin.Trajectory.load. --frame states the axes in which FILE gives base velocities and "
     "wrenches. The default of --frame is the frame named in FILE or, if there is none, local",
+    "periodic": "for a robot in orbit: use the linear models at N + 1 knots of one period, about a "
+    "periodic motion that --motion selects. --joint, --rpy and --position define where the robot "
+    "rests, relative to the axes `lvlh`. In a simulation, --target-joint, --target-rpy and "
+    "--target-position define it",
+    "motion": "periodic motion of --periodic: at rest in the orbital frame and held by the inputs "
+    "(held, default), or without inputs (free)",
+    "time": "time of the model [s], for a robot whose model depends on time: in an elliptic orbit, "
+    "or with magnetorquers; 0 by default",
+    "bdot": "detumble by the B-dot law with this gain [A m^2 s/T]: each magnetorquer has a moment "
+    "proportional to the derivative of the magnetic field along its axis",
     "hold": "inputs between the knots of FILE: linearly interpolated (linear), or constant from "
     "each knot to the next (previous). The default is the setting in FILE or, if there is none, "
     "linear",
@@ -247,8 +276,9 @@ ABOUT: dict[str, str] = {
     "schedule": "use the gains in FILE, which `fflin tvlqr` saved, and follow the trajectory that "
     "FILE also contains. This option replaces --trajectory",
     "allocate": "design the regulator with base torque and force as inputs, and allocate its "
-    "commands to the thrusters, which produce the nearest possible wrench. Allocation is the "
-    "default if the thrusters can push in every direction, but not along a trajectory. With "
+    "commands to the thrusters and magnetorquers, which produce the nearest possible wrench. "
+    "Allocation is the default if the thrusters can push in every direction, or if three "
+    "magnetorquers can have a moment in every direction, but not along a trajectory. With "
     "--no-allocate, the regulator commands each thruster itself, and negative thrust is cut at "
     "zero",
     "limits": "limits of the inputs. `urdf` (default) uses the limits of the robot and the limits "

@@ -38,8 +38,10 @@ from fflin.base.validation import (
     number,
     refuse_masked,
 )
+from fflin.control.closed_loop import ClosedLoop
 from fflin.control.gain import Gain, asymmetry
-from fflin.control.margins import ClosedLoop, Margins, closed_loop
+from fflin.control.loop_margins import Margins
+from fflin.control.margins import closed_loop
 from fflin.control.optimal.channel_limits import NO_GRID, channel_limits
 from fflin.control.optimal.disk import as_continuous
 from fflin.control.policy import Policy
@@ -377,7 +379,7 @@ def plot_loops(
     Raises
     ------
     InputError
-        If the policy is not linear about a point, or its model is not known.
+        If the policy is not linear about a point, its model is not known, or the law is periodic.
 
     Examples
     --------
@@ -400,6 +402,11 @@ def plot_loops(
         raise InputError("the model of the law is not known; give lin=")
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         closed = closed_loop(policy, lin, delay, sample)
+        if len(closed.laws) > 1:
+            raise InputError(
+                "the law is periodic and answers one frequency with several, so its loop has no "
+                "Bode or Nichols plot; use fflin.margins(policy, lin)"
+            )
         w, response = loop_responses(closed)
         margins = in_one_thread(closed.margins)()
     return _plot_closed(closed, margins, w, response, path, axes)

@@ -61,6 +61,7 @@ _DESCRIBING = (
     "form",
     "feedback_gain",
     "linear_law",
+    "laws_of_period",
     "closed_loop",
     "loop_around",
     "loop_notes",
@@ -362,6 +363,14 @@ class Policy(ABC):
         if lin is None or K is None:
             return None
         return proportional(K, lin.dt, lin.state_names, lin.input_names)
+
+    def laws_of_period(self) -> list[System]:
+        """Return the law of `linear_law` at each sample of its period; empty if it is not linear.
+
+        A law that does not vary with time has one.
+        """
+        law = self.linear_law()
+        return [] if law is None else [law]
 
     def poles_along(self) -> Array:
         """Return the poles [1/s] of the robot and of the loop along the followed trajectory."""

@@ -224,6 +224,21 @@ def checked_constraints(value: object) -> tuple[Constraint, ...]:
     return tuple(replace(item) for item in given)
 
 
+def checked_independent(value: object) -> tuple[str, ...]:
+    """Return the names of independent coordinates; a single string is refused."""
+    if value is None:
+        return ()
+    if (
+        isinstance(value, str)
+        or not isinstance(value, Sequence)
+        or not all(isinstance(name, str) for name in value)
+    ):
+        raise InputError(
+            f"independent is {value!r}, expected a list of coordinates, such as ['q_b', 'left_1']"
+        )
+    return tuple(value)
+
+
 def weld_at(
     frame: str,
     to: str | None = None,

@@ -28,14 +28,18 @@ from fflin.base.validation import (
     numbers,
     whole,
 )
-from fflin.robot.constraints import checked_constraints
+from fflin.robot.constraints import checked_constraints, checked_independent
 from fflin.robot.disturbance import checked_disturbance
 from fflin.robot.inputs import (
     KINDS,
+    BaseForce,
+    BaseTorque,
     Input,
     JointTorque,
+    Magnetorquer,
     Range,
     ReactionWheel,
+    Thruster,
     named_inputs,
     three_numbers,
 )
@@ -52,7 +56,12 @@ RULES = ("urdf", "identity")
 
 def input_keys_of(robot: RobotData) -> tuple[str, ...]:
     """Return the name GROUP.ENTRY of each input, such as "thrust.NAME"; see `names.input_keys`."""
-    pairs = ((item.GROUP, name) for item, names in robot.named_inputs for name in names)
+    return _keys_of(robot.named_inputs)
+
+
+def _keys_of(named: Iterable[tuple[Input, tuple[str, ...]]]) -> tuple[str, ...]:
+    """Return the name GROUP.ENTRY of each named input."""
+    pairs = ((item.GROUP, name) for item, names in named for name in names)
     keys = []
     for group, name in pairs:
         key = name if name.startswith(f"{group}.") else f"{group}.{name}"
@@ -284,7 +293,7 @@ def _weights(value: object, robot: RobotData) -> dict[str, object]:
     The keys of the mappings are names, groups or patterns of states and inputs. `integral` contains
     names of states or outputs, or a mapping {name: weight of the integral}.
     """
-    states, inputs = state_keys(robot.joint_names), input_keys_of(robot)
+    states, inputs = state_keys(robot.joint_names), _weighted_inputs(robot)
     both = (*states, *inputs)
     kinds = {
         "q": ("state", states),
@@ -345,6 +354,19 @@ def _tune(value: object, robot: RobotData) -> dict[str, object]:
     return given
 
 
+def _weighted_inputs(robot: RobotData) -> tuple[str, ...]:
+    """Return the names and groups of the inputs that may have weights.
+
+    The commands of a design with base torque and force may be allocated to thrusters and
+    magnetorquers, so a robot with such inputs may have weights of the base torque and force.
+    """
+    keys = input_keys_of(robot)
+    if not any(isinstance(item, Thruster | Magnetorquer) for item in robot.inputs):
+        return keys
+    of_base = _keys_of(named_inputs((BaseTorque(), BaseForce())))
+    return tuple(dict.fromkeys((*keys, *of_base)))
+
+
 def _integrated(value: object) -> object:
     """Return the signals that `lqr` integrates: a tuple of names, or a mapping {name: weight}.
 
@@ -390,6 +412,7 @@ def _parts(what: str, value: object, known: Sequence[str]) -> dict[str, object]:
 FIELDS: dict[str, Callable[[object, RobotData], Any] | None] = {
     **dict.fromkeys(("passive", "wheel_joints", "inputs", "appendages")),
     "constraints": lambda value, _: checked_constraints(value),
+    "independent": lambda value, _: checked_independent(value),
     "outputs": _outputs,
     **{name: partial(_of_joints, name) for name in ("stiffness", "damping", "rest")},
     "gravity": lambda value, _: three_numbers("gravity", value),

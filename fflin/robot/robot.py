@@ -111,6 +111,9 @@ class Robot(RobotData):
         Flexible appendages and slosh. Their modes are among the joints.
     constraints : tuple of Weld, Hinge and Spherical
         Constraints between frames of the robot, or to inertial space, see `replace`.
+    independent : tuple of str
+        Coordinates that linear models of a robot with constraints keep; chosen by `linearize` if
+        empty.
 
     Examples
     --------
@@ -141,6 +144,9 @@ class Robot(RobotData):
             Constraints between frames of the robot, or to inertial space, which replace all
             previous ones. A constraint without a placement holds its frames in the pose that they
             have at the first configuration at which it is used.
+        independent : sequence of str
+            Coordinates that linear models of a robot with constraints keep, as in `linearize`. It
+            has no effect without constraints.
         outputs : sequence of Output
             Measured outputs of the robot, in the order of y.
         stiffness : mapping or float

@@ -97,6 +97,7 @@ class RobotData(Coordinates):
     attached: tuple[tuple[str, Self], ...] = ()
     appendages: tuple[Appendage, ...] = ()
     constraints: tuple[Constraint, ...] = ()
+    independent: tuple[str, ...] = ()
     # The robot without the joints of wheels and modes; None if no joint is a wheel or mode. Its
     # fields such as `inputs` and `stiffness` may be outdated.
     _unequipped: Self | None = None

@@ -93,7 +93,7 @@ def hinf(
 
     The generalised plant contains the inputs and outputs of all goals, divided by their sizes and
     limits. The norm is the largest gain of all of them together, so it is an upper bound of the
-    value of each goal. SLICOT's SB10AD solves the Riccati equations for the balanced plant, and a
+    value of each goal. SLICOT's SB10FD solves the Riccati equations for the balanced plant, and a
     bisection finds the least norm within 0.1 %. If undisturbed poles or zeros are on the imaginary
     axis, the design adds disturbances and outputs of all states, of at most 1e-4 of the others.
 
@@ -377,12 +377,10 @@ def _controller(
     A, B, C, D, y_sizes, u_sizes = prepared
     nu, ny = len(u_sizes), len(y_sizes)
     try:
-        design = _slycot().sb10ad(
-            len(A), B.shape[1], len(C), nu, ny, level, A, B, C, D, job=4
-        )
+        design = _slycot().sb10fd(len(A), B.shape[1], len(C), nu, ny, level, A, B, C, D)
     except ArithmeticError:
         return None
-    Ak, Bk, Ck, Dk = design[1:5]
+    Ak, Bk, Ck, Dk = design[:4]
     law = (
         Ak,
         Bk / y_sizes,

@@ -16,7 +16,6 @@ from fflin.base.names import matching
 from fflin.base.validation import (
     Array,
     as_double,
-    count,
     function,
     positive,
     printable,
@@ -61,12 +60,15 @@ class Element:
         Indices of its signals in the plant; None if the part acts on any number of channels.
     law : callable
         Function of the values and of the number of channels that returns the `Law`.
+    of_gain : callable, optional
+        Function that returns start values for a static gain (commanded, measured).
     """
 
     parameters: tuple[Parameter, ...]
     measured: tuple[int, ...] | None
     commanded: tuple[int, ...] | None
     law: Callable[[Array, int], Law]
+    of_gain: Callable[[Array], Array] | None = None
 
     def used(self, signals: Signals) -> tuple[tuple[int, ...], tuple[int, ...]]:
         """Return the indices of the outputs and inputs that the law connects."""
@@ -101,6 +103,10 @@ class Structure(ABC):
     @abstractmethod
     def element(self, signals: Signals) -> Element:
         """Return the part of a law for the signals of a plant."""
+
+    def simpler(self) -> Structure | None:
+        """Return a structure with fewer states, whose parameters have the same names."""
+        return None
 
     def __add__(self, other: object) -> Structure:
         if not isinstance(other, Structure):
@@ -155,6 +161,22 @@ def _united(
     """Return the indices of two sets of signals, in order."""
     return tuple(sorted({*(first or ()), *(second or ())}))
 
+    def simpler(self) -> Structure | None:
+        """Return a structure with fewer states, whose parameters have the same names."""
+        return _simpler(_Sum, self.first, self.second)
+
+
+def _simpler(
+    kind: Callable[[Structure, Structure], Structure],
+    first: Structure,
+    second: Structure,
+) -> Structure | None:
+    """Return a sum or series of simpler structures, or None if neither has a simpler one."""
+    simpler = first.simpler(), second.simpler()
+    if simpler == (None, None):
+        return None
+    return kind(simpler[0] or first, simpler[1] or second)
+
 
 @dataclass(frozen=True, eq=False)
 class _Series(Structure):
@@ -196,7 +218,29 @@ class _Series(Structure):
             derivatives = [stack[order] for stack in swapped[4:]]
             return Law(*swapped[:4], *derivatives)
 
-        return Element((*left.parameters, *right.parameters), measured, commanded, law)
+        part = right if left.measured is None else left
+        of_gain = part.of_gain
+
+        def start(gain: Array) -> Array:
+            assert of_gain is not None
+            values = {
+                id(side): of_gain(gain) if side is part else _values(side.parameters)
+                for side in (left, right)
+            }
+            return np.concatenate((values[id(left)], values[id(right)]))
+
+        parameters = (*left.parameters, *right.parameters)
+        known = None if of_gain is None else start
+        return Element(parameters, measured, commanded, law, known)
+
+    def simpler(self) -> Structure | None:
+        """Return a structure with fewer states, whose parameters have the same names."""
+        return _simpler(_Series, self.left, self.right)
+
+
+def _values(parameters: Sequence[Parameter]) -> Array:
+    """Return the start values of parameters."""
+    return np.array([parameter.value for parameter in parameters])
 
 
 def _require_name(name: object) -> None:
@@ -869,7 +913,11 @@ class StaticGain(Structure):
         def law(values: Array, width: int) -> Law:
             return static_law(np.tensordot(values, dD, 1), dD)
 
-        return Element(tuple(parameters), measured, inputs, law)
+        def of_gain(gain: Array) -> Array:
+            return np.array([gain[entry] for entry in entries])
+
+        start_of = of_gain if self.gain is None else None
+        return Element(tuple(parameters), measured, inputs, law, start_of)
 
     def _array(self, key: str, shape: tuple[int, int]) -> Array:
         value = as_double(key, getattr(self, key))
@@ -903,7 +951,7 @@ class StateSpaceLaw(Structure):
     Parameters
     ----------
     order : int
-        Number of states.
+        Number of states; 0 for a static gain.
     measured, inputs : str or sequence of str
         Names, groups or patterns of the measured outputs and of the inputs; all by default.
     feedthrough : bool
@@ -931,7 +979,7 @@ class StateSpaceLaw(Structure):
     name: str = ""
 
     def __post_init__(self) -> None:
-        count("order", self.order)
+        whole("order", self.order, 0)
         truth("feedthrough", self.feedthrough)
         positive("bandwidth", self.bandwidth, "rad/s")
         _require_name(self.name)
@@ -975,9 +1023,9 @@ class StateSpaceLaw(Structure):
                 add(label, (nu + row, column), value, w * of_outputs[column])
         for row in range(nu):
             for column in range(n):
+                # With C = 0, the first start is the static gain.
                 label = f"{prefix}.C[{row},{column}]"
-                value = 0.5 * rng.standard_normal()
-                add(label, (row, ny + column), value, of_inputs[row])
+                add(label, (row, ny + column), 0.0, of_inputs[row])
             for column in range(ny if self.feedthrough else 0):
                 label = f"{prefix}.D[{row},{column}]"
                 add(label, (row, column), 0.0, scales[row, column])
@@ -996,7 +1044,21 @@ class StateSpaceLaw(Structure):
                 changes[:, :nu, :ny],
             )
 
-        return Element(tuple(parameters), measured, inputs, law)
+        def of_gain(gain: Array) -> Array:
+            values = _values(parameters)
+            for index, (row, column) in enumerate(places):
+                if row < nu and column < ny:
+                    values[index] = gain[row, column]
+            return values
+
+        start_of = of_gain if self.feedthrough else None
+        return Element(tuple(parameters), measured, inputs, law, start_of)
+
+    def simpler(self) -> Structure | None:
+        """Return a law with one state less; a law needs a state or a feedthrough."""
+        if self.order > (0 if self.feedthrough else 1):
+            return replace(self, order=self.order - 1)
+        return None
 
 
 @dataclass(frozen=True, eq=False)
@@ -1116,6 +1178,7 @@ class Structured:
     """Law of a structure for the signals of a plant, as a function of its free parameters."""
 
     def __init__(self, structure: Structure, signals: Signals) -> None:
+        self._structure, self._signals = structure, signals
         element = structure.element(signals)
         if element.measured is None or element.commanded is None:
             raise InputError(
@@ -1146,6 +1209,33 @@ class Structured:
             raise InputError(
                 "all parameters of the structure are fixed; free one of them"
             )
+
+    @property
+    def simpler(self) -> Structured | None:
+        """Law with fewer states, or None."""
+        structure = self._structure.simpler()
+        return None if structure is None else Structured(structure, self._signals)
+
+    @property
+    def has_gain(self) -> bool:
+        """Whether the law can start as a static gain."""
+        return self._element.of_gain is not None
+
+    def of_gain(self, gain: Array) -> Array:
+        """Return start values for a gain (commanded, measured) of the signals in `used`."""
+        element = self._element
+        assert element.of_gain is not None
+        assert element.measured is not None
+        assert element.commanded is not None
+        full = np.zeros(self._sizes[::-1])
+        measured, commanded = self.used
+        full[np.ix_(commanded, measured)] = gain
+        values = element.of_gain(full[np.ix_(element.commanded, element.measured)])
+        result = _values(self.parameters)
+        for value, place in zip(values.tolist(), self._place, strict=True):
+            if self.free[place]:
+                result[place] = value
+        return result
 
     def law(self, values: Array) -> Law:
         """Return the law from all outputs to all inputs, with derivatives for all parameters."""

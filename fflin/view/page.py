@@ -1,7 +1,7 @@
 """Drawing of robots in a meshcat scene, and the self-contained HTML page of the scene.
 
 Each body is a node of the scene. The visual elements of the body are child nodes of this node.
-Wheels and thrusters are drawn at their positions on the links.
+Wheels, thrusters and constraints are drawn at their positions on the links.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ from fflin.robot.inputs import Thruster, named_wheels
 from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.orbit import CircularOrbit
 from fflin.robot.robot import Robot
+from fflin.view.constraints import constraint_marks
 from fflin.view.shapes import (
     PLAIN,
     Color,
@@ -531,6 +532,7 @@ class Page:
             "triads": triads,
             "nozzles": self.nozzles,
             "wheels": wheels,
+            "constraints": constraint_marks(robot, nodes, robot.constraints),
             "links": self.links,
             "title": robot.name,
             "subtitle": subtitle(robot),

@@ -6,7 +6,7 @@ The page of natural modes animates one mode of a robot at a time.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -36,6 +36,7 @@ from fflin.simulation.plots import (
     styles_of,
 )
 from fflin.simulation.report import DEGREES, STATES, THERE, TRUSTED, Curve, headline
+from fflin.view.constraints import Reaction, constraint_marks, reactions
 from fflin.view.page import Drawing, Page, body_poses, encoded, packed, subtitle
 from fflin.view.shapes import carriers_of
 
@@ -48,6 +49,9 @@ _ANGLE, _SHARE = 0.5, 0.14
 # ARROW is the length of the arrow for the largest force. If the motion extends over more than _FAR,
 # the camera follows the base by default. Both lengths are relative to the robot's size.
 ARROW, _FAR = 0.62, 20.0
+
+# Length of the arrow for the largest force of the constraints, relative to the robot's size.
+REACTION = 0.4
 
 # The flight of a payload before its capture is integrated in steps of at most _STEP [s]. Within a
 # step, the phase of the payload's fastest oscillation changes by at most _SWING [rad].
@@ -157,6 +161,7 @@ def motion_page(
         verdict=headline(motion),
         **panel(robot, motion, shown, goal, predicted, off),
         **marks(page, film, marked_goals),
+        **_constraints(page, reactions(robot, motion, shown)),
         t=packed(t),
         speed=speed,
         follow=follow,
@@ -277,6 +282,32 @@ def marks(page: Page, film: Playback, goals: Array) -> dict[str, object]:
             {**nozzle, "values": packed(film.thrust[:, k])}
             for k, nozzle in enumerate(page.nozzles)
             if np.abs(film.thrust).max(initial=0.0) > THERE
+        ],
+    }
+
+
+def _constraints(page: Page, items: Sequence[Reaction]) -> dict[str, object]:
+    """Return the marks of constraints, with the frames in which they act, and their force arrows.
+
+    The forces of all constraints have one scale. Forces that never exceed THERE have no arrow.
+    """
+    active = {item.constraint.title: item.active for item in items}
+    found = [item.constraint for item in items]
+    marked = [
+        {**mark, "active": packed(active[str(mark["name"])])}
+        for mark in constraint_marks(page.robot, page.nodes, found)
+    ]
+    return {
+        "constraints": marked,
+        "reactions": [
+            {
+                "name": item.constraint.title,
+                "longest": REACTION * page.size,
+                "points": packed(item.point),
+                "values": packed(item.force),
+            }
+            for item in items
+            if _strongest(item.force) > THERE
         ],
     }
 

@@ -71,3 +71,50 @@ def test_a_held_robot_is_simulated_with_its_regulator_and_its_forces():
     code, out, _ = run("simulate", "dual_arm", "--weld", "base", *how)
     assert code == 0
     assert "largest force of constraint 'base'" in out
+
+
+KEPT = ("q_b", "r_b", "left_1", "right_2")
+NAMED = [word for name in KEPT for word in ("--independent", name)]
+
+
+def test_the_independent_coordinates_can_be_named():
+    code, out, _ = run("linearize", *GRASP, *NAMED, "--json")
+    assert code == 0
+    names = json.loads(out)["state_names"]
+    assert names[6:8] == ["q_m.left_1", "q_m.right_2"]
+
+
+def test_gains_have_the_named_coordinates():
+    code, out, _ = run("lqr", *GRASP, *NAMED, "--json")
+    assert code == 0
+    names = json.loads(out)["state_names"]
+    assert names[6:8] == ["q_m.left_1", "q_m.right_2"]
+
+
+def test_robot_files_name_the_independent_coordinates(tmp_path):
+    path = tmp_path / "grasp.toml"
+    path.write_text(
+        f"""
+urdf = "dual_arm"
+independent = {list(KEPT)}
+[[constraint]]
+type = "weld"
+frame = "tool_left"
+to = "tool_right"
+"""
+    )
+    code, out, _ = run("linearize", path, "--json")
+    assert code == 0
+    assert json.loads(out)["state_names"][6:8] == ["q_m.left_1", "q_m.right_2"]
+    path.write_text('urdf = "dual_arm"\nindependent = "q_b"\n')
+    assert "independent is 'q_b', expected a list" in refused("linearize", path)
+
+
+def test_independent_coordinates_need_constraints():
+    message = refused("linearize", "dual_arm", "--independent", "q_b")
+    assert "--independent needs constraints, but 'dual_arm' has none" in message
+
+
+def test_too_few_independent_coordinates_are_refused():
+    message = refused("linearize", *GRASP, *NAMED[:2], *NAMED[4:6])
+    assert "independent names 4 coordinates, expected 8" in message

@@ -8,7 +8,10 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+import fflin
+from fflin.dynamics.closure import redundancy
 from fflin.robot.catalog import bundled_directory
+from tests.support.marks import exhaustive
 
 ROBOTS = bundled_directory()
 
@@ -22,7 +25,18 @@ SUMMARY = {
     "servicer_7dof": (9, 800 + 2 * 24 + 12 + 10 + 9.5 + 8.5 + 6.5 + 5 + 6, ["tool"]),
     "inspector": (10, 424 + 4 * 6 + 6 + 9 + 7 + 3 + 3 + 4, ["tool"]),
     "dual_arm": (8, 240 + 2 * (4 + 5 + 3.8 + 2.4), ["tool_left", "tool_right"]),
+    "grasped_target": (12, 240 + 2 * (4 + 5 + 4 + 3 * 2.5) + 410, ["tool_right"]),
+    "berthed_stack": (
+        7,
+        14288 + 16500 + 2 * 243.66 + 4 * 105.98 + 314.88 + 279.2,
+        ["tool"],
+    ),
+    "scissor_mast": (7, 180 + 4 * 0.6 + 2 * 0.8 + 12, ["foot", "knee", "head"]),
 }
+# Trees of the robot files with constraints: number of rows and rank of the constraints
+CLOSED = {"grasped_target": (6, 6), "berthed_stack": (6, 6), "scissor_mast": (15, 6)}
+# Frames of tools and of constraints, which have no mass
+FRAMES = {"handle", "port", "foot", "knee", "head", "top"}
 NAMES = sorted(SUMMARY)
 
 # Published: link -> mass, centre of mass, (ixx, iyy, izz, ixy, ixz, iyz); absent products are zero
@@ -96,7 +110,8 @@ BREAK_TRIANGLE = {("ets_vii", "link_1"), ("ets_vii", "link_2"), ("ets_vii", "lin
 
 
 def path(name):
-    return ROBOTS / f"{name}.urdf"
+    folder = ROBOTS / "trees" if name in CLOSED else ROBOTS
+    return folder / f"{name}.urdf"
 
 
 def root(name):
@@ -134,7 +149,8 @@ def inertials(name):
 
 
 def test_exactly_these_robots():
-    assert sorted(p.stem for p in ROBOTS.glob("*.urdf")) == NAMES
+    assert sorted(p.stem for p in ROBOTS.rglob("*.urdf")) == NAMES
+    assert {p.stem for p in (ROBOTS / "trees").iterdir()} == set(CLOSED)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -262,8 +278,9 @@ def test_file_conventions(name):
     ] == ["base"]
     assert "floating" not in {j.get("type") for j in robot.iter("joint")}
     for link in robot.iter("link"):
-        # only frames of tools may be without mass
-        assert (link.find("inertial") is None) == link.get("name").startswith("tool")
+        # only frames of tools and of constraints may be without mass
+        frame = link.get("name").startswith("tool") or link.get("name") in FRAMES
+        assert (link.find("inertial") is None) == frame
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -281,3 +298,51 @@ def test_visuals(name):
         build(name), str(path(name)), pin.GeometryType.VISUAL
     )
     assert shapes.ngeoms == len(visuals)
+
+
+@pytest.mark.parametrize("name", sorted(CLOSED))
+def test_closed_robots_load_by_name_closed_at_the_neutral_configuration(name):
+    robot = fflin.load(name)
+    found = redundancy(robot, robot.neutral())
+    assert (found.rows, found.rank) == CLOSED[name]
+    assert found.free == 6 + robot.n - found.rank
+    q = fflin.closed(robot, robot.neutral())
+    assert np.abs(q - robot.neutral()).max() < 1e-10  # 12 digits in the file
+
+
+@pytest.mark.parametrize(
+    "name", ["scissor_mast", *exhaustive("berthed_stack", "grasped_target")]
+)
+def test_closed_robots_are_verified_and_regulated(name):
+    robot = fflin.load(name)
+    lin = fflin.linearize(robot)
+    assert fflin.check(robot, lin).ok
+    assert fflin.controllability(lin).controllable
+    gain = fflin.lqr(lin)
+    assert np.linalg.eigvals(lin.A - lin.B @ gain.K).real.max() < 0
+    q0 = fflin.closed(robot, fflin.configuration(robot, rpy=(2, 0, 0)))
+    policy = fflin.StateFeedback(lin, gain)
+    motion = fflin.simulate(robot, policy, q0=q0, duration=0.2, dt=0.1)
+    assert np.abs(motion.momentum_drift).max() < 1e-12
+
+
+def test_scissor_mast_extends_as_its_bars_turn():
+    # The bars of 1 m stand at asin(z) for a cell of height z; the carriage is at cos of it.
+    robot = fflin.load("scissor_mast")
+    robot = robot.replace(constraints=[*robot.constraints, fflin.Weld("base")])
+    fflin.closed(robot, robot.neutral())
+    model, data = robot.model, robot.create_data()
+    for carriage in (-0.3, -0.1, 0.1):
+        guess = fflin.configuration(robot, {"carriage": carriage})
+        placement = pin.SE3(np.eye(3), np.array([0.4 + carriage, 0.0, 0.35]))
+        held = robot.replace(
+            constraints=[
+                *robot.constraints,
+                fflin.Weld("carriage_link", "base", placement=placement),
+            ]
+        )
+        q = fflin.closed(held, guess)
+        pin.framesForwardKinematics(model, data, q)
+        height = data.oMf[model.getFrameId("platform_link")].translation[2] - 0.35
+        width = 0.8 + carriage
+        assert height == pytest.approx(2 * np.sqrt(1 - width**2), abs=1e-10)

@@ -1,6 +1,7 @@
-// What is fixed to the robot's bodies and has no shape in its URDF: axes, thrusters and wheels.
+// What is fixed to the robot's bodies and has no shape in its URDF: axes, thrusters, wheels and
+// constraints.
 
-const NOZZLE = "#c9d2e0", WHEEL = "#8fe0ff";
+const NOZZLE = "#c9d2e0", WHEEL = "#8fe0ff", CONSTRAINT = "#9be564";
 
 function triad({ length, position, quaternion }) {
   const group = new THREE.Group();
@@ -49,7 +50,33 @@ function wheel({ position, quaternion, spins, path }, size, viewer) {
   return group;
 }
 
-// Put the equipment on the robot. Returns what shows it at the poses that the bodies have.
+// A bolt for a weld, a ring with its pin along z for a hinge, a ball in its socket for a spherical.
+function constraint({ kind, position, quaternion, active }, size) {
+  const r = 0.022 * size, group = new THREE.Group(), material = seenThrough(CONSTRAINT);
+  material.opacity = 0.85;
+  const add = (geometry) => {
+    const mesh = new THREE.Mesh(geometry, material);
+    mesh.renderOrder = 5;
+    group.add(mesh);
+  };
+  const rod = (radius, length, sides) => new THREE.CylinderGeometry(radius, radius, length, sides).rotateX(Math.PI / 2);
+  if (kind === "weld") {
+    add(rod(r, 0.7 * r, 6).translate(0, 0, 0.6 * r));
+    add(rod(0.45 * r, 2 * r, 16).translate(0, 0, -0.6 * r));
+  } else if (kind === "hinge") {
+    add(new THREE.TorusGeometry(r, 0.22 * r, 12, 40));
+    add(rod(0.25 * r, 3 * r, 16));
+  } else {
+    add(new THREE.SphereGeometry(0.6 * r, 24, 16));
+    add(new THREE.TorusGeometry(r, 0.12 * r, 10, 40));
+  }
+  group.position.set(...position);
+  group.quaternion.set(...quaternion);
+  if (active) group.show = (i) => { group.visible = i === undefined || active[i] > 0; };
+  return group;
+}
+
+// Put the equipment on the robot. Returns what shows it at the poses that the bodies have in frame i.
 function makeEquipment(viewer, info) {
   const shows = [];
   const add = (each, name, mark) => {
@@ -59,5 +86,6 @@ function makeEquipment(viewer, info) {
   info.triads.forEach((each, k) => add(each, `frame ${k}`, triad({ ...each, length: (k ? 0.12 : 0.3) * info.size })));
   info.nozzles.forEach((each, k) => add(each, `nozzle ${k}`, nozzle(each, info.size)));
   info.wheels.forEach((each, k) => add(each, `wheel ${k}`, wheel(each, info.size, viewer)));
-  return () => shows.forEach((show) => show());
+  info.constraints.forEach((each, k) => add(each, `constraint ${k}`, constraint(each, info.size)));
+  return (i) => shows.forEach((show) => show(i));
 }

@@ -1,7 +1,8 @@
 // From the data of the page to the picture.
 
 function decode(text) {
-  const bytes = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
+  const letters = atob(text), bytes = new Uint8Array(letters.length);
+  for (let i = 0; i < letters.length; i++) bytes[i] = letters.charCodeAt(i);
   return bytes;
 }
 
@@ -22,6 +23,17 @@ function extent(points) {
   return Math.max(...high.map((x, k) => x - low[k]));
 }
 
+// The entries of constraints and of their forces, which share one scale.
+function constraintsOf({ constraints, reactions }) {
+  if (!constraints.length) return [];
+  const names = constraints.map(({ name }) => name).join(", ");
+  const label = constraints.length > 3 ? `${constraints.length} constraints` : `constraint${constraints.length > 1 ? "s" : ""} ${names}`;
+  const entries = [{ label, colour: CONSTRAINT, paths: constraints.map(({ path }, k) => [...path, `constraint ${k}`]) }];
+  if (!reactions.length) return entries;
+  const scale = `force of constraints (longest: ${figure(strongest(reactions), 2)} N)`;
+  return [...entries, { label: scale, colour: CONSTRAINT, paths: [["meshcat", "reactions"]] }];
+}
+
 // What is drawn beside the robot and can be seen; each can be switched off.
 function legendOf(info) {
   const entry = (label, colour, ...path) => ({ label, colour, paths: [["meshcat", ...path]] });
@@ -30,6 +42,7 @@ function legendOf(info) {
     ...info.trails.filter(({ points }) => extent(points) > 0.02 * info.size).map(({ name }) => entry(`path of the ${name}`, MARKS[name], "trails", name)),
     ...Object.entries({ wheel: WHEEL, nozzle: NOZZLE }).filter(([kind]) => info[`${kind}s`].length).map(([kind, colour]) => (
       { label: kind === "wheel" ? "wheels" : "thrusters", colour, paths: info[`${kind}s`].map(({ path }, k) => [...path, `${kind} ${k}`]) })),
+    ...constraintsOf(info),
     ...info.arrows.map(({ kind, unit, values }) => entry(`${kind} on the base (longest: ${figure(largest(values, 3), 2)} ${unit})`, MARKS[kind], "wrench", kind)),
   ];
   const rest = info.rest === null ? "" : `, at rest from ${Number(info.rest.toPrecision(4))} s`;
@@ -95,8 +108,9 @@ function main() {
   }
 
   info.t = floats(info.t);
-  for (const each of [...info.trails, ...info.followed]) each.points = floats(each.points);
-  for (const each of [...info.arrows, ...info.plumes, ...info.readouts]) each.values = floats(each.values);
+  for (const each of [...info.trails, ...info.followed, ...info.reactions]) each.points = floats(each.points);
+  for (const each of [...info.arrows, ...info.plumes, ...info.reactions, ...info.readouts]) each.values = floats(each.values);
+  for (const each of info.constraints) each.active = floats(each.active);
   for (const plot of info.plots) for (const line of plot.lines) for (const key of ["values", "reference", "linear"]) line[key] = floats(line[key]);
   markFirst(info.plots);
   for (const plot of info.plots) if (plot.raster) for (const line of plot.lines) line.pulses = decode(line.pulses);
@@ -118,7 +132,7 @@ function main() {
   const player = makePlayer(viewer, info, quality, (i, time) => {
     turn(time);
     showMarks(i);
-    showEquipment();
+    showEquipment(i);
     showFigures(i);
     showLink();
     stamp.textContent = `t = ${figure(time, 3)} s${showPhase(time)}`;

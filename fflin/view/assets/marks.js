@@ -1,4 +1,4 @@
-// What is drawn about the robot: trails, forces, torques and plumes of thrusters.
+// What is drawn about the robot: trails, forces, torques, reactions and plumes of thrusters.
 
 const MARKS = { tool: "#ff9d4d", base: "#7fe3c4", "centre of mass": "#7fe3c4", force: "#ffd166", torque: "#d58cff" };
 
@@ -12,6 +12,8 @@ function largest(values, size) {
   }
   return Math.sqrt(square);
 }
+
+const strongest = (reactions) => Math.max(0, ...reactions.map(({ values }) => largest(values, 3)));
 
 function flat(colour) {
   return new THREE.MeshBasicMaterial({ color: new THREE.Color(colour).convertSRGBToLinear(), toneMapped: false });
@@ -93,6 +95,21 @@ function forceArrow({ colour, values, longest, size }) {
     group.visible = length > 0.004 * size;
     if (!group.visible) return;
     group.setLength(length);
+    group.quaternion.setFromUnitVectors(UP, force.normalize());
+  };
+  return group;
+}
+
+// The force of a constraint, at the frame on which it acts; all constraints have one scale.
+function reactionArrow({ points, values, longest, most, size }) {
+  const group = arrow(CONSTRAINT, 0.008 * size, seenThrough(CONSTRAINT));
+  group.show = (i) => {
+    const force = new THREE.Vector3().fromArray(values, 3 * i);
+    const length = (longest * force.length()) / most;
+    group.visible = length > 0.004 * size;
+    if (!group.visible) return;
+    group.setLength(length);
+    group.position.fromArray(points, 3 * i);
     group.quaternion.setFromUnitVectors(UP, force.normalize());
   };
   return group;
@@ -182,6 +199,8 @@ function makeMarks(viewer, info) {
   for (const each of info.arrows) {
     add(["meshcat", "wrench", each.kind], (each.kind === "force" ? forceArrow : torqueArrow)({ ...each, colour: MARKS[each.kind], size }));
   }
+  const most = strongest(info.reactions);
+  info.reactions.forEach((each, k) => add(["meshcat", "reactions", `${k}`], reactionArrow({ ...each, most, size })));
   info.plumes.forEach((each, k) => add([...each.path, `plume ${k}`], plume({ ...each, size })));
   return (i) => {
     wrench.position.copy(base.position);
