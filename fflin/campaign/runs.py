@@ -50,8 +50,8 @@ KINDS = {
     "v_b": "m/s",
     "joint rates": "rad/s|m/s",
 }
-# Errors that only some robots have. They have no settling time.
-WHEEL_SPEEDS, MODES = "wheel speeds", "modes"
+# Like the wheel speeds, an error that only some robots have. Neither has a settling time.
+MODES = "modes"
 # Attitude error [deg] above which a run of `validity` or `funnel` counts as having left the chart.
 # The chart ends at 180 deg.
 EDGE = 176.0

@@ -56,7 +56,13 @@ from fflin.dynamics.state import StateMap, selection
 from fflin.linear.model import Delay, LinearModel
 from fflin.robot.fields import chosen_limits, input_keys_of
 from fflin.robot.robot import Robot
-from fflin.simulation.pace import Pace, Signal, limits_of_step
+from fflin.simulation.pace import (
+    LONGEST_STEP,
+    SLOW_STEP,
+    Pace,
+    Signal,
+    limits_of_step,
+)
 from fflin.simulation.plant import LARGEST_TURN, Disturbance, Plant
 
 Event: TypeAlias = Callable[[float, Array, Array], float]
@@ -171,7 +177,7 @@ class Plan:
             plant, policy, commands, self.q, self.v, u, sample or 0.0
         )
         limits += _signals(plant, self.q, self.v, dt, duration)
-        pace = Pace(limits, self.method, duration)
+        pace = Pace(limits, self.method, duration, _longest_step(plant, policy))
         late = delays_of(policy, plant, options.delay)
         self.times = times = times_of(options, duration, sample, pace, late)
         if policy and times.sample:
@@ -541,6 +547,17 @@ def delays_of(
             "the inputs of the simulated robot; give delay= with one delay for all"
         )
     return delays
+
+
+def _longest_step(plant: Plant, policy: Policy | None) -> float:
+    """Return the longest default step [s].
+
+    It is longer for magnetorquers and for laws that repeat, which act slowly, over many orbits.
+    """
+    trajectory = policy.followed_trajectory if policy else None
+    if plant.actuation.torquers or (trajectory is not None and trajectory.period):
+        return SLOW_STEP
+    return LONGEST_STEP
 
 
 def step_of(

@@ -124,9 +124,10 @@ def simulate(
     duration : float, optional
         Simulated time [s]; by default the duration of the followed trajectory.
     dt : float, optional
-        Integration step [s]; by default 0.01, or less if the fastest pole of the loop or the
-        sample time requires a shorter step. For continuous-time policies without delay, the step
-        is adjusted so that the duration is a whole number of steps.
+        Integration step [s]; by default 0.01, or 1 for magnetorquers and for laws that repeat, or
+        less if the fastest pole of the loop or the sample time requires a shorter step. For
+        continuous-time policies without delay, the step is adjusted so that the duration is a
+        whole number of steps.
     method : {"cf4", "semi_implicit_euler"}
         Integration method.
     project : bool
