@@ -1,5 +1,6 @@
 """Dispersions: random changes of the robot, sensors, delay and initial state of each run."""
 
+import math
 import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -23,8 +24,9 @@ from fflin.base.validation import Array, Indices, untied
 from fflin.base.validation import by_name as mapping
 from fflin.base.writing import reason
 from fflin.campaign.spreads import SEED, SEEDS, Inverse, inverse_of
-from fflin.control.data_sheet import output_keys
+from fflin.control.data_sheet import Deviations, output_keys
 from fflin.control.policy import Command, Policy, bound
+from fflin.control.sensor_errors import SensorErrors
 from fflin.dynamics.coordinates import PIN_ANGULAR, PIN_LINEAR
 from fflin.dynamics.disturbance import Plate
 from fflin.dynamics.state import StateMap
@@ -45,7 +47,7 @@ from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.mass_properties import properties, varied
 from fflin.robot.robot import Robot
 from fflin.simulation.extension import DRAG, SUNLIGHT
-from fflin.simulation.lanes import DISTURBANCE, disturbances_of, noise_generator
+from fflin.simulation.lanes import DISTURBANCE, disturbances_of
 from fflin.simulation.plan import Times
 from fflin.simulation.plant import Plant
 
@@ -59,7 +61,9 @@ _ONE_SIGMA = np.array([0.15865525393145707, 0.8413447460685429])
 _AXES = {"com": "xyz", "inertia": "xyz", "misalignment": "12"}
 _OF_BODIES = ("mass", "com", "inertia", "density")
 _OF_INPUTS, _OF_SPRINGS = ("gain", "bias", "fails"), ("stiffness", "damping")
-_OF_SENSORS = ("sensor", "noise")
+_OF_SENSORS = ("sensor", "noise", "drift")
+# Kinds that need a sampled law, and whose number is the value in all runs.
+_RANDOM_ERRORS = ("noise", "drift")
 _DISTURBANCES = tuple(f"{name}.{axis}" for name in UNITS for axis in "xyz")
 # Kind of the relative changes of the amplitudes of periodic disturbances.
 _AMPLITUDE = "amplitude"
@@ -98,6 +102,7 @@ class Dispersions:
         x0: Array,
         seed: int,
         times: Times,
+        declared: Deviations | None = None,
     ) -> None:
         self._plant, self._policy, self._x0, self._seed = plant, policy, x0, seed
         self._times = times
@@ -140,15 +145,17 @@ class Dispersions:
                 )
             if kind in _OF_SENSORS:
                 head = output_keys([head], sensors)[head]
-            inverse = inverse_of(str(key), plain_spread, fixed=kind == "noise")
+            inverse = inverse_of(str(key), plain_spread, fixed=kind in _RANDOM_ERRORS)
             by_kind.setdefault(kind, {})[head] = inverse, group
         if not by_kind:
             raise InputError(
                 "dispersions is empty; give at least one dispersion, such as {'q_b': 0.05}"
             )
+        if declared is not None:
+            _add_declared(by_kind, declared, sensors)
         self._kinds = {*by_kind}
         self.columns: list[Column] = []
-        if "noise" in by_kind:
+        if self._kinds & {*_RANDOM_ERRORS}:
             self.columns.append(Column(SEED, "seed", [0], 0, SEEDS))
         for kind, spreads in by_kind.items():
             self._add(kind, spreads, " | ".join(kinds))
@@ -185,7 +192,7 @@ class Dispersions:
         names = self._known[kind]
         if not names:
             self._refuse(kind, next(iter(spreads)))
-        if kind in ("noise", "delay") and not self._times.sample:
+        if kind in (*_RANDOM_ERRORS, "delay") and not self._times.sample:
             raise InputError(
                 f"{kind} is dispersed, but the policy is continuous, and {kind} applies only to "
                 "a sampled policy; give sample=, a multiple of dt (--sample on the command line)"
@@ -537,15 +544,7 @@ class Dispersions:
             pointed["bodies"] += runs.get("bodies", tree.bodies)
             runs |= pointed
         if self._kinds & {*_OF_SENSORS}:
-            sensors = self._known["sensor"]
-            of_outputs = self._policy is not None and self._policy.senses_outputs
-            names = sensors if of_outputs else plant.state.names
-            fed = [names.index(name) for name in sensors]
-            for key, kind in (("sensed", "sensor"), ("noise", "noise")):
-                runs[key] = np.zeros((count, len(names)))
-                runs[key][:, fed] = self._of(kind, drawn)
-            if "noise" in self._kinds:
-                runs["seed"] = self._of("seed", drawn)[:, 0]
+            runs |= self._sensors_in_lanes(drawn)
         if self._kinds & {DISTURBANCE, _AMPLITUDE}:
             waves = disturbances_of(plant.robot, dispersed=True)
             vectors = np.tile([wave.vector for wave in waves], (count, 1, 1))
@@ -561,6 +560,30 @@ class Dispersions:
         if "delay" in self._kinds:
             runs["delay"] = self.delays(drawn)
         return runs
+
+    def _sensors_in_lanes(self, drawn: Array) -> dict[str, Array]:
+        """Return the arrays of `in_lanes` for the errors of sensors."""
+        sensors, plant = self._known["sensor"], self._plant
+        of_outputs = self._policy is not None and self._policy.senses_outputs
+        names = sensors if of_outputs else plant.state.names
+        fed = [names.index(name) for name in sensors]
+        kinds = {"sensed": "sensor", "noise": "noise"}
+        if "drift" in self._kinds:
+            kinds["drift"] = "drift"
+        arrays = dict[str, Array]()
+        for key, kind in kinds.items():
+            arrays[key] = np.zeros((len(drawn), len(names)))
+            arrays[key][:, fed] = self._of(kind, drawn)
+        if "drift" in arrays:
+            arrays["drift"] *= self._root_of_sample
+        if self._kinds & {*_RANDOM_ERRORS}:
+            arrays["seed"] = self._of("seed", drawn)[:, 0]
+        return arrays
+
+    @property
+    def _root_of_sample(self) -> float:
+        """Square root of the sampling time of the law [s^0.5]."""
+        return math.sqrt(self._times.sample * self._times.dt)
 
     def one(self, drawn: Array) -> tuple[Plant, Policy | None, Array, Array]:
         """Return the plant, the policy, and the initial q and v of a run with drawn values (k,)."""
@@ -589,8 +612,12 @@ class Dispersions:
             plates = [self._plate_factors(kind, rows)[0] for kind in _OF_PLATES]
             robot = _with_plates(robot, *plates)
         if policy and self._kinds & {*_OF_SENSORS}:
-            errors = (self._of(kind, rows)[0] for kind in (*_OF_SENSORS, "seed"))
-            policy = with_sensor_errors(policy, *errors)
+            bias, noise, drift, (seed,) = (
+                self._of(kind, rows)[0] for kind in (*_OF_SENSORS, "seed")
+            )
+            policy = with_sensor_errors(
+                policy, bias, noise, seed, self._root_of_sample * drift
+            )
         if "misalignment" in self._kinds:
             robot = _misaligned(robot, self._of("misalignment", rows)[0])
             if policy and policy.commanded_robot:
@@ -689,23 +716,38 @@ def _scaled(term: DisturbanceTerm, factors: Array) -> DisturbanceTerm:
 
 
 def with_sensor_errors(
-    policy: Policy, bias: Array, deviation: Array, seed: Array
+    policy: Policy,
+    bias: Array,
+    deviation: Array,
+    seed: float,
+    steps: Array | None = None,
 ) -> Policy:
-    """Add a bias and white noise to the measurements (ny,) of a policy; return the new policy.
+    """Add errors to the measurements (ny,) of a policy; return the new policy.
 
     The measurements are the states or outputs that the policy feeds back. `deviation` (ny,)
-    contains the standard deviations of the noise. `seed` (1,) is the seed of the noise.
+    contains the standard deviations of the noise, and `steps` (ny,) those of the change of the bias
+    from sample to sample.
     """
-    generator = noise_generator(seed[0])
+    if steps is None:
+        steps = np.zeros(len(bias))
     given = policy.measurement_noise
+    return policy.with_sensor_errors(SensorErrors(bias, deviation, steps, seed, given))
 
-    def error(t: float) -> Array:
-        drawn: Array = bias + deviation * generator.standard_normal(len(bias))
-        if given is not None:
-            drawn = drawn + np.asarray(given(t))
-        return drawn
 
-    return policy.with_sensor_errors(error)
+def _add_declared(
+    by_kind: dict[str, dict[str, tuple[Inverse, str]]],
+    declared: Deviations,
+    sensors: tuple[str, ...],
+) -> None:
+    """Add the errors that outputs declare, unless the dispersions contain this error."""
+    for kind in _RANDOM_ERRORS:
+        spreads = by_kind.get(kind, {})
+        given = by_name(f"{kind} to disperse", spreads, sensors)
+        for at, size in enumerate(getattr(declared, kind).tolist()):
+            if size and at not in given:
+                name = sensors[at]
+                inverse = inverse_of(f"{name}.{kind}", size, fixed=True)
+                by_kind.setdefault(kind, {})[name] = inverse, ""
 
 
 def _parameters(axes: Array, mass: Array, com: Array, inertia: Array) -> Array:

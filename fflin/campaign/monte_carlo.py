@@ -43,6 +43,7 @@ _OPTIONS = {option.name for option in fields(SimulationOptions)} - {
     "every",
     "progress",
     "engine",
+    "seed",
 }
 
 
@@ -130,6 +131,9 @@ def monte_carlo(
           `TrajectoryOutputFeedback` measures. ``NAME.noise``: white noise added to this measurement
           at each sample. If the spread is a number, it is the standard deviation of the noise in
           all runs. From any other spread, a standard deviation is drawn for each run.
+          ``NAME.drift``: standard deviation of the random change of the sensor's bias within 1 s.
+          By default, noise and drift are those that the robot's outputs declare, see `Output`; the
+          option ``noise=0`` leaves them out.
         - ``delay`` [s]: change of the argument `delay` of `simulate`. The total delay is rounded to
           whole steps; a negative total becomes 0.
         - ``JOINT.stiffness`` and ``JOINT.damping``: relative changes from the nominal values.

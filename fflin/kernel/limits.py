@@ -117,11 +117,8 @@ LIMITS = (
         "the magnetic field of '{}' is a function, which is called in Python",
     ),
     Limit(
-        lambda task: (
-            (not task.simulated or len(task.robots) > 1)
-            and task.first(_has_magnetorquer)
-        ),
-        "sweeps and allocations with the magnetorquers of '{}' are computed in Python",
+        lambda task: "" if task.simulated else task.first(_has_magnetorquer),
+        "sweeps of '{}' with its magnetorquers are computed in Python",
     ),
     Limit(
         lambda task: task.first(_has_other_joint),

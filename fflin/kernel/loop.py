@@ -327,10 +327,10 @@ def _ask(work, robot, orbit, law, extension, channel, point, t, step, stage):
     """Write the command of the policy to `point.u`, and correct the memory of the policy."""
     count = step // max(channel.sample, 1)
     command(work, robot, orbit, law, extension, point, t, count, stage)
-    allocate(law.allocation, point, law.u)
+    allocate(law.allocation, orbit, point, law.u, t)
     if len(law.filter.E) > 0:
         limit(channel, point.u)
-        write_difference(law.allocation, point, law.u)
+        write_difference(law.allocation, orbit, point, law.u)
         correct(law, count, stage)
 
 

@@ -20,6 +20,7 @@ from fflin.base.validation import Array, Indices, Mask, shaped, vector
 from fflin.control.channel import channel_of
 from fflin.control.loops import Loop, Sample, measured_at
 from fflin.control.policy import BDotForm, Form, OutputForm, PathForm, Policy, StateForm
+from fflin.control.sensor_errors import drift_generator, noise_generator
 from fflin.control.tracking import AT_THE_END, TrajectoryFeedback
 from fflin.dynamics.disturbance import Wave, waves_of
 from fflin.dynamics.orbital import OrbitField, mean_motion
@@ -161,11 +162,6 @@ def _measurement_error(state: StateMap) -> str:
     except InputError as error:
         return str(error)
     return ""
-
-
-def noise_generator(seed: float) -> np.random.Generator:
-    """Return the random generator for the sensor noise of a run with the given seed."""
-    return np.random.Generator(np.random.Philox(np.random.SeedSequence(int(seed))))
 
 
 def noises(plan: Plan, size: int, step: int, last: int) -> tuple[Indices, Array]:
@@ -427,8 +423,13 @@ class LaneLoop:
         deviation = runs.get("noise", zero)[of_lane].T
         errors[:] = bias
         generators = list[np.random.Generator]()
+        drifting = list[np.random.Generator]()
         if "seed" in runs:
             generators = [noise_generator(seed) for seed in runs["seed"][of_lane]]
+        if "drift" in runs:
+            drifting = [drift_generator(seed) for seed in runs["seed"][of_lane]]
+        steps = runs.get("drift", zero)[of_lane]
+        drift = np.zeros((self.lanes, size))
         drawn_until = 0
 
         def write_noise(step: int, last: int) -> None:
@@ -443,6 +444,11 @@ class LaneLoop:
             for lane, generator in enumerate(generators):
                 normal = generator.standard_normal(noise.shape)
                 errors[rows, :, lane] += deviation[:, lane] * normal
+            for lane, generator in enumerate(drifting):
+                changes = steps[lane] * generator.standard_normal(noise.shape)
+                path = np.cumsum(np.vstack((drift[lane], changes)), axis=0)
+                errors[rows, :, lane] += path[:-1]
+                drift[lane] = path[-1]
 
         return write_noise
 

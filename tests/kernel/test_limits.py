@@ -52,9 +52,7 @@ TASKS = {
     "the magnetic field of 'cubesat' is a function": Task(
         robots=(in_field(lambda t, position: np.zeros(3)),), simulated=True
     ),
-    "sweeps and allocations with the magnetorquers of 'cubesat'": Task(
-        robots=(in_field("dipole"),)
-    ),
+    "sweeps of 'cubesat' with its magnetorquers": Task(robots=(in_field("dipole"),)),
     "a joint of 'composite' does not": Task(robots=(with_displaced_axis(),)),
     "the root joint of 'displaced'": Task(
         robots=(with_displaced_root(),), simulated=True
