@@ -21,7 +21,7 @@ from fflin.tuning.channels import Ends, channel_of, ends_of
 from fflin.tuning.goals import Goal, MaxGain
 from fflin.tuning.law import Law, law_of
 from fflin.tuning.plant import Plant, plant_of, signals_of
-from fflin.tuning.structures import Names, indices
+from fflin.tuning.structures import Names, indices, input_indices
 from fflin.tuning.tuned import matrices_of
 from fflin.tuning.verification import largest_in_band
 
@@ -146,7 +146,7 @@ def hinf(
         raise InputError(f"goals are {goals!r}, expected one goal or more")
     signals = signals_of(lin)
     rows = indices("output", measured, signals.outputs)
-    columns = indices("input", inputs, signals.inputs)
+    columns = input_indices(inputs, signals)
     ends = []
     for goal in every:
         instance("goal", goal, MaxGain, "a fflin.MaxGain, the goal of hinf")
