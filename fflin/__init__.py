@@ -57,7 +57,8 @@ _PUBLIC = {
         "linear.fit": "line_up",
         "control.weights": "bryson sampled_cost",
         "control.gain": "Gain",
-        "control.margins": "margins Margins ChannelMargins",
+        "control.margins": "margins",
+        "control.loop_margins": "Margins ChannelMargins",
         "control.plan": "plan",
         "control.unloading": "unload_wheels",
         "control.mpc": "mpc",
@@ -82,6 +83,7 @@ _PUBLIC = {
         "Structure",
         "tuning.goals": "Goal MaxGain RollOff Margin Decay Damping Variance Track",
         "tuning.hinf": "hinf HInfinity",
+        "tuning.plots": "plot_tuned",
     },
     "Policies": {
         "control.policy": "Policy StateForm",

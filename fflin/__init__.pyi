@@ -96,8 +96,8 @@ from fflin.linear.fit import line_up as line_up
 from fflin.control.weights import bryson as bryson
 from fflin.control.gain import Gain as Gain
 from fflin.control.margins import margins as margins
-from fflin.control.margins import Margins as Margins
-from fflin.control.margins import ChannelMargins as ChannelMargins
+from fflin.control.loop_margins import Margins as Margins
+from fflin.control.loop_margins import ChannelMargins as ChannelMargins
 from fflin.control.lqr import acceleration_lqr as acceleration_lqr
 from fflin.control.weights import sampled_cost as sampled_cost
 from fflin.control.plan import plan as plan
@@ -145,6 +145,7 @@ from fflin.tuning.goals import Variance as Variance
 from fflin.tuning.goals import Track as Track
 from fflin.tuning.hinf import hinf as hinf
 from fflin.tuning.hinf import HInfinity as HInfinity
+from fflin.tuning.plots import plot_tuned as plot_tuned
 
 # Policies
 from fflin.control.policy import Policy as Policy

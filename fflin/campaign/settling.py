@@ -19,6 +19,7 @@ from fflin.batch.run import Execution, Progress
 from fflin.campaign.runs import EDGE, CampaignJob, completed
 from fflin.control.gain import Gain, gain_matrix, regulated_states
 from fflin.control.policies import StateFeedback
+from fflin.control.policy import Policy
 from fflin.dynamics.integrators import DEFAULT_INTEGRATOR, held_exponential
 from fflin.dynamics.state import StateMap
 from fflin.linear.fit import require_fit
@@ -57,6 +58,11 @@ class Loop:
     def __init__(self, robot: Robot, lin: LinearModel, gain: object) -> None:
         instance("robot", robot, Robot, "a fflin.Robot")
         instance("lin", lin, LinearModel, "a fflin.LinearModel")
+        if isinstance(gain, Policy) and gain.feedback_gain is None:
+            raise InputError(
+                f"gain is a {gain.kind}, expected a gain of the states, as from fflin.lqr; use "
+                "fflin.monte_carlo for the range of other laws"
+            )
         refuse_delayed(lin, "the comparison of linear and nonlinear motions")
         refuse_frozen(lin, "the comparison of linear and nonlinear motions")
         # A gain with integral action must be given itself, because its matrix has more columns.

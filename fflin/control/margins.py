@@ -3,197 +3,36 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from functools import partial
-from typing import Literal, NamedTuple
 
 import numpy as np
 
 from fflin.base.errors import InputError
-from fflin.base.html import Reported
 from fflin.base.names import input_keys
 from fflin.base.process import in_one_thread
-from fflin.base.tables import cut, folded, grid
-from fflin.base.validation import (
-    Array,
-    FrozenArrays,
-    Values,
-    instance,
-    number,
-    positive,
-)
+from fflin.base.validation import instance, number, positive
+from fflin.control.closed_loop import ClosedLoop
 from fflin.control.delayed import is_delayed, law_with_memory
 from fflin.control.gain import Gain
 from fflin.control.gain import Margins as GainMargins
-from fflin.control.optimal.channel_limits import (
-    Crossing,
-    Grid,
-    channel_limits,
-    log_gain,
-    loop_gain,
+from fflin.control.lags import (
+    designed_lags,
+    lags_of_model,
+    model_with_lags,
+    robot_lags,
+    warn_of_lags,
 )
-from fflin.control.optimal.disk import (
-    Loop,
-    as_continuous,
-    disk_gain,
-    disk_phase,
-    largest_scaled_gain,
-    largest_structured_gain,
-)
-from fflin.control.optimal.largest_gain import largest_gain
+from fflin.control.loop_margins import Margins, Place
+from fflin.control.optimal.disk import disk_gain, disk_phase
+from fflin.control.periodic_closed_loop import PeriodicClosedLoop
 from fflin.control.policy import Policy, System, as_policy
-from fflin.dynamics.delays import HeldSystem, split
-from fflin.linear.holding import lags_by_name
+from fflin.control.sensed_laws import sensed_systems
+from fflin.control.sensors import sensors_of_model, timing_of
 from fflin.linear.model import LinearModel, refuse_frozen
 
-Place = Literal["inputs", "outputs"]
-
-# Order of the Pade approximation of a delay in continuous time. Up to an angle of 6 rad its phase
-# error is below 1e-9 rad.
-_PADE = 10
-
-# A pole counts as stable if its decay rate, or 1 - |z|, exceeds this fraction of the largest pole
-# magnitude.
-_ROUNDING = 1e-9
-
-# Stability of a sampled loop is tested at _FRACTIONS parts of each of the first two samples of
-# delay, and then at each sample up to _LONGEST. A delay may have at most _MOST_SAMPLES samples.
-_FRACTIONS = 10
-_LONGEST = 40
-_MOST_SAMPLES = 500
-
-# The report of a simulation contains no margins if the loop has more states than this.
+# The report of a simulation contains no margins if the loop has more states than this, or if a
+# periodic loop has more harmonics of all channels.
 _MOST_STATES = 250
-
-# Number of frequencies of the grid on which a continuous loop with a delay is examined.
-_GRID = 600
-
-
-class ChannelMargins(NamedTuple):
-    """Margins of one input or output, with the loops of all others closed.
-
-    Attributes
-    ----------
-    name : str
-        Name of the input or output.
-    gain : tuple of float
-        Least and largest gain factor between which the loop is stable.
-    gain_frequencies : tuple of float
-        Frequencies [rad/s] of the oscillations at these factors; NaN if there is no limit.
-    phase : float
-        Phase margin [deg], at most 180: lag or lead at which the loop becomes unstable.
-    phase_frequency : float
-        Frequency [rad/s] of the oscillation at the phase margin; NaN if there is none.
-    delay : float
-        Delay margin [s]: additional delay at which the loop becomes unstable; may be infinite.
-    disk : float
-        Symmetric disk margin, at most 2.
-    disk_frequency : float
-        Frequency [rad/s] at which the disk margin is reached.
-
-    Examples
-    --------
-    >>> lin = fflin.linearize(fflin.load("planar_detumble"))
-    >>> channel = fflin.margins(fflin.lqr(lin), lin).channels[0]
-    >>> channel.name, channel.phase > 60.0
-    ('tau_b.x', True)
-    """
-
-    name: str
-    gain: tuple[float, float]
-    gain_frequencies: tuple[float, float]
-    phase: float
-    phase_frequency: float
-    delay: float
-    disk: float
-    disk_frequency: float
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Margins(FrozenArrays, Reported):
-    r"""Margins of a linear loop for changes in each channel, and in all channels at once.
-
-    The signal of each channel is multiplied by a complex factor
-    :math:`f = (1 + \delta/2)/(1 - \delta/2)`. The disk margin is the largest number below which all
-    :math:`|\delta|` may be without instability.
-
-    Attributes
-    ----------
-    disk : float
-        Disk margin for independent changes in all channels: the loop is stable for all smaller
-        ``delta``. At most 2; 0 if the loop is unstable.
-    disk_reached : float
-        Size of the smallest ``delta`` that is known to make the loop unstable. It equals `disk` for
-        up to three channels.
-    gain : tuple of float
-        Gain factors in the disk: the loop is stable if the factors of all channels are between
-        these values.
-    phase : float
-        Phase in the disk [deg].
-    frequency : float
-        Frequency [rad/s] at which the disk margin is reached.
-    factors : ndarray (n,) of complex
-        Factors f of the channels with which the loop oscillates at `frequency`.
-    channels : tuple of ChannelMargins
-        Margins of one channel at a time.
-    at : {"inputs", "outputs"}
-        Where the factors act.
-    stable : bool
-        Whether the loop is stable without changes.
-    robot : str
-    dt : float
-        Sampling time [s]; 0 in continuous time.
-    delay : float
-        Largest delay of an input [s] with which the margins were computed.
-
-    Examples
-    --------
-    >>> lin = fflin.linearize(fflin.load("planar_detumble"))
-    >>> margins = fflin.margins(fflin.lqr(lin), lin)
-    >>> margins.disk >= 2 / 3, margins.stable
-    (True, True)
-    """
-
-    disk: float
-    disk_reached: float
-    gain: tuple[float, float]
-    phase: float
-    frequency: float
-    factors: Values
-    channels: tuple[ChannelMargins, ...]
-    at: Place
-    stable: bool
-    robot: str
-    dt: float
-    delay: float
-
-    def __str__(self) -> str:
-        where = self.at
-        time = f"sampled at {self.dt:g} s" if self.dt else "continuous"
-        if self.delay:
-            time += f", delay {self.delay:g} s"
-        if not self.stable:
-            return folded([f"{self.robot}: the loop is unstable ({time}); no margins"])
-        together = (
-            f"{self.robot}: changes of all {where} at once, {time}: disk margin "
-            f"{self.disk:.3g} at {self.frequency:.3g} rad/s, gain {self.gain[0]:.3g} to "
-            f"{self.gain[1]:.3g}, phase {self.phase:.3g} deg"
-        )
-        if self.disk_reached > self.disk * (1.0 + 1e-3):
-            together += f"; a change of {self.disk_reached:.3g} makes the loop unstable"
-        head = [where[:-1], "gain", "phase [deg]", "delay [s]", "disk", "at [rad/s]"]
-        rows = [
-            [
-                each.name,
-                f"{each.gain[0]:.3g} to {each.gain[1]:.3g}",
-                f"{each.phase:.3g}",
-                f"{each.delay:.3g}",
-                f"{each.disk:.3g}",
-                f"{each.disk_frequency:.3g}",
-            ]
-            for each in self.channels
-        ]
-        return f"{folded([together])}\n\n{grid(cut([head, *rows]))}"
+_MOST_HARMONICS = 40
 
 
 @in_one_thread
@@ -217,17 +56,26 @@ def margins(
     three channels. For more, the result also contains the smallest destabilising change that was
     found.
 
+    The loop of measured outputs contains their sampling times and delays. If the law is periodic,
+    as `MultirateFeedback` is, an oscillation has N frequencies at once, where N is the number of
+    samples of the period. Its disk margin allows independent factors at each of them, as unknown
+    dynamics of the channels cause them. The factors of the gain margins are constant, and the delay
+    margins are those of the exact loop.
+
     Parameters
     ----------
     policy : Policy or Gain
-        Linear law about a point: `StateFeedback`, `OutputFeedback`, `LinearController`, or a gain.
+        Linear law about a point: `StateFeedback`, `OutputFeedback`, `LinearController`,
+        `MultirateFeedback`, or a gain.
     lin : LinearModel
         Model of the robot with which the loop is closed. A continuous model may be given for a
         sampled law.
     delay : float, optional
         Delay [s] of all inputs. A delay of `lin`, see `LinearModel.discretize`, is added. By
         default, the delay is that of `lin`. If `lin` has none, it is the delay of the policy's
-        model, as in `simulate`.
+        model, as in `simulate`. Likewise, if `lin` has no lags, the loop has those of its robot; a
+        warning states lags for which the law was not designed. If the robot has none either, the
+        loop has the lags of the policy's model.
     sample : float, optional
         Sampling time [s] with which a continuous law is executed.
     at : {"inputs", "outputs"}, optional
@@ -257,6 +105,10 @@ def margins(
     """
     if not isinstance(at, str) or at not in ("inputs", "outputs"):
         raise InputError(f"at is {at!r}, expected 'inputs' or 'outputs'")
+    model = instance("lin", lin, LinearModel, "a fflin.LinearModel")
+    law = policy if isinstance(policy, Gain) else as_policy(policy)
+    if not lags_of_model(model):
+        warn_of_lags(law, robot_lags(law, model), "the loop")
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         return closed_loop(policy, lin, delay, sample, at).margins()
 
@@ -272,7 +124,10 @@ def closed_loop(
     lin, delay = delayed_model(policy, lin, delay)
     if sample is not None:
         sample = positive("sample", sample, "s")
-    return ClosedLoop(law_in_loop(policy, lin, sample), lin, delay, sample, at)
+    laws = laws_in_loop(policy, lin, sample)
+    if len(laws) > 1:
+        return PeriodicClosedLoop(laws, lin, delay, sample, at)
+    return ClosedLoop(laws, lin, delay, sample, at)
 
 
 def delayed_model(
@@ -280,28 +135,28 @@ def delayed_model(
 ) -> tuple[LinearModel, float]:
     """Return the model with which a loop is closed, and the delay [s] in addition to its own.
 
-    If no delay is given and the model has none, the model gets the delay of the policy's model.
+    If no delay is given and the model has none, the model gets the delay of the policy's model. If
+    the model has no lags, it gets those of its robot, or else those of the policy's model.
     """
     instance("lin", lin, LinearModel, "a fflin.LinearModel")
     refuse_frozen(lin, "the analysis of a closed loop")
+    lin = _lagging(policy, lin)
     if delay is not None:
         delay = number("delay", delay)
         if delay < 0.0:
             raise InputError(f"delay is {delay:g} s, expected at least 0")
         return lin, delay
     known = policy if isinstance(policy, Gain) else as_policy(policy).model
-    if lin.added or known is None:
+    if lin.delay.any() or known is None:
         return lin, 0.0
-    if not known.delay.any() and is_delayed(known.state_names):
+    if is_delayed(known.state_names) and not (known.delay.any() or lin.added):
         raise InputError(
             "the gain was designed for delayed inputs, but lin has no delay; give the model "
             "of the gain, lin.discretize(dt, delay=...), or give delay="
         )
-    model = known._lin if isinstance(known, Gain) else known
-    has_lags = model is not None and bool(model.lag.any() or model.output_lag.any())
     source = lin.generator if lin.dt else lin
     if (
-        not (known.delay.any() or has_lags)
+        not known.delay.any()
         or known.input_names != lin.input_names
         or (lin.dt and not math.isclose(lin.dt, known.dt))
     ):
@@ -311,12 +166,29 @@ def delayed_model(
             "the law was designed for delayed inputs, but lin is sampled without a delay and its "
             "continuous model is unknown; give the continuous model, or delay=0"
         )
-    if model is not None and has_lags:
-        source = source.with_lags(*lags_by_name(model))
-    if not known.dt:
-        return source, 0.0
     delays = dict(zip(input_keys(lin), known.delay.tolist(), strict=True))
     return source.discretize(known.dt, delay=delays), 0.0
+
+
+def _lagging(policy: Policy | Gain, lin: LinearModel) -> LinearModel:
+    """Return the model with lags: its own, or those of its robot, or of the policy's model."""
+    if lags_of_model(lin):
+        return lin
+    law = policy if isinstance(policy, Gain) else as_policy(policy)
+    lags = robot_lags(law, lin) or designed_lags(law)
+    if not lags:
+        return lin
+    source = lin.generator if lin.dt else lin
+    if source is None:
+        raise InputError(
+            "the inputs or outputs of the robot have lags, but lin is sampled without them and its "
+            "continuous model is unknown; give the continuous model"
+        )
+    source = model_with_lags(source, lags)
+    if not lin.dt:
+        return source
+    delays = dict(zip(input_keys(lin), lin.delay.tolist(), strict=True))
+    return source.discretize(lin.dt, delay=delays)
 
 
 @in_one_thread
@@ -340,24 +212,21 @@ def margins_at_once(
     try:
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             closed = closed_loop(policy, lin, delay, sample)
-            loop = closed.loop()
-            if len(loop[0]) > _MOST_STATES:
+            if closed.states > _MOST_STATES or closed.harmonics > _MOST_HARMONICS:
                 return None
-            disk = 0.0
-            if closed.is_stable(loop[0]):
-                largest, *_ = largest_scaled_gain(as_continuous(*loop, closed.dt))
-                disk = min(1.0 / largest, 2.0)
+            disk = closed.disk_margin()
     except (InputError, np.linalg.LinAlgError):
         return None
     return GainMargins(disk, disk_gain(disk), disk_phase(disk))
 
 
-def law_in_loop(
+def laws_in_loop(
     policy: Policy | Gain, lin: LinearModel, sample: float | None
-) -> System:
-    """Return the linear law of a policy, sampled if it is continuous and `sample` [s] is given.
+) -> list[System]:
+    """Return the linear law of a policy at each sample of its period, in series with its sensors.
 
-    Raise `InputError` if it does not fit the model.
+    A continuous law is sampled if `sample` [s] is given. Raise `InputError` if the law does not fit
+    the model.
     """
     outputs = False
     if isinstance(policy, Gain):
@@ -365,18 +234,19 @@ def law_in_loop(
         law = law_with_memory(policy.K, policy.A, policy.B, policy.dt, *names)
         if policy.integrals:
             law = policy.integral_law()
+        laws = [law]
     else:
         given = as_policy(policy)
         if sample:
             given = given.held_for(sample)
-        linear = given.linear_law()
-        if linear is None:
+        laws = given.laws_of_period()
+        if not laws:
             raise InputError(
                 f"policy is a {given.kind}, expected a linear law about a point: a StateFeedback, "
-                "an OutputFeedback, a LinearController or a Gain"
+                "an OutputFeedback, a LinearController, a MultirateFeedback or a Gain"
             )
-        law = linear
         outputs = given.senses_outputs
+    law = laws[0]
     known = lin.output_names if outputs else lin.state_names
     missing = [name for name in law.inputs if name not in known]
     if missing or law.outputs != lin.input_names:
@@ -388,438 +258,21 @@ def law_in_loop(
             f"{what}; give the model of the robot for which the law was designed, with the same "
             "inputs and outputs"
         )
-    return law
+    if not outputs:
+        return laws
+    return _with_sensors(laws, lin)
 
 
-class ClosedLoop:
-    """Loop of a law and a model, with factors at the inputs or at the measured signals."""
-
-    def __init__(
-        self,
-        law: System,
-        lin: LinearModel,
-        delay: float,
-        sample: float | None,
-        at: Place,
-    ) -> None:
-        self.lin = lin
-        self.at = at
-        self.delay = delay
-        self.dt = _sampling_time(law, lin, sample)
-        self.law = law
-        self.plant = self._continuous_or_sampled(lin)
-        names = lin.input_names if at == "inputs" else law.inputs
-        acting = law.D.any(axis=1) | law.C.any(axis=1)
-        if at == "outputs":
-            acting = law.D.any(axis=0) | law.B.any(axis=0)
-        self.channels = np.flatnonzero(acting)
-        self.names = [names[index] for index in self.channels]
-        if not self.names:
-            raise InputError("the law has no gain, so its loop has no margins")
-
-    def _continuous_or_sampled(self, lin: LinearModel) -> System:
-        """Return the plant from all inputs to the measured signals, without a delay.
-
-        The plant is continuous if its model is known in continuous time. It contains only states
-        that inputs reach and that have an effect on a measured signal.
-        """
-        source = lin.generator if self.dt else lin
-        model = lin if source is None else source
-        if self.law.inputs == lin.output_names:
-            C, D = model.C, model.D
-        else:
-            rows = [lin.state_names.index(name) for name in self.law.inputs]
-            C = np.eye(len(model.A))[rows]
-            D = np.zeros((len(rows), model.B.shape[1]))
-        used = self.law.D.any(axis=0) | self.law.B.any(axis=0)
-        kept = self.kept_states(model, C[used])
-        return System(model.A[np.ix_(kept, kept)], model.B[kept], C[:, kept], D)
-
-    def kept_states(self, model: LinearModel, C: Array) -> list[int]:
-        """Return the indices of the states of the plant; C is that of the used signals."""
-        return _joined(model.A, model.B, C)
-
-    @property
-    def is_continuous_plant(self) -> bool:
-        """Whether `plant` is in continuous time."""
-        return not self.dt or self.lin.generator is not None
-
-    def with_delays(self, delays: Array) -> System:
-        """Return the plant in the time of the loop, whose inputs arrive after `delays` (nu,)."""
-        if not self.dt:
-            return _delayed(self.plant, delays)
-        if self.is_continuous_plant:
-            A, B, C, D, *_ = self.plant
-            self._require_short(delays)
-            held = HeldSystem(A, B, self.dt, delays)
-            return System(*held.sampled(), *held.outputs(C, D))
-        if delays.any():
+def _with_sensors(laws: list[System], lin: LinearModel) -> list[System]:
+    """Return laws of outputs in series with the sensors of the robot of a model."""
+    if lin._robot is None:
+        if len(laws) > 1:
             raise InputError(
-                "lin is sampled and its continuous model is unknown, so a delay cannot be added; "
-                "give the continuous model"
+                "the model has no robot, so the sampling times and delays of its outputs are "
+                "unknown; give the model of fflin.linearize(robot)"
             )
-        return self.plant
-
-    def _require_short(self, delays: Array) -> None:
-        """Raise `InputError` if commands on their way would need very many states."""
-        longest = float(delays.max(initial=0.0))
-        if longest > _MOST_SAMPLES * self.dt:
-            raise InputError(
-                f"delay is {longest:g} s, more than {_MOST_SAMPLES} samples of {self.dt:g} s; give "
-                "a shorter delay or a longer sample time"
-            )
-
-    def closed(self, plant: System) -> tuple[Array, Array, Array, Array]:
-        """Return F, G, H and J from the changes of all channels to (S - T)/2."""
-        A, B, C, D, *_ = plant
-        law = self.law
-        F = np.block(
-            [
-                [A + B @ law.D @ C, B @ law.C],
-                [law.B @ (C + D @ law.D @ C), law.A + law.B @ D @ law.C],
-            ]
-        )
-        if self.at == "inputs":
-            G = np.vstack((B, law.B @ D))
-            H = np.hstack((law.D @ C, law.C))
-            J = law.D @ D
-        else:
-            G = np.vstack((B @ law.D, law.B + law.B @ D @ law.D))
-            H = np.hstack((C + D @ law.D @ C, D @ law.C))
-            J = D @ law.D
-        kept = self.channels
-        half = 0.5 * np.eye(len(kept))
-        return F, G[:, kept], H[kept], J[np.ix_(kept, kept)] + half
-
-    @property
-    def delays(self) -> Array:
-        """Delays (nu,) [s] of the inputs."""
-        delays = np.full(self.plant.B.shape[1], self.delay)
-        if self.is_continuous_plant:
-            delays += self.lin.delay
-        return delays
-
-    @property
-    def longest_delay(self) -> float:
-        """Largest delay [s] of an input, also if the matrices of the model contain it."""
-        return self.delay + float(self.lin.delay.max(initial=0.0))
-
-    def loop(self) -> tuple[Array, Array, Array, Array]:
-        """Return F, G, H and J of `closed`, with the delay."""
-        loop = self.closed(self.with_delays(self.delays))
-        _require_finite(*loop)
-        return loop
-
-    def margins(self) -> Margins:
-        """Return the margins of all channels."""
-        delays = self.delays
-        loop = self.loop()
-        if not self.is_stable(loop[0]):
-            count = len(self.channels)
-            return Margins(
-                disk=0.0,
-                disk_reached=0.0,
-                gain=(1.0, 1.0),
-                phase=0.0,
-                frequency=math.nan,
-                factors=np.ones(count, complex),
-                channels=(),
-                stable=False,
-                at=self.at,
-                robot=self.lin.robot,
-                dt=self.dt,
-                delay=self.longest_delay,
-            )
-        system = as_continuous(*loop, self.dt)
-        count = len(self.channels)
-        frequencies = self._grid()
-        responses = np.array([np.diagonal(system.at(w)) for w in frequencies])
-        responses = responses.reshape(len(frequencies), count)
-        channels = tuple(
-            self._channel(
-                index,
-                system.channel(index),
-                delays,
-                Grid(frequencies, responses[:, index]),
-            )
-            for index in range(count)
-        )
-        peak = largest_structured_gain(system)
-        disk = min(1.0 / peak.bound, 2.0)
-        reached = min(1.0 / peak.reached, 2.0) if peak.reached else 2.0
-        change = peak.perturbation
-        with np.errstate(divide="ignore", invalid="ignore"):
-            factors = (1.0 + 0.5 * change) / (1.0 - 0.5 * change)
-        return Margins(
-            disk=disk,
-            disk_reached=reached,
-            gain=disk_gain(disk),
-            phase=disk_phase(disk),
-            frequency=self._frequency(peak.frequency),
-            factors=factors,
-            channels=channels,
-            stable=True,
-            at=self.at,
-            robot=self.lin.robot,
-            dt=self.dt,
-            delay=self.longest_delay,
-        )
-
-    def own_rates(self) -> Array:
-        """Return the magnitudes [rad/s] of the poles of the continuous loop without a delay."""
-        rates: Array = np.abs(np.linalg.eigvals(self.closed(self.plant)[0]))
-        return rates
-
-    def _grid(self) -> Array:
-        """Return frequencies [rad/s] between which crossings of a continuous loop are sought.
-
-        They are needed with a delay only: the fast poles of its approximation hide crossings from
-        the eigenvalues.
-        """
-        if self.dt or not self.delay:
-            return np.zeros(0)
-        rates = self.own_rates()
-        rates = rates[rates > 0.0]
-        return np.geomspace(0.01 * rates.min(), 100.0 * rates.max(), _GRID)
-
-    def is_stable(self, F: Array) -> bool:
-        """Return whether the loop is stable, by more than rounding errors."""
-        _require_finite(F)
-        poles = np.linalg.eigvals(F)
-        if self.dt:
-            return bool(np.abs(poles).max(initial=0.0) < 1.0 - _ROUNDING)
-        # The poles of the approximation of a short delay are fast, and are no scale for others.
-        largest = self.own_rates().max(initial=0.0)
-        return bool(poles.real.max(initial=-np.inf) < -_ROUNDING * largest)
-
-    def _frequency(self, w: float) -> float:
-        """Return the frequency [rad/s] of a frequency of the transformed loop."""
-        if not self.dt:
-            return w
-        return 2.0 * math.atan(w) / self.dt
-
-    def _channel(
-        self, index: int, loop: Loop, delays: Array, grid: Grid
-    ) -> ChannelMargins:
-        """Return the margins of one channel."""
-        peak, w_disk = largest_gain(*loop)
-        limits = channel_limits(loop, grid)
-        phase, phase_frequency = 180.0, math.nan
-        if limits.crossings:
-            nearest = min(limits.crossings, key=lambda crossing: crossing.phase)
-            phase = nearest.phase
-            phase_frequency = self._frequency(nearest.frequency)
-        low, high = limits.gain_frequencies
-        return ChannelMargins(
-            name=self.names[index],
-            gain=limits.gain,
-            gain_frequencies=(self._frequency(low), self._frequency(high)),
-            phase=phase,
-            phase_frequency=phase_frequency,
-            delay=self._delay_margin(index, limits.crossings, delays),
-            disk=min(1.0 / peak, 2.0),
-            disk_frequency=self._frequency(w_disk),
-        )
-
-    def _delay_margin(
-        self, index: int, crossings: tuple[Crossing, ...], delays: Array
-    ) -> float:
-        """Return the least delay [s] of a channel at which the loop becomes unstable.
-
-        In continuous time, the least lag of a crossing gives it. In a sampled loop, a part of a
-        sample also changes the gain.
-        """
-        estimates = [
-            (crossing.lag / self._frequency(crossing.frequency), crossing.frequency)
-            for crossing in crossings
-        ]
-        estimate, w = min(estimates, default=(math.inf, 0.0))
-        if not (self.dt and self.is_continuous_plant):
-            return estimate
-        unstable = self._first_unstable(index, estimate, delays)
-        if unstable is not None:
-            return unstable
-        if math.isinf(estimate):
-            return math.inf
-        return self._refined(index, estimate, w, delays)
-
-    def _first_unstable(
-        self, index: int, estimate: float, delays: Array
-    ) -> float | None:
-        """Return the delay [s] at which the exact loop becomes unstable, or None if it is long.
-
-        Stability is tested in fractions of the first two samples, because a part of a sample can
-        make a loop unstable that whole samples leave stable, and then at each sample.
-        """
-        from scipy.optimize import brentq
-
-        h = self.dt
-
-        def growth(extra: float) -> float:
-            F = self.closed(self.delayed_plant(index, extra, delays))[0]
-            return float(np.abs(np.linalg.eigvals(F)).max()) - 1.0
-
-        last = _LONGEST
-        if estimate < _LONGEST * h:
-            last = math.ceil(estimate / h) + 1
-        fractions = np.arange(1, 2 * _FRACTIONS + 1) / _FRACTIONS
-        times = h * np.concatenate((fractions, np.arange(3, last + 1)))
-        before = 0.0
-        for time in times.tolist():
-            if growth(time) >= 0.0:
-                return float(brentq(growth, before, time, xtol=1e-9 * h))
-            before = time
-        return None
-
-    def _refined(self, index: int, estimate: float, w: float, delays: Array) -> float:
-        """Return the delay [s] near a long estimate at which a sampled loop oscillates.
-
-        A whole number of samples delays the loop gain by their phase alone. So the rest of the
-        delay is sought for which the lag of the loop is that of a whole number of samples. If none
-        is found within a sample of the estimate, the estimate is returned.
-        """
-        from scipy.optimize import newton
-
-        h = self.dt
-        samples = max(math.floor(estimate / h) - 1, 0)
-
-        def excess(rest: float) -> float:
-            rest = min(max(rest, 0.0), 3.0 * h)
-            loop = self._delayed_channel(index, rest, delays)
-            level = partial(log_gain, loop)
-            at = float(newton(level, w, x1=w * (1.0 + 1e-4), rtol=1e-12))
-            frequency = self._frequency(at)
-            lag = float(np.angle(-loop_gain(loop, at)))
-            turn = 2.0 * math.pi
-            expected = samples * h * frequency
-            lag += turn * round((expected - lag) / turn)
-            return lag / frequency - samples * h
-
-        rest = estimate - samples * h
-        try:
-            found = newton(excess, rest, x1=rest + 1e-3 * h, tol=1e-10 * h)
-        except (RuntimeError, ValueError, np.linalg.LinAlgError):
-            return estimate
-        if not abs(found - rest) <= h:
-            return estimate
-        return samples * h + float(found)
-
-    def _delayed_channel(self, index: int, extra: float, delays: Array) -> Loop:
-        """Return the loop of a channel with an additional delay [s] in it."""
-        plant = self.delayed_plant(index, extra, delays)
-        return as_continuous(*self.closed(plant), self.dt).channel(index)
-
-    def delayed_plant(self, index: int, extra: float, delays: Array) -> System:
-        """Return the sampled plant with an additional delay [s] in one channel."""
-        channel = self.channels[index]
-        if self.at == "inputs":
-            more = delays.copy()
-            more[channel] += extra
-            return self.with_delays(more)
-        # The output is measured at a time within a sample, and passes a chain of samples.
-        A, B, C, D, *_ = self.plant
-        held = HeldSystem(A, B, self.dt, delays)
-        Ad, Bd = held.sampled()
-        Cd, Dd = held.outputs(C, D)
-        samples, rest = split(extra, self.dt)
-        if samples:
-            within = held.outputs(C[[channel]], D[[channel]], self.dt - rest)
-            size = len(Ad)
-            chain = np.eye(samples, k=-1)
-            Ad = np.block(
-                [[Ad, np.zeros((size, samples))], [np.zeros((samples, size)), chain]]
-            )
-            Ad[size, :size] = within[0][0]
-            Bd = np.vstack((Bd, np.zeros((samples, Bd.shape[1]))))
-            Bd[size] = within[1][0]
-            Cd = np.hstack((Cd, np.zeros((len(Cd), samples))))
-            Cd[channel] = 0.0
-            Cd[channel, -1] = 1.0
-            Dd[channel] = 0.0
-        return System(Ad, Bd, Cd, Dd)
-
-
-def _sampling_time(law: System, lin: LinearModel, sample: float | None) -> float:
-    """Return the sampling time [s] of the loop; 0 in continuous time."""
-    times = {time for time in (law.dt, lin.dt, sample or 0.0) if time}
-    if not times:
-        return 0.0
-    longest, least = max(times), min(times)
-    if longest - least > 1e-9 * longest:
-        shown = " and ".join(f"{time:g} s" for time in sorted(times))
-        raise InputError(
-            f"the law, the model and sample have different sampling times, {shown}; give the "
-            "continuous model, and a sample time only for a continuous law"
-        )
-    return longest
-
-
-def _joined(A: Array, B: Array, C: Array) -> list[int]:
-    """Return the indices of the states that an input reaches and that affect an output."""
-    reached = B.any(axis=1)
-    seen = C.any(axis=0)
-    for _ in A:
-        reached = reached | A[:, reached].any(axis=1)
-        seen = seen | A[seen].any(axis=0)
-    return np.flatnonzero(reached & seen).tolist()
-
-
-def _require_finite(*matrices: Array) -> None:
-    """Raise `InputError` if the matrices of a loop are not finite."""
-    if not all(np.isfinite(matrix).all() for matrix in matrices):
-        raise InputError(
-            "the response of the loop overflows; give smaller gains, a shorter sample time or "
-            "a shorter delay"
-        )
-
-
-def _delayed(plant: System, delays: Array) -> System:
-    """Return a continuous plant with rational approximations of delays [s] at its inputs."""
-    for index in np.flatnonzero(delays):
-        for section in _pade(float(delays[index])):
-            plant = _after_section(plant, int(index), section)
-    return plant
-
-
-def _pade(delay: float) -> list[System]:
-    """Return the diagonal Pade approximation of a delay [s] as a chain of all-pass sections.
-
-    The section of a complex pair of poles p has the transfer function
-    (s^2 + 2 Re(p) s + |p|^2) / (s^2 - 2 Re(p) s + |p|^2).
-    """
-    order = np.arange(_PADE, -1, -1)
-    sizes = [
-        math.comb(_PADE, int(k)) * math.factorial(2 * _PADE - int(k)) for k in order
-    ]
-    poles = np.roots(np.array(sizes, float) / sizes[0]) / delay
-    sections = []
-    for pole in poles[poles.imag > 0.0]:
-        size, sum_of_pair = float(np.abs(pole)), 2.0 * float(pole.real)
-        sections.append(
-            System(
-                np.array([[0.0, size], [-size, sum_of_pair]]),
-                np.array([[0.0], [size]]),
-                np.array([[0.0, 2.0 * sum_of_pair / size]]),
-                np.ones((1, 1)),
-            )
-        )
-    return sections
-
-
-def _after_section(plant: System, index: int, late: System) -> System:
-    """Return a plant with a section before one of its inputs."""
-    A, B, C, D, *_ = plant
-    column = B[:, index : index + 1]
-    through = D[:, index : index + 1]
-    B, D = B.copy(), D.copy()
-    B[:, index : index + 1] = column @ late.D
-    D[:, index : index + 1] = through @ late.D
-    added = np.zeros((len(late.A), B.shape[1]))
-    added[:, index : index + 1] = late.B
-    corner = np.zeros((len(late.A), len(A)))
-    return System(
-        np.block([[A, column @ late.C], [corner, late.A]]),
-        np.vstack((B, added)),
-        np.hstack((C, through @ late.C)),
-        D,
-    )
+        return laws
+    sensors = sensors_of_model(lin)
+    names = laws[0].inputs
+    timing = timing_of([sensors[name] for name in names], names, laws[0].dt or 0.0)
+    return sensed_systems(laws, timing)

@@ -11,7 +11,7 @@ from fflin.base.validation import Mask, instance
 from fflin.control.loops import NOT_CORRECTED, Loop, PredictedLaw, Sample
 from fflin.control.multirate import MultirateCompensator
 from fflin.control.policies import Feedback, OutputSensing, at_samples
-from fflin.control.policy import Command, Noise, OutputForm, Predictor
+from fflin.control.policy import Command, Noise, OutputForm, Predictor, System
 from fflin.control.sensed_laws import sensed
 from fflin.control.sensors import timing_of_model, timing_of_robot
 from fflin.dynamics.outputs import Measuring
@@ -112,6 +112,14 @@ class MultirateFeedback(OutputSensing, Feedback):
                 A, B, law.C, none, lin.u0, lin.y0, E=E if corrected else NOT_CORRECTED
             )
             for A, B, E in zip(law.A, law.B, law.E, strict=True)
+        ]
+
+    def laws_of_period(self) -> list[System]:
+        """Return the law at each sample of the period, from the received outputs to the inputs."""
+        names = self.lin.output_names, self.lin.input_names
+        return [
+            System(term.A, term.B, term.C, term.D, self.lin.dt, *names)
+            for term in self.terms()
         ]
 
     def bind(self, robot: Robot) -> Command:

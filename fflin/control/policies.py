@@ -663,6 +663,10 @@ class Allocation(Policy):
         """Return the law of the inner policy, without limits."""
         return self.inner.linear_law()
 
+    def laws_of_period(self) -> list[System]:
+        """Return the laws of the inner policy, without limits."""
+        return self.inner.laws_of_period()
+
     def closed_loop(self) -> tuple[Array, float] | None:
         """Return the closed loop of the inner policy, without limits."""
         return self.inner.closed_loop()

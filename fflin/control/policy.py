@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeAlias
 
 import numpy as np
 
+from fflin.base import html
 from fflin.base.errors import InputError
 from fflin.base.validation import (
     Array,
@@ -61,6 +62,7 @@ _DESCRIBING = (
     "form",
     "feedback_gain",
     "linear_law",
+    "laws_of_period",
     "closed_loop",
     "loop_around",
     "loop_notes",
@@ -217,6 +219,17 @@ class Policy(ABC):
     def bind(self, robot: Robot) -> Command:
         """Return policy(t, q, v) -> u for a robot; each call returns one with its own memory."""
 
+    def _repr_html_(self) -> str:
+        """Return a card with the sampling time, the sensors and the notes of the law."""
+        time = "commands in continuous time"
+        if self.sample_time:
+            time = f"commands every {self.sample_time:g} s"
+        facts = [time]
+        if self.sensors:
+            facts.append(f"measures {', '.join(self.sensors)}")
+        notes = [html.paragraph(note, "note") for note in self.notes]
+        return html.result_card(self, html.paragraph("; ".join(facts)), *notes)
+
     @property
     def kind(self) -> str:
         """Name of the type of law, for messages."""
@@ -362,6 +375,14 @@ class Policy(ABC):
         if lin is None or K is None:
             return None
         return proportional(K, lin.dt, lin.state_names, lin.input_names)
+
+    def laws_of_period(self) -> list[System]:
+        """Return the law of `linear_law` at each sample of its period; empty if it is not linear.
+
+        A law that does not vary with time has one.
+        """
+        law = self.linear_law()
+        return [] if law is None else [law]
 
     def poles_along(self) -> Array:
         """Return the poles [1/s] of the robot and of the loop along the followed trajectory."""

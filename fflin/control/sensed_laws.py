@@ -9,6 +9,7 @@ import numpy as np
 
 from fflin.base.validation import Array
 from fflin.control.loops import Sample
+from fflin.control.policy import System
 from fflin.control.sensors import SensorTiming, sensor_systems
 
 
@@ -24,6 +25,18 @@ def sensed(terms: Sequence[Sample], timing: SensorTiming) -> list[Sample]:
     return [
         _in_series(terms[k % len(terms)], *matrices)
         for k, matrices in zip(range(count), sensor_systems(timing), strict=False)
+    ]
+
+
+def sensed_systems(laws: Sequence[System], timing: SensorTiming) -> list[System]:
+    """Return laws that include the sensors, for each sample of a common period; see `sensed`."""
+    if timing.is_plain:
+        return list(laws)
+    nu, ny = laws[0].D.shape
+    terms = [Sample(*law[:4], np.zeros(nu), np.zeros(ny)) for law in laws]
+    return [
+        laws[0]._replace(A=term.A, B=term.B, C=term.C, D=term.D)
+        for term in sensed(terms, timing)
     ]
 
 

@@ -99,7 +99,7 @@ def load(
         precedence over the table ``[xacro]`` of the robot file.
     **fields
         Fields of the robot: inputs, outputs, appendages, constraints, stiffness, damping, rest,
-        gravity, orbit, disturbance, limits, passive, weights, point, target and start; see
+        gravity, orbit, disturbance, limits, passive, weights, tune, point, target and start; see
         `Robot.replace`. Fields
         given here take precedence over the robot file. Locks, limits, springs and dampers are
         merged with the robot file: an entry given here replaces only the entry with the same name.
@@ -508,6 +508,8 @@ def _read_robot_file(file: RobotFile) -> tuple[TomlFile, RobotFile, dict[str, ob
     for key in ("weights", "point", "target", "start"):
         if isinstance(table := record.get(key), dict):
             values[key] = {part: flat(value) for part, value in table.items()}
+    if isinstance(table := record.get("tune"), dict):
+        values["tune"] = table | {"vary": _ranges(table.get("vary", {}))}
     if "input" in record:
         values["inputs"] = _read_inputs(document)
     if "output" in record:
@@ -531,6 +533,21 @@ def _read_robot_file(file: RobotFile) -> tuple[TomlFile, RobotFile, dict[str, ob
     urdf_file = urdf_file._replace(name=file.name, package_dirs=dirs)
     keys = ("lock", "xacro", *FIELDS)
     return document, urdf_file, {key: values[key] for key in keys if key in values}
+
+
+def _ranges(table: object) -> object:
+    """Return the ranges {parameter: range} of a table whose names may contain dots."""
+    if not isinstance(table, dict):
+        return table
+    ranges: dict[str, object] = {}
+    for key, value in table.items():
+        if isinstance(value, dict) and "range" not in value:
+            inner = _ranges(value)
+            assert isinstance(inner, dict)
+            ranges |= {f"{key}.{below}": entry for below, entry in inner.items()}
+        else:
+            ranges[key] = value
+    return ranges
 
 
 def _xacro_arguments(given: object) -> dict[str, str]:

@@ -28,9 +28,15 @@ from fflin.base.validation import (
     truth,
     vector,
 )
+from fflin.control.closed_loop import ClosedLoop
 from fflin.control.data_sheet import output_keys
 from fflin.control.gain import Gain
-from fflin.control.margins import ClosedLoop, delayed_model, law_in_loop
+from fflin.control.margins import delayed_model, laws_in_loop
+from fflin.control.optimal.periodic_loops import (
+    monodromy,
+    steady_covariances,
+    steady_states,
+)
 from fflin.control.policy import Policy, System
 from fflin.dynamics.coordinates import refuse_elliptic
 from fflin.dynamics.disturbance import phasors_of
@@ -233,7 +239,9 @@ def error_budget(
     sinusoid leads to the amplitude of the frequency response. White noise leads to the covariance S
     with :math:`F S + S F^T + G W G^T = 0`, or with :math:`S = F S F^T + G W G^T`. A sampled loop
     contains the exact sampled plant with delayed inputs, and forces act between the samples. Its
-    errors are those at the samples.
+    errors are those at the samples. The errors of a periodic law, such as `MultirateFeedback`, vary
+    over its period: constants count with their largest magnitude, noise and sinusoids with their
+    root mean square.
 
     A name in a mapping is a name, a group or a pattern. The values of a group are independent: the
     result of a group of constants is the sum of the magnitudes, and the result of a group of noises
@@ -307,7 +315,7 @@ def error_budget(
     if sample is not None:
         sample = positive("sample", sample, "s")
     factor = positive("factor", factor)
-    law = law_in_loop(policy, lin, sample)
+    laws = laws_in_loop(policy, lin, sample)
     forces = [
         *_given("disturbance", disturbance),
         *_given("periodic", periodic),
@@ -315,7 +323,7 @@ def error_budget(
     ]
     phasors = _disturbances(robot, lin)
     forces += [name for name, _ in phasors]
-    loop = DisturbedLoop(law, lin, delay, sample, forces)
+    loop = DisturbedLoop(laws, lin, delay, sample, forces)
     acting = [loop.phasor(*key, value) for key, value in phasors.items()]
     causes: list[Contribution] = []
     for key, values in _given("noise", noise).items():
@@ -488,7 +496,7 @@ class DisturbedLoop(ClosedLoop):
 
     def __init__(
         self,
-        law: System,
+        laws: Sequence[System],
         lin: LinearModel,
         delay: float,
         sample: float | None,
@@ -501,15 +509,18 @@ class DisturbedLoop(ClosedLoop):
                 f"the model has no state {missing[0]}; give a model that contains the attitude of "
                 "the base"
             )
-        super().__init__(law, lin, delay, sample, "outputs")
+        super().__init__(laws, lin, delay, sample, "outputs")
         if not self.is_continuous_plant:
             raise InputError(
                 "lin is sampled and its continuous model is unknown, so forces between the samples "
                 "cannot be computed; give the continuous model"
             )
         self._delayed = self.with_delays(self.delays)
-        self.F = self.closed(self._delayed)[0]
-        if not self.is_stable(self.F):
+        # State matrices of the loop at each sample of the period of the law.
+        self.F: Array = np.array(
+            [self.closed_with(law, self._delayed)[0] for law in self.laws]
+        )
+        if not self.is_stable(monodromy(self.F)):
             raise InputError(
                 "the loop is unstable or does not control the attitude, so its errors are not "
                 "bounded; give a law that stabilises the attitude"
@@ -550,13 +561,13 @@ class DisturbedLoop(ClosedLoop):
     def measurement_noise(self, key: str, size: float) -> Contribution:
         """Return the effect of white noise of measured signals."""
         at = self._measured(key)
-        G = size * self._from_measurements()[:, at]
-        return Contribution(f"noise of {key}", "noise", self._deviation(G @ G.T))
+        G = size * self._from_measurements()[:, :, at]
+        return Contribution(f"noise of {key}", "noise", self._deviation(G @ G.mT))
 
     def bias(self, key: str, size: float) -> Contribution:
         """Return the effect of constant errors of measured signals."""
         at = self._measured(key)
-        G = size * self._from_measurements()[:, at]
+        G = size * self._from_measurements()[:, :, at]
         return Contribution(f"bias of {key}", "constant", self._constants(G))
 
     def disturbance(self, key: str, value: object) -> Contribution:
@@ -596,9 +607,12 @@ class DisturbedLoop(ClosedLoop):
     def _sinusoid(self, key: str, inputs: Values, w: float) -> Contribution:
         """Return the effect of independent sinusoidal forces, whose amplitudes are columns."""
         G = self._held(inputs, w)
-        point = np.exp(1j * w * self.dt) if self.dt else 1j * w
-        response = np.linalg.solve(point * np.eye(len(self.F)) - self.F, G)
-        amplitudes = np.linalg.norm(response, axis=1)
+        if self.dt:
+            response = steady_states(self.F, G, w * self.dt)
+        else:
+            response = np.linalg.solve(1j * w * np.eye(self.size) - self.F, G)
+        powers = np.sum(np.abs(response) ** 2, axis=2)
+        amplitudes = np.sqrt(powers.mean(axis=0))
         hertz = w / (2.0 * math.pi)
         cause = f"{key} at {hertz:.4g} Hz"
         return Contribution(cause, "periodic", self._errors(amplitudes))
@@ -609,7 +623,7 @@ class DisturbedLoop(ClosedLoop):
         G = size * self._force_inputs[:, at]
         W = np.zeros_like(self.F)
         count = len(self.plant.A)
-        W[:count, :count] = self._covariance(G @ G.T)
+        W[:, :count, :count] = self._covariance(G @ G.T)
         return Contribution(f"white {key}", "noise", self._deviation(W))
 
     def _measured(self, key: str) -> list[int]:
@@ -620,14 +634,20 @@ class DisturbedLoop(ClosedLoop):
     def _signals(self, kind: str, key: str, names: Sequence[str]) -> list[int]:
         return sorted(by_name(kind, {key: None}, names))
 
+    @property
+    def size(self) -> int:
+        """Number of states of the loop."""
+        return len(self.F[0])
+
     def _from_measurements(self) -> Array:
-        """Return the matrix from errors of the measured signals to the states of the loop."""
+        """Return the matrices (N, n, ny) from errors of measured signals to states of the loop."""
         _, B, _, D, *_ = self._delayed
-        law = self.law
-        return np.vstack((B @ law.D, law.B + law.B @ D @ law.D))
+        return np.array(
+            [np.vstack((B @ law.D, law.B + law.B @ D @ law.D)) for law in self.laws]
+        )
 
     def _held(self, inputs: Values, w: float) -> Values:
-        """Return the matrix from forces (nx, k) to the states of the loop.
+        """Return the matrices (N, n, k) from forces (nx, k) to the states of the loop.
 
         In a sampled loop, it is the effect of e^(j w t) over a sample.
         """
@@ -640,8 +660,8 @@ class DisturbedLoop(ClosedLoop):
             block[:count, count:] = inputs
             block[count:, count:] = 1j * w * np.eye(columns)
             inputs = expm(block * self.dt)[:count, count:]
-        G = np.zeros((len(self.F), columns), complex)
-        G[:count] = inputs
+        G = np.zeros((*self.F.shape[:2], columns), complex)
+        G[:, :count] = inputs
         return G
 
     def _covariance(self, W: Array) -> Array:
@@ -660,18 +680,24 @@ class DisturbedLoop(ClosedLoop):
         return covariance
 
     def _constants(self, G: Array) -> Array:
-        """Return the sum of the magnitudes of the constant errors that the columns of G cause."""
-        unit = np.eye(len(self.F))
-        inner = unit - self.F if self.dt else -self.F
-        return self._errors(np.abs(np.linalg.solve(inner, G)).sum(axis=1))
+        """Return the sum of the magnitudes of the constant errors that the columns of G cause.
+
+        The errors of a periodic law vary over its period, and their largest magnitude counts.
+        """
+        states = steady_states(self.F, G) if self.dt else np.linalg.solve(-self.F, G)
+        return self._errors(np.abs(states).max(axis=0).sum(axis=1))
 
     def _deviation(self, W: Array) -> Array:
-        """Return the standard deviations for noise of intensity or covariance W of the states."""
-        from scipy.linalg import solve_continuous_lyapunov, solve_discrete_lyapunov
+        """Return the standard deviations for noise of intensities or covariances W (N, n, n).
+
+        Those of a periodic law are the root mean square over its period.
+        """
+        from scipy.linalg import solve_continuous_lyapunov
 
         if self.dt:
-            return self._standard(solve_discrete_lyapunov(self.F, W))
-        return self._standard(solve_continuous_lyapunov(self.F, -W))
+            covariances = steady_covariances(self.F, W)
+            return self._standard(covariances.mean(axis=0))
+        return self._standard(solve_continuous_lyapunov(self.F[0], -W[0]))
 
     def _standard(self, S: Array) -> Array:
         """Return the standard deviations of a covariance of the states of the loop."""

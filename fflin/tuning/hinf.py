@@ -21,7 +21,7 @@ from fflin.tuning.channels import Ends, channel_of, ends_of
 from fflin.tuning.goals import Goal, MaxGain
 from fflin.tuning.law import Law, law_of
 from fflin.tuning.plant import Plant, plant_of, signals_of
-from fflin.tuning.structures import Names, indices
+from fflin.tuning.structures import Names, indices, input_indices
 from fflin.tuning.tuned import matrices_of
 from fflin.tuning.verification import largest_in_band
 
@@ -80,6 +80,14 @@ class HInfinity(LinearController):
         self.gamma = gamma
         self.order = len(law.A)
 
+    def __repr__(self) -> str:
+        time = f"dt={self.dt:g} s" if self.dt else "continuous"
+        (nu, ny) = self.system.D.shape
+        return (
+            f"HInfinity('{self.lin.robot}', gamma={self.gamma:.4g}, order={self.order}, ny={ny}, "
+            f"nu={nu}, {time})"
+        )
+
 
 @in_one_thread
 def hinf(
@@ -93,7 +101,7 @@ def hinf(
 
     The generalised plant contains the inputs and outputs of all goals, divided by their sizes and
     limits. The norm is the largest gain of all of them together, so it is an upper bound of the
-    value of each goal. SLICOT's SB10AD solves the Riccati equations for the balanced plant, and a
+    value of each goal. SLICOT's SB10FD solves the Riccati equations for the balanced plant, and a
     bisection finds the least norm within 0.1 %. If undisturbed poles or zeros are on the imaginary
     axis, the design adds disturbances and outputs of all states, of at most 1e-4 of the others.
 
@@ -138,7 +146,7 @@ def hinf(
         raise InputError(f"goals are {goals!r}, expected one goal or more")
     signals = signals_of(lin)
     rows = indices("output", measured, signals.outputs)
-    columns = indices("input", inputs, signals.inputs)
+    columns = input_indices(inputs, signals)
     ends = []
     for goal in every:
         instance("goal", goal, MaxGain, "a fflin.MaxGain, the goal of hinf")
@@ -377,12 +385,10 @@ def _controller(
     A, B, C, D, y_sizes, u_sizes = prepared
     nu, ny = len(u_sizes), len(y_sizes)
     try:
-        design = _slycot().sb10ad(
-            len(A), B.shape[1], len(C), nu, ny, level, A, B, C, D, job=4
-        )
+        design = _slycot().sb10fd(len(A), B.shape[1], len(C), nu, ny, level, A, B, C, D)
     except ArithmeticError:
         return None
-    Ak, Bk, Ck, Dk = design[1:5]
+    Ak, Bk, Ck, Dk = design[:4]
     law = (
         Ak,
         Bk / y_sizes,

@@ -98,15 +98,41 @@ class Problem:
 
     def start(self, rng: np.random.Generator | None = None) -> Array:
         """Return the start values, or random ones."""
+        parameters = self.structured.parameters
+        x = self._point([parameter.value for parameter in parameters])
+        if rng is not None:
+            for place, index in enumerate(self.free):
+                x[place] = parameters[index].drawn(rng)
+        return x
+
+    def of_gain(self, gain: Array) -> Array:
+        """Return the point of a static gain (commanded, measured)."""
+        return self._point(self.structured.of_gain(gain).tolist())
+
+    @property
+    def simpler(self) -> Problem | None:
+        """Problem of a law with fewer states, or None."""
+        structured = self.structured.simpler
+        if structured is None:
+            return None
+        return Problem(structured, self.measures, self.cases)
+
+    def extended(self, simple: Problem, x: Array) -> Array:
+        """Return the point of the law of a simpler problem at x."""
+        names = [parameter.name for parameter in simple.structured.parameters]
+        known = dict(zip(names, simple.values(x)[0].tolist(), strict=True))
+        parameters = self.structured.parameters
+        point = self._point([known.get(p.name, p.value) for p in parameters])
+        point[len(self.free) :] = x[len(simple.free) :]
+        return point
+
+    def _point(self, values: Sequence[float]) -> Array:
+        """Return the point of the values of all parameters."""
         x = np.zeros(self.size)
         for place, index in enumerate(self.free):
-            parameter = self.structured.parameters[index]
-            if rng is None:
-                x[place] = parameter.coordinate(parameter.value)
-            else:
-                x[place] = parameter.drawn(rng)
-        started: Array = np.clip(x, *self.bounds)
-        return started
+            x[place] = self.structured.parameters[index].coordinate(values[index])
+        inside: Array = np.clip(x, *self.bounds)
+        return inside
 
     def values(self, x: Array) -> tuple[Array, Array]:
         """Return the values of all parameters, and the derivatives of the free ones."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -15,7 +16,6 @@ from fflin.base.names import matching
 from fflin.base.validation import (
     Array,
     as_double,
-    count,
     function,
     positive,
     printable,
@@ -25,6 +25,7 @@ from fflin.base.validation import (
 from fflin.tuning.law import (
     Law,
     Matrices,
+    distributed,
     embedded,
     law_of,
     repeated,
@@ -41,6 +42,9 @@ Names: TypeAlias = str | Sequence[str]
 # Without a given bandwidth [rad/s], the first search starts from this one.
 _BANDWIDTH = 0.3
 
+# Units such as rad/s or 1/s^2.
+_PER_SECONDS = re.compile(r"([^/]+)/s(?:\^(\d+))?")
+
 # Relative step of the differences for laws that users define.
 _STEP = 6e-6
 
@@ -56,12 +60,15 @@ class Element:
         Indices of its signals in the plant; None if the part acts on any number of channels.
     law : callable
         Function of the values and of the number of channels that returns the `Law`.
+    of_gain : callable, optional
+        Function that returns start values for a static gain (commanded, measured).
     """
 
     parameters: tuple[Parameter, ...]
     measured: tuple[int, ...] | None
     commanded: tuple[int, ...] | None
     law: Callable[[Array, int], Law]
+    of_gain: Callable[[Array], Array] | None = None
 
     def used(self, signals: Signals) -> tuple[tuple[int, ...], tuple[int, ...]]:
         """Return the indices of the outputs and inputs that the law connects."""
@@ -97,6 +104,10 @@ class Structure(ABC):
     def element(self, signals: Signals) -> Element:
         """Return the part of a law for the signals of a plant."""
 
+    def simpler(self) -> Structure | None:
+        """Return a structure with fewer states, whose parameters have the same names."""
+        return None
+
     def __add__(self, other: object) -> Structure:
         if not isinstance(other, Structure):
             return NotImplemented
@@ -121,7 +132,9 @@ class _Sum(Structure):
                 "structure that has signals, such as PD"
             )
         first, second = parts
-        ny, nu = len(signals.outputs), len(signals.inputs)
+        every = _united(first.measured, second.measured)
+        commanded_by = _united(first.commanded, second.commanded)
+        ny, nu = len(every), len(commanded_by)
         split = len(first.parameters)
 
         def law(values: Array, width: int) -> Law:
@@ -130,13 +143,39 @@ class _Sum(Structure):
                 (first, values[:split]),
                 (second, values[split:]),
             ):
-                measured, commanded = part.measured or (), part.commanded or ()
+                measured = [every.index(index) for index in part.measured or ()]
+                commanded = [
+                    commanded_by.index(index) for index in part.commanded or ()
+                ]
                 part_law = part.law(part_values, len(measured))
                 laws.append(embedded(part_law, measured, commanded, ny, nu))
             return total(*laws)
 
-        every = tuple(range(ny)), tuple(range(nu))
-        return Element((*first.parameters, *second.parameters), *every, law)
+        parameters = (*first.parameters, *second.parameters)
+        return Element(parameters, every, commanded_by, law)
+
+
+def _united(
+    first: tuple[int, ...] | None, second: tuple[int, ...] | None
+) -> tuple[int, ...]:
+    """Return the indices of two sets of signals, in order."""
+    return tuple(sorted({*(first or ()), *(second or ())}))
+
+    def simpler(self) -> Structure | None:
+        """Return a structure with fewer states, whose parameters have the same names."""
+        return _simpler(_Sum, self.first, self.second)
+
+
+def _simpler(
+    kind: Callable[[Structure, Structure], Structure],
+    first: Structure,
+    second: Structure,
+) -> Structure | None:
+    """Return a sum or series of simpler structures, or None if neither has a simpler one."""
+    simpler = first.simpler(), second.simpler()
+    if simpler == (None, None):
+        return None
+    return kind(simpler[0] or first, simpler[1] or second)
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,22 +195,67 @@ class _Series(Structure):
             measured, commanded = right.measured, right.commanded
         split = len(left.parameters)
 
-        def law(values: Array, width: int) -> Law:
-            before = after = width
-            if measured is not None and commanded is not None:
-                before, after = len(measured), len(commanded)
-            return series(
-                left.law(values[:split], after if left.measured is None else before),
-                right.law(values[split:], before),
-            )
+        before, after = len(measured or ()), len(commanded or ())
+        # A filter of all channels gives the same law before and after the structure. It is placed
+        # where there are fewer channels, and so has fewer states.
+        is_swapped = measured is not None and (
+            (left.measured is None and before < after)
+            or (right.measured is None and after < before)
+        )
 
-        return Element((*left.parameters, *right.parameters), measured, commanded, law)
+        def law(values: Array, width: int) -> Law:
+            narrow = width if measured is None else min(before, after)
+            first = left.law(
+                values[:split], narrow if left.measured is None else before
+            )
+            second = right.law(
+                values[split:], narrow if right.measured is None else before
+            )
+            if not is_swapped:
+                return series(first, second)
+            swapped = series(second, first)
+            order = np.roll(np.arange(len(values)), split)
+            derivatives = [stack[order] for stack in swapped[4:]]
+            return Law(*swapped[:4], *derivatives)
+
+        part = right if left.measured is None else left
+        of_gain = part.of_gain
+
+        def start(gain: Array) -> Array:
+            assert of_gain is not None
+            values = {
+                id(side): of_gain(gain) if side is part else _values(side.parameters)
+                for side in (left, right)
+            }
+            return np.concatenate((values[id(left)], values[id(right)]))
+
+        parameters = (*left.parameters, *right.parameters)
+        known = None if of_gain is None else start
+        return Element(parameters, measured, commanded, law, known)
+
+    def simpler(self) -> Structure | None:
+        """Return a structure with fewer states, whose parameters have the same names."""
+        return _simpler(_Series, self.left, self.right)
+
+
+def _values(parameters: Sequence[Parameter]) -> Array:
+    """Return the start values of parameters."""
+    return np.array([parameter.value for parameter in parameters])
 
 
 def _require_name(name: object) -> None:
     """Raise `InputError` unless a name is printable or empty."""
     if not isinstance(name, str) or name:
         printable("name", name)
+
+
+def input_indices(keys: object, signals: Signals) -> tuple[int, ...]:
+    """Return the indices of inputs in the order of the keys; a key may be a group such as wheel."""
+    if isinstance(keys, str):
+        keys = (keys,)
+    if isinstance(keys, Sequence) and all(isinstance(key, str) for key in keys):
+        keys = [name for key in keys for name in signals.expanded(key)]
+    return indices("input", keys, signals.inputs)
 
 
 def indices(kind: str, keys: object, names: Sequence[str]) -> tuple[int, ...]:
@@ -190,13 +274,36 @@ def quotient(above: str, below: str) -> str:
     """Return the unit of the ratio of two quantities."""
     if below in ("1", ""):
         return above or "1"
+    if above == below:
+        return "1"
+    if above.startswith(f"{below}/"):
+        return f"1{above.removeprefix(below)}"
     divisor = f"({below})" if " " in below or "/" in below else below
     return f"{above or '1'}/{divisor}"
 
 
+def power_of_seconds(order: int) -> str:
+    """Return the unit of a power of time."""
+    return "s" if order == 1 else f"s^{order}"
+
+
 def times_seconds(unit: str) -> str:
     """Return the unit of a quantity multiplied by a time."""
-    return "s" if unit == "1" else f"{unit} s"
+    rate = _PER_SECONDS.fullmatch(unit)
+    if not rate:
+        return "s" if unit == "1" else f"{unit} s"
+    order = int(rate[2] or 1) - 1
+    if not order:
+        return rate[1]
+    return f"{rate[1]}/{power_of_seconds(order)}"
+
+
+def per_second(unit: str) -> str:
+    """Return the unit of a quantity divided by a time."""
+    rate = _PER_SECONDS.fullmatch(unit)
+    if not rate:
+        return f"{unit}/s"
+    return f"{rate[1]}/{power_of_seconds(int(rate[2] or 1) + 1)}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,7 +317,8 @@ class PID(Structure):
     measured : str or sequence of str
         Names, groups or patterns of the measured outputs, such as "q_b".
     inputs : str or sequence of str
-        Inputs of the robot, one for each measured output, in the same order.
+        Inputs of the robot, one for each measured output, in the same order; or with `distribution`
+        any number of inputs, such as four wheels.
     rates : str or sequence of str, optional
         Measured rates of the outputs, such as a gyroscope. The derivative term is then ``k_d``
         times these rates, without a lag.
@@ -225,6 +333,11 @@ class PID(Structure):
         Whether the gains are full matrices. By default, each axis has its own loop.
     shared : bool
         Whether all axes have the same gains.
+    distribution : array_like (nu, k), optional
+        Fixed matrix from the commands of the k axes to the inputs. By default, if there are more
+        inputs than axes, the axes command the accelerations of the outputs, and the pseudo-inverse
+        of the response of the plant distributes them. For an attitude q_b and wheels, the units of
+        kp and kd are then 1/s^2 and 1/s.
     name : str, optional
         First part of the names of the parameters, such as "roll" for "roll.kp".
 
@@ -248,6 +361,7 @@ class PID(Structure):
     bandwidth: float = _BANDWIDTH
     coupled: bool = False
     shared: bool = False
+    distribution: object = None
     name: str = ""
 
     _INTEGRAL = True
@@ -261,21 +375,59 @@ class PID(Structure):
     def element(self, signals: Signals) -> Element:
         """Return the part of a law for the signals of a plant."""
         measured = indices("output", self.measured, signals.outputs)
-        inputs = indices("input", self.inputs, signals.inputs)
+        inputs = input_indices(self.inputs, signals)
         rates: tuple[int, ...] = ()
         if self.rates is not None:
             rates = indices("output", self.rates, signals.outputs)
         k = len(measured)
-        if len(inputs) != k or (rates and len(rates) != k):
+        matrix = self._distribution(signals, measured, inputs)
+        if (matrix is None and len(inputs) != k) or (rates and len(rates) != k):
             raise InputError(
                 f"{type(self).__name__} has {k} measured outputs, {len(inputs)} inputs and "
-                f"{len(rates)} rates, expected the same number of each"
+                f"{len(rates)} rates, expected the same number of each, or more inputs than "
+                "measured outputs"
             )
+        axes, axis_signals = inputs, signals
+        if matrix is not None:
+            axis_signals = self._axes(signals, measured, inputs, matrix)
+            axes = tuple(range(k))
         if rates and self.lag is not None:
             raise InputError(
                 "lag acts on the derivative of outputs, but the rates are measured; leave out lag, "
                 "and multiply the structure by LowPass"
             )
+        parameters, places = self._gain_parameters(
+            axis_signals, signals, axes, measured, rates
+        )
+        with_lag = not rates
+        if with_lag:
+            start = 0.1 / self.bandwidth
+            least = 0.1 * start
+            lag = Parameter(f"{self._prefix}lag", "s", start, least, math.inf, start)
+            parameters.append(resolved(lag, self.lag))
+
+        def law(values: Array, width: int) -> Law:
+            if with_lag:
+                lag = float(values[-1])
+                of_axes = _pid(values[:-1], places, k, self._INTEGRAL, lag)
+            else:
+                of_axes = _pid_of_rates(values, places, k, self._INTEGRAL)
+            if matrix is None:
+                return of_axes
+            return distributed(matrix, of_axes)
+
+        return Element(tuple(parameters), (*measured, *rates), inputs, law)
+
+    def _gain_parameters(
+        self,
+        axis_signals: Signals,
+        signals: Signals,
+        axes: Sequence[int],
+        measured: Sequence[int],
+        rates: Sequence[int],
+    ) -> tuple[list[Parameter], list[tuple[str, list[tuple[int, int]]]]]:
+        """Return the gains, and for each of them its term and its entries in the gain matrix."""
+        k = len(measured)
         pairs = [(axis, axis) for axis in range(k)]
         if self.coupled:
             pairs = [(row, column) for row in range(k) for column in range(k)]
@@ -289,32 +441,68 @@ class PID(Structure):
                 groups = [pairs]
             for group in groups:
                 row, column = group[0]
-                command, signal = inputs[row], measured[column]
+                command, signal = axes[row], measured[column]
                 if term == "kd" and rates:
                     signal = rates[column]
                 where = ""
                 if not self.shared and k > 1:
-                    where = f".{signals.inputs[command]}"
+                    where = f".{axis_signals.inputs[command]}"
                     if self.coupled:
                         where += f".{signals.outputs[signal]}"
-                default = self._default(signals, term, command, signal, row == column)
+                default = self._default(
+                    axis_signals, term, command, signal, row == column
+                )
                 label = f"{self._prefix}{term}{where}"
                 default = _named(default, label)
                 parameters.append(resolved(default, given))
                 places.append((term, group))
-        with_lag = not rates
-        if with_lag:
-            start = 0.1 / self.bandwidth
-            least = 0.1 * start
-            lag = Parameter(f"{self._prefix}lag", "s", start, least, math.inf, start)
-            parameters.append(resolved(lag, self.lag))
+        return parameters, places
 
-        def law(values: Array, width: int) -> Law:
-            if with_lag:
-                return _pid(values[:-1], places, k, self._INTEGRAL, float(values[-1]))
-            return _pid_of_rates(values, places, k, self._INTEGRAL)
+    def _distribution(
+        self, signals: Signals, measured: Sequence[int], inputs: Sequence[int]
+    ) -> Array | None:
+        """Return the matrix from the axes to the inputs, or None if each axis has one input."""
+        shape = len(inputs), len(measured)
+        if self.distribution is not None:
+            matrix = as_double("distribution", self.distribution)
+            if matrix.shape != shape:
+                raise InputError(
+                    f"distribution has shape {matrix.shape}, expected {shape}: inputs and measured "
+                    "outputs"
+                )
+            return matrix
+        if shape[0] <= shape[1]:
+            return None
+        response = np.zeros(shape[::-1])
+        for row, output in enumerate(measured):
+            for column, command in enumerate(inputs):
+                response[row, column] = signals.response(output, command)[0]
+        if np.linalg.matrix_rank(response) < len(measured):
+            raise InputError(
+                f"the inputs {self.inputs!r} cannot accelerate the outputs {self.measured!r} "
+                "independently of each other; give distribution=, or other inputs"
+            )
+        return np.asarray(np.linalg.pinv(response))
 
-        return Element(tuple(parameters), (*measured, *rates), inputs, law)
+    def _axes(
+        self,
+        signals: Signals,
+        measured: Sequence[int],
+        inputs: Sequence[int],
+        matrix: Array,
+    ) -> Signals:
+        """Return signals whose inputs are the commands of the axes."""
+        units = [signals.input_units[inputs[0]] for _ in measured]
+        if self.distribution is None:
+            units = []
+            for index in measured:
+                responses = [signals.response(index, command) for command in inputs]
+                order = min(order for gain, order in responses if gain)
+                unit = signals.output_units[index]
+                units.append(quotient(unit, power_of_seconds(order)))
+        names = tuple(signals.outputs[index] for index in measured)
+        B = signals.B[:, list(inputs)] @ matrix
+        return replace(signals, inputs=names, input_units=tuple(units), B=B)
 
     @property
     def _prefix(self) -> str:
@@ -330,7 +518,7 @@ class PID(Structure):
         unit = quotient(signals.input_units[command], signals.output_units[signal])
         if term == "ki":
             size *= 0.1 * w
-            unit = f"{unit}/s"
+            unit = per_second(unit)
         if term == "kd" and self.rates is None:
             size *= 1.4 / w
             unit = times_seconds(unit)
@@ -695,7 +883,7 @@ class StaticGain(Structure):
     def element(self, signals: Signals) -> Element:
         """Return the part of a law for the signals of a plant."""
         measured = indices("output", self.measured, signals.outputs)
-        inputs = indices("input", self.inputs, signals.inputs)
+        inputs = input_indices(self.inputs, signals)
         shape = len(inputs), len(measured)
         pattern = (
             np.ones(shape) if self.pattern is None else self._array("pattern", shape)
@@ -725,7 +913,11 @@ class StaticGain(Structure):
         def law(values: Array, width: int) -> Law:
             return static_law(np.tensordot(values, dD, 1), dD)
 
-        return Element(tuple(parameters), measured, inputs, law)
+        def of_gain(gain: Array) -> Array:
+            return np.array([gain[entry] for entry in entries])
+
+        start_of = of_gain if self.gain is None else None
+        return Element(tuple(parameters), measured, inputs, law, start_of)
 
     def _array(self, key: str, shape: tuple[int, int]) -> Array:
         value = as_double(key, getattr(self, key))
@@ -759,7 +951,7 @@ class StateSpaceLaw(Structure):
     Parameters
     ----------
     order : int
-        Number of states.
+        Number of states; 0 for a static gain.
     measured, inputs : str or sequence of str
         Names, groups or patterns of the measured outputs and of the inputs; all by default.
     feedthrough : bool
@@ -787,7 +979,7 @@ class StateSpaceLaw(Structure):
     name: str = ""
 
     def __post_init__(self) -> None:
-        count("order", self.order)
+        whole("order", self.order, 0)
         truth("feedthrough", self.feedthrough)
         positive("bandwidth", self.bandwidth, "rad/s")
         _require_name(self.name)
@@ -795,7 +987,7 @@ class StateSpaceLaw(Structure):
     def element(self, signals: Signals) -> Element:
         """Return the part of a law for the signals of a plant."""
         measured = indices("output", self.measured, signals.outputs)
-        inputs = indices("input", self.inputs, signals.inputs)
+        inputs = input_indices(self.inputs, signals)
         n, ny, nu = self.order, len(measured), len(inputs)
         rng = np.random.default_rng(0)
         prefix = self.name or "law"
@@ -831,9 +1023,9 @@ class StateSpaceLaw(Structure):
                 add(label, (nu + row, column), value, w * of_outputs[column])
         for row in range(nu):
             for column in range(n):
+                # With C = 0, the first start is the static gain.
                 label = f"{prefix}.C[{row},{column}]"
-                value = 0.5 * rng.standard_normal()
-                add(label, (row, ny + column), value, of_inputs[row])
+                add(label, (row, ny + column), 0.0, of_inputs[row])
             for column in range(ny if self.feedthrough else 0):
                 label = f"{prefix}.D[{row},{column}]"
                 add(label, (row, column), 0.0, scales[row, column])
@@ -852,7 +1044,21 @@ class StateSpaceLaw(Structure):
                 changes[:, :nu, :ny],
             )
 
-        return Element(tuple(parameters), measured, inputs, law)
+        def of_gain(gain: Array) -> Array:
+            values = _values(parameters)
+            for index, (row, column) in enumerate(places):
+                if row < nu and column < ny:
+                    values[index] = gain[row, column]
+            return values
+
+        start_of = of_gain if self.feedthrough else None
+        return Element(tuple(parameters), measured, inputs, law, start_of)
+
+    def simpler(self) -> Structure | None:
+        """Return a law with one state less; a law needs a state or a feedthrough."""
+        if self.order > (0 if self.feedthrough else 1):
+            return replace(self, order=self.order - 1)
+        return None
 
 
 @dataclass(frozen=True, eq=False)
@@ -901,7 +1107,7 @@ class CustomLaw(Structure):
     def element(self, signals: Signals) -> Element:
         """Return the part of a law for the signals of a plant."""
         measured = indices("output", self.measured, signals.outputs)
-        inputs = indices("input", self.inputs, signals.inputs)
+        inputs = input_indices(self.inputs, signals)
         parameters = []
         for key, given in zip(self._keys, self.parameters.values(), strict=True):
             default = Parameter(key, "", math.nan, -math.inf, math.inf, 1.0)
@@ -972,6 +1178,7 @@ class Structured:
     """Law of a structure for the signals of a plant, as a function of its free parameters."""
 
     def __init__(self, structure: Structure, signals: Signals) -> None:
+        self._structure, self._signals = structure, signals
         element = structure.element(signals)
         if element.measured is None or element.commanded is None:
             raise InputError(
@@ -1002,6 +1209,33 @@ class Structured:
             raise InputError(
                 "all parameters of the structure are fixed; free one of them"
             )
+
+    @property
+    def simpler(self) -> Structured | None:
+        """Law with fewer states, or None."""
+        structure = self._structure.simpler()
+        return None if structure is None else Structured(structure, self._signals)
+
+    @property
+    def has_gain(self) -> bool:
+        """Whether the law can start as a static gain."""
+        return self._element.of_gain is not None
+
+    def of_gain(self, gain: Array) -> Array:
+        """Return start values for a gain (commanded, measured) of the signals in `used`."""
+        element = self._element
+        assert element.of_gain is not None
+        assert element.measured is not None
+        assert element.commanded is not None
+        full = np.zeros(self._sizes[::-1])
+        measured, commanded = self.used
+        full[np.ix_(commanded, measured)] = gain
+        values = element.of_gain(full[np.ix_(element.commanded, element.measured)])
+        result = _values(self.parameters)
+        for value, place in zip(values.tolist(), self._place, strict=True):
+            if self.free[place]:
+                result[place] = value
+        return result
 
     def law(self, values: Array) -> Law:
         """Return the law from all outputs to all inputs, with derivatives for all parameters."""

@@ -15,20 +15,20 @@ from fflin.base.validation import Array, ArrayLike, count, instance, whole
 from fflin.linear.model import Delay
 from fflin.tuning.channels import ends_of
 from fflin.tuning.criteria import Piece
+from fflin.tuning.curves import GoalLoops
 from fflin.tuning.goals import Goal
+from fflin.tuning.law import Law
 from fflin.tuning.plant import Plant, Signals, plant_of, signals_of
 from fflin.tuning.points import Point, Points, points_of
 from fflin.tuning.problem import Case, Measure, Problem
 from fflin.tuning.search import Minimum, Term, minimise
+from fflin.tuning.starts import searched, stabilised
 from fflin.tuning.structures import Structure, Structured
 from fflin.tuning.tuned import GoalValue, Tuned, is_active
 from fflin.tuning.verification import second_value
 
-# Steps of the search for a stable loop, and its real part of the poles relative to the slowest.
-_STABILISING = 150
-
-# Steps of each start; the best one is then continued.
-_SCREENING = 60
+# Steps of the search for the least factor by which all goals would hold.
+_RELAXING = 150
 
 # Rounds in which worst models are added.
 _ROUNDS = 12
@@ -84,7 +84,10 @@ def tune(
     q : array_like (nq,), optional
         Configuration of an `Uncertain`; neutral by default.
     starts : int
-        Number of starts; the first one begins at the values of the structure.
+        Number of starts. The first one begins at the values of the structure, or for a
+        `StateSpaceLaw` at the best law with one state less. If a `StaticGain` has no given values,
+        the first and every other start is a regulator of all states, projected to the outputs. The
+        other starts are random.
     steps : int
         Largest number of steps of each search.
     seed : int
@@ -206,42 +209,12 @@ class _Task:
     ) -> tuple[Problem, Minimum, tuple[float, ...]]:
         """Search from several starts, and return the best result and the values of all."""
         problem = self.problem()
-        best: Minimum | None = None
-        values = []
-        for number in range(starts):
-            rng = np.random.default_rng([seed, number]) if number else None
-            x = self.stabilised(problem, problem.start(rng))
-            value = math.inf
-            if x is not None:
-                few = min(steps, _SCREENING) if starts > 1 else steps
-                minimum = minimise(problem.evaluate, x, problem.bounds, steps=few)
-                value = _level(minimum)
-                if best is None or _is_better(minimum, best):
-                    best = minimum
-            values.append(value)
-            bar(number + 1, starts, "search")
+        best, values = searched(
+            problem, starts, steps, seed, lambda done: bar(done, starts, "search")
+        )
         if best is None:
             raise InputError(self._why_unstable(problem))
-        if best.steps == _SCREENING and steps > _SCREENING:
-            best = minimise(problem.evaluate, best.x, problem.bounds, steps=steps)
-        return problem, best, tuple(values)
-
-    def stabilised(self, problem: Problem, x: Array) -> Array | None:
-        """Return a point whose loops are all stable, found from x; None if there is none."""
-        if problem.evaluate(x) is not None:
-            return x
-        if problem.abscissas(x) is None:
-            return None
-
-        def is_stable(terms: list[Term]) -> bool:
-            return max(term.value for term in terms) < 0.0
-
-        minimum = minimise(
-            problem.abscissas, x, problem.bounds, steps=_STABILISING, is_done=is_stable
-        )
-        if problem.evaluate(minimum.x) is None:
-            return None
-        return minimum.x
+        return problem, best, values
 
     def with_worst(
         self, problem: Problem, minimum: Minimum, steps: int, bar: Progress
@@ -259,13 +232,14 @@ class _Task:
                 break
             self.chosen += added
             problem = self.problem()
-            start = self.stabilised(problem, minimum.x)
+            start = stabilised(problem, minimum.x)
             if start is None:
                 raise InputError(
                     "no law of this structure was found that stabilises all models; give narrower "
                     "ranges, or another structure"
                 )
-            minimum = minimise(problem.evaluate, start, problem.bounds, steps=steps)
+            more = minimise(problem.evaluate, start, problem.bounds, steps=steps)
+            minimum = more.after(minimum)
         return problem, minimum
 
     def _worse(
@@ -374,7 +348,27 @@ class _Task:
             starts=starts,
             seconds=seconds,
             history=np.exp(np.array(minimum.history).reshape(-1, 2)),
+            parameter_history=np.array(
+                [problem.values(x)[0] for x in minimum.path]
+            ).reshape(-1, len(parameters)),
+            loops=self.loops(problem, minimum.x, law),
         )
+
+    def loops(self, problem: Problem, x: Array, law: Law) -> tuple[GoalLoops, ...]:
+        """Return the loops of each goal in the models of the search."""
+        cases = [
+            (self.case(point), self.case(point).loops(law)) for point in self.chosen
+        ]
+        results = []
+        for index, measure in enumerate(self.measures):
+            loops = tuple(
+                (of_goals[index], case.channels[index])
+                for case, of_goals in cases
+                if of_goals is not None
+            )
+            scaling = problem.scaling(x, index)
+            results.append(GoalLoops(measure.goal, measure.ends, loops, scaling))
+        return tuple(results)
 
     def _contradiction(
         self, problem: Problem, minimum: Minimum
@@ -389,7 +383,7 @@ class _Task:
                     return None
                 return [term._replace(is_constraint=False) for term in terms]
 
-            relaxed = minimise(evaluate, minimum.x, problem.bounds, steps=_STABILISING)
+            relaxed = minimise(evaluate, minimum.x, problem.bounds, steps=_RELAXING)
         weights: dict[int, float] = {}
         for key, weight in (relaxed.weights or {}).items():
             index = key[1] if isinstance(key, tuple) else 0
@@ -442,17 +436,3 @@ def _require_slow(measure: Measure, dt: float) -> None:
             f"the goal '{measure.goal.label}' begins at {low:g} rad/s, but the law is sampled at "
             f"{dt:g} s, half of whose rate is {math.pi / dt:.3g} rad/s; give a lower frequency"
         )
-
-
-def _level(minimum: Minimum) -> float:
-    """Return the largest value of the goals."""
-    return math.exp(max(minimum.objective, minimum.violation))
-
-
-def _is_better(minimum: Minimum, other: Minimum) -> bool:
-    """Return whether a result is better; one that violates hard goals less is better."""
-    least = 1e-6
-    largest = max(minimum.violation, other.violation)
-    if largest > least and abs(minimum.violation - other.violation) > least:
-        return minimum.violation < other.violation
-    return minimum.objective < other.objective

@@ -10,7 +10,8 @@ import pytest
 from scipy.linalg import expm
 
 import fflin
-from fflin.control.margins import ClosedLoop, _delayed, law_in_loop
+from fflin.control.closed_loop import ClosedLoop, _delayed
+from fflin.control.margins import laws_in_loop
 from fflin.control.optimal import disk
 from fflin.control.optimal.disk import best_scaling, worst_perturbation
 from fflin.control.policy import System
@@ -27,7 +28,7 @@ def satellite(inputs=None, **fields):
 def loop_of(policy, lin, **how):
     """Return the loop whose margins are computed."""
     how = {"delay": 0.0, "sample": None, "at": "inputs", **how}
-    return ClosedLoop(law_in_loop(policy, lin, how["sample"]), lin, *how.values())
+    return ClosedLoop(laws_in_loop(policy, lin, how["sample"]), lin, *how.values())
 
 
 def test_each_input_of_a_continuous_plant_has_its_own_delay():

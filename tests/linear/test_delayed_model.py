@@ -9,7 +9,8 @@ from scipy.integrate import quad_vec
 from scipy.linalg import expm
 
 import fflin
-from fflin.control.margins import ClosedLoop, law_in_loop
+from fflin.control.closed_loop import ClosedLoop
+from fflin.control.margins import laws_in_loop
 
 DELAYS = (0.03, 0.1, 0.17, 0.2, 0.33)
 
@@ -298,7 +299,7 @@ def test_the_loop_is_that_of_the_margins(delay):
     _, lin = satellite()
     late = lin.discretize(0.1, delay)
     gain = fflin.lqr(late)
-    loop = ClosedLoop(law_in_loop(gain, lin, None), lin, 0.0, None, "inputs")
+    loop = ClosedLoop(laws_in_loop(gain, lin, None), lin, 0.0, None, "inputs")
     plant = loop.with_delays(np.full(3, delay))
     poles = np.linalg.eigvals(loop.closed(plant)[0])
     lasting = gain.poles[np.abs(gain.poles) > 0.05]
@@ -336,7 +337,7 @@ def test_a_delay_beyond_the_delay_margin_makes_the_loop_unstable():
     margin = fflin.margins(gain, late).channels[0].delay
 
     def radius(delay):
-        loop = ClosedLoop(law_in_loop(gain, lin, None), lin, delay, None, "inputs")
+        loop = ClosedLoop(laws_in_loop(gain, lin, None), lin, delay, None, "inputs")
         F = loop.closed(loop.with_delays(np.full(1, delay)))[0]
         return np.abs(np.linalg.eigvals(F)).max()
 

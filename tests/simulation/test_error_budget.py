@@ -11,6 +11,7 @@ from fflin.base.errors import InputError, UnknownNameError
 from fflin.dynamics.disturbance import BaseDisturbance, phasors_of
 from fflin.dynamics.orbital import OrbitField
 from fflin.dynamics.state_rows import attitude_rotations
+from tests.control.test_multirate import designed
 
 DEGREES = np.degrees(1.0)
 
@@ -410,3 +411,85 @@ def test_a_budget_warns_of_plates_and_refuses_elliptic_orbits():
     elliptic = robot.replace(orbit=fflin.EllipticOrbit(perigee=500e3, apogee=900e3))
     with pytest.raises(fflin.InputError, match="error budgets do not support elliptic"):
         fflin.error_budget(law, model, robot=elliptic, **causes)
+
+
+class Recursion:
+    """Deviations of a satellite, a law at two rates and its sensors; one column for each run."""
+
+    def __init__(self):
+        _, self.lin, compensator = designed()
+        self.policy = fflin.MultirateFeedback(self.lin, compensator)
+        law, lin = self.policy.compensator, self.lin
+        names = [f"{group}.{axis}" for group in ("q_b", "omega_b") for axis in "xyz"]
+        self.kept = [lin.state_names.index(name) for name in names]
+        self.A = lin.A[np.ix_(self.kept, self.kept)]
+        self.B, self.C = lin.B[self.kept], lin.C[:, self.kept]
+        self.law = law
+
+    def run(self, samples, runs, errors, push=None):
+        """Return the attitudes (samples, 3, runs) [deg]; errors() returns those of the outputs."""
+        law, late = self.law, 4
+        x, z = np.zeros((6, runs)), np.zeros((law.A.shape[1], runs))
+        seen = np.zeros((late + 1, 6, runs))
+        held = np.zeros((6, runs))
+        attitudes = []
+        for k in range(samples):
+            attitudes.append(np.degrees(2.0) * x[:3])
+            seen = np.roll(seen, 1, axis=0)
+            seen[0] = self.C @ x + errors()
+            held[3:] = seen[0, 3:]
+            if k % 5 == late:
+                held[:3] = seen[late, :3]
+            u = law.C @ z
+            j = k % len(law.A)
+            z = law.A[j] @ z + law.B[j] @ held
+            x = self.A @ x + self.B @ u
+            if push is not None:
+                x = x + push(k)
+        return np.array(attitudes)
+
+
+@pytest.mark.exhaustive
+def test_the_budget_of_a_law_at_two_rates_equals_a_recursion():
+    loop = Recursion()
+    rng = np.random.default_rng(4)
+    size = np.array([2e-5] * 3 + [3e-6] * 3)[:, None]
+    budget = fflin.error_budget(
+        loop.policy,
+        loop.lin,
+        noise={"q_b": 2e-5, "gyroscope": 3e-6},
+    )
+    samples, runs = 4000, 400
+    attitudes = loop.run(samples, runs, lambda: size * rng.standard_normal((6, runs)))
+    # The last ten periods of all runs are about 400 independent samples, an error of 4 %.
+    late = np.sqrt((attitudes[-50:] ** 2).mean(axis=(0, 2)))
+    assert late == pytest.approx(budget.deviation[:3], rel=0.12)
+    periodic = fflin.error_budget(
+        loop.policy, loop.lin, periodic={"wheel_y": (1e-4, 0.02)}
+    )
+    # A held input has the sinusoid of the forces up to (w h)^2/24 and half a sample of lag.
+    angle = 2.0 * np.pi * 0.02 * loop.lin.dt
+    column = loop.B[:, [1]]
+    attitudes = loop.run(
+        20000,
+        1,
+        lambda: 0.0,
+        lambda k: 1e-4 * column * np.sin(angle * (k + 0.5)),
+    )
+    rms = np.sqrt((attitudes[-10000:, 1, 0] ** 2).mean())
+    expected = periodic.error("attitude.y")["wheel_y at 0.02 Hz"] / np.sqrt(2.0)
+    assert rms == pytest.approx(expected, rel=1e-3)
+
+
+def test_a_constant_torque_leaves_a_law_that_estimates_it_without_error():
+    loop = Recursion()
+    budget = fflin.error_budget(
+        loop.policy,
+        loop.lin,
+        disturbance={"tau_b": (2e-5, 0.0, 1e-5)},
+        bias={"gyroscope": 3e-5, "q_b.x": 1e-5},
+    )
+    errors = budget.error("attitude.x")
+    assert errors["constant tau_b"] < 1e-9
+    assert errors["bias of gyroscope"] < 1e-9
+    assert errors["bias of q_b.x"] == pytest.approx(np.degrees(2e-5), rel=1e-6)

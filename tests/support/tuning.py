@@ -2,11 +2,12 @@
 
 import numpy as np
 
+from fflin.base.process import in_one_thread
 from fflin.tuning.channels import Channel, Ends
 from fflin.tuning.goals import MaxGain
 from fflin.tuning.plant import Plant, Signals
 from fflin.tuning.problem import Case, Measure, Problem
-from fflin.tuning.search import minimise
+from fflin.tuning.starts import searched
 from fflin.tuning.structures import StaticGain, Structured
 
 
@@ -34,24 +35,9 @@ def problem_of(matrices, structure=None):
     return Problem(structured, [measure], [case])
 
 
-def least_gain(matrices, structure=None, starts=3, steps=300):
+@in_one_thread
+def least_gain(matrices, structure=None, starts=3, steps=300, seed=1):
     """The least gain of several starts, and the law that reaches it."""
     problem = problem_of(matrices, structure)
-    best = None
-    for number in range(starts):
-        rng = np.random.default_rng([1, number]) if number else None
-        x = problem.start(rng)
-        if problem.evaluate(x) is None:
-            x = minimise(
-                problem.abscissas,
-                x,
-                problem.bounds,
-                steps=200,
-                is_done=lambda terms: max(term.value for term in terms) < 0.0,
-            ).x
-        if problem.evaluate(x) is None:
-            continue
-        found = minimise(problem.evaluate, x, problem.bounds, steps=steps)
-        if best is None or found.objective < best.objective:
-            best = found
+    best, _ = searched(problem, starts, steps, seed)
     return float(np.exp(best.objective)), problem.law(best.x)

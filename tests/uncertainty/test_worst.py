@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 import fflin
-from fflin.control.margins import ClosedLoop, delayed_model, law_in_loop
+from fflin.control.closed_loop import ClosedLoop
+from fflin.control.margins import delayed_model, laws_in_loop
 from fflin.uncertainty import worst
 from fflin.uncertainty.sampled_loops import (
     OUTPUTS,
@@ -504,7 +505,7 @@ def test_the_worst_sampled_loop_has_its_margin_its_poles_and_its_gain(
     def closed(parameters):
         lin = fflin.linearize(model.at(parameters))
         lin, delay = delayed_model(law, lin, None)
-        return ClosedLoop(law_in_loop(law, lin, None), lin, delay, None, "inputs")
+        return ClosedLoop(laws_in_loop(law, lin, None), lin, delay, None, "inputs")
 
     def figures(loop):
         F = loop.loop()[0]

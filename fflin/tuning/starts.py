@@ -1,0 +1,154 @@
+"""Starts of a search: given values, regulators, simpler laws and random values."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from fflin.base.validation import Array
+from fflin.tuning.problem import Problem
+from fflin.tuning.search import Minimum, Term, minimise
+
+# Largest number of steps of the search for a stable loop.
+_STABILISING = 150
+
+# Steps of each start; the best one is then continued.
+_SCREENING = 60
+
+# Decades by which the weight of the commands of a regulator is larger or smaller, at random.
+_DECADES = 2.0
+
+# Weights that make the equations of a regulator solvable, relative to the others.
+_SMALL = 1e-6
+
+
+def searched(
+    problem: Problem,
+    starts: int,
+    steps: int,
+    seed: int,
+    done: Callable[[int], None] = lambda number: None,
+) -> tuple[Minimum | None, tuple[float, ...]]:
+    """Search from several starts, and return the best result and the values of all.
+
+    The first start of a law with states is the best law with one state less, so that a law of a
+    higher order is never worse. `done` is called with the number of starts that have ended.
+    """
+    screening = min(steps, _SCREENING) if starts > 1 else steps
+    best: Minimum | None = None
+    values = []
+    for number, start in enumerate(_starts(problem, starts, steps, seed)):
+        x = None if start is None else stabilised(problem, start)
+        value = math.inf
+        if x is not None:
+            minimum = minimise(problem.evaluate, x, problem.bounds, steps=screening)
+            value = math.exp(max(minimum.objective, minimum.violation))
+            if best is None or _is_better(minimum, best):
+                best = minimum
+        values.append(value)
+        done(number + 1)
+    if best is not None and best.steps == _SCREENING and steps > _SCREENING:
+        more = minimise(problem.evaluate, best.x, problem.bounds, steps=steps)
+        best = more.after(best)
+    return best, tuple(values)
+
+
+def stabilised(problem: Problem, x: Array) -> Array | None:
+    """Return a point whose loops are all stable, found from x; None if there is none."""
+    if problem.evaluate(x) is not None:
+        return x
+    if problem.abscissas(x) is None:
+        return None
+
+    def is_stable(terms: list[Term]) -> bool:
+        return max(term.value for term in terms) < 0.0
+
+    minimum = minimise(
+        problem.abscissas, x, problem.bounds, steps=_STABILISING, is_done=is_stable
+    )
+    if problem.evaluate(minimum.x) is None:
+        return None
+    return minimum.x
+
+
+def _starts(
+    problem: Problem, starts: int, steps: int, seed: int
+) -> Iterator[Array | None]:
+    """Yield the starts of a search.
+
+    The first one has the values of the structure. A law that can be a static gain starts from
+    projected regulators instead, in the first and every other start. The remaining starts are
+    random.
+    """
+    has_gain = problem.structured.has_gain
+    for number in range(starts):
+        rng = np.random.default_rng([seed, number])
+        if number == 0:
+            first = _simpler(problem, starts, steps, seed)
+            if first is None and has_gain:
+                first = _regulator(problem, None)
+            yield problem.start() if first is None else first
+        elif has_gain and number % 2:
+            yield _regulator(problem, rng)
+        else:
+            yield problem.start(rng)
+
+
+def _simpler(problem: Problem, starts: int, steps: int, seed: int) -> Array | None:
+    """Return the point of the best simpler law, or None."""
+    simple = problem.simpler
+    if simple is None:
+        return None
+    # The simplest law is searched from all starts, and every other one from the simpler law.
+    few = starts if simple.simpler is None else 1
+    best = searched(simple, few, min(steps, _SCREENING), seed)[0]
+    return None if best is None else problem.extended(simple, best.x)
+
+
+def _regulator(problem: Problem, rng: np.random.Generator | None) -> Array | None:
+    """Return the point of a regulator of all states, projected to the measured outputs.
+
+    The regulator minimises the outputs of all goals. Its gain F becomes ``K = F P C' (C P C')^-1``
+    with the covariance P of its loop under the inputs of all goals, so that K y is the best
+    estimate of F x from the measured outputs y. The weight of the commands is random.
+    """
+    from scipy.linalg import solve_continuous_are, solve_continuous_lyapunov
+
+    case = problem.cases[0]
+    measured, commanded = problem.structured.used
+    plant = case.plant
+    A, B, C = plant.A, plant.B[:, list(commanded)], plant.C[list(measured)]
+    n, nu = B.shape
+    if not n:
+        return None
+    cost, effort, noise = _SMALL * np.eye(n), _SMALL * np.eye(nu), _SMALL * np.eye(n)
+    for channel in case.channels:
+        if channel is None or channel.plant is not plant:
+            continue
+        D12 = channel.D12[:, list(commanded)]
+        cost = cost + channel.C1.T @ channel.C1
+        effort = effort + D12.T @ D12
+        noise = noise + channel.B1 @ channel.B1.T
+    if rng is not None:
+        effort = effort * 10.0 ** rng.uniform(-_DECADES, _DECADES)
+    try:
+        X = solve_continuous_are(A, B, cost, effort)
+        F = -np.linalg.solve(effort, B.T @ X)
+        P = solve_continuous_lyapunov(A + B @ F, -noise)
+        gain = F @ P @ C.T @ np.linalg.pinv(C @ P @ C.T, rcond=1e-10)
+    except (np.linalg.LinAlgError, ValueError):
+        return None
+    if not np.isfinite(gain).all():
+        return None
+    return problem.of_gain(gain)
+
+
+def _is_better(minimum: Minimum, other: Minimum) -> bool:
+    """Return whether a result is better; one that violates hard goals less is better."""
+    least = 1e-6
+    largest = max(minimum.violation, other.violation)
+    if largest > least and abs(minimum.violation - other.violation) > least:
+        return minimum.violation < other.violation
+    return minimum.objective < other.objective
