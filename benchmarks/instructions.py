@@ -21,7 +21,7 @@ _COUNT = "_count"  # the argument with which this module runs itself under valgr
 
 # Ratios on CPython 3.11, NumPy 2.4 and Pinocchio 4.1, and by what part of them they may grow: they
 # repeat to two in a thousand, and one call of CRBA more at rest is a sixth.
-BASELINE = {"at rest": 1.63, "operating point": 2.06}
+BASELINE = {"at rest": 1.63, "operating point": 2.06, "constrained at rest": 4.24}
 TOLERANCE = 0.1
 
 Call = Callable[[], object]
@@ -60,9 +60,18 @@ def pairs() -> dict[str, tuple[Call, Call]]:
         A[nv:, nv:] = -M_inverse.dot(by_v.take(flat))
         return A, B
 
+    arms = fflin.load("dual_arm")
+    bent = {"left_1": 0.4, "left_2": 0.6, "right_1": -0.4, "right_2": -0.6}
+    closed = fflin.configuration(arms, bent)
+    free = fflin.Linearizer(arms)
+    grasp = fflin.Weld("tool_right", "tool_left")
+    held = fflin.Linearizer(arms.replace(constraints=[grasp]))
+
     return {
         "at rest": (lambda: linearizer(q), inverse),
         "operating point": (lambda: linearizer(q, v, u), slopes),
+        # The other side is the robot without its constraint.
+        "constrained at rest": (lambda: held(closed), lambda: free(closed)),
     }
 
 

@@ -35,6 +35,8 @@ COLORS = (
 )
 # The colours after the first _SOLID are drawn with dashes and dots.
 _SOLID = 5
+# Units of revolute joints, prismatic joints and modes, in the order of the charts of a motion.
+_UNITS_OF_JOINTS = ("rad", "m", "kg^0.5 m")
 # Colour of curves that have none of COLORS, because others change more.
 GREY = "#8a93a5"
 _STYLE = Path(__file__).parent / "assets" / "figures.mplstyle"
@@ -70,6 +72,18 @@ def curve_styles(changes: Mapping[str, float]) -> dict[str, CurveStyle]:
     for index, name in enumerate(named):
         styles[name] = CurveStyle(COLORS[index], dashed=index >= _SOLID)
     return styles
+
+
+def joint_styles(units: Mapping[str, str]) -> dict[str, CurveStyle]:
+    """Return the styles of joints, given {joint: unit} without wheels.
+
+    In the figures and on the page of every motion, the joints have these styles. The result is
+    empty if there are more joints than COLORS, because then their styles depend on the motion.
+    """
+    if len(units) > len(COLORS):
+        return {}
+    names = sorted(units, key=lambda name: _UNITS_OF_JOINTS.index(units[name]))
+    return curve_styles(dict.fromkeys(names, 0.0))
 
 
 def cycle(count: int) -> list[str]:

@@ -106,7 +106,7 @@ class RandomConfigurations:
 
     def rows(self, start: int, stop: int) -> Array:
         """Return configurations start to stop - 1 as rows of an array (stop - start, nq)."""
-        low, high = np.array(list(self.ranges.values())).reshape(-1, 2).T
+        low, high = self._limits()
         first = start // _DRAWN
         blocks = [np.empty((0, len(low)))] + [
             np.random.default_rng([self.seed, block]).uniform(
@@ -117,6 +117,19 @@ class RandomConfigurations:
         drawn = np.concatenate(blocks)[start - first * _DRAWN : stop - first * _DRAWN]
         values = dict(zip(self.ranges, drawn.T, strict=True))
         return _placed(self.robot, self.start, stop - start, values)
+
+    def drawn_again(self, index: int, attempt: int) -> Array:
+        """Return another draw (nq,) for a configuration, with the number `attempt` from 1."""
+        seed = [self.seed, index, attempt]
+        values = np.random.default_rng(seed).uniform(*self._limits())
+        columns = dict(zip(self.ranges, values[:, None], strict=True))
+        row: Array = _placed(self.robot, self.start, 1, columns)[0]
+        return row
+
+    def _limits(self) -> tuple[Array, Array]:
+        """Return the lower and upper limits of all joints."""
+        low, high = np.array(list(self.ranges.values())).reshape(-1, 2).T
+        return low, high
 
 
 # Configurations of a sweep that are generated on demand.

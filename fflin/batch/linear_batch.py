@@ -76,6 +76,13 @@ class LinearBatch(ModelHeader):
     verified : bool
         Whether the data are known to be unchanged. The value is False for a file without a
         checksum, or if the checksum was not verified.
+    residual : ndarray (N,) or None
+        Largest distance [m] or angle [rad] by which each point violates the constraints of the
+        robot; None without constraints.
+    dependent : tuple of str
+        See `LinearModel`.
+    joints : tuple of str
+        Names of the joints of `columns`.
     notes : tuple of str
         Why the models were computed in Python although no engine was given.
 
@@ -107,11 +114,17 @@ class LinearBatch(ModelHeader):
     _reference: Array | None
     _root: Array
     _drift: Array | None
+    # Fields of a robot with constraints.
+    _all_states: Array | None
+    _reduced_inertia: Array | None
+    residual: Array | None
     # Further fields of each `LinearModel`: values that are the same at all points, and functions
     # that compute a field from the robot when the field is read.
     _asked: Mapping[str, object]
     verified: bool = True
     notes: tuple[str, ...] = ()
+    dependent: tuple[str, ...] = ()
+    joints: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.q)
@@ -186,8 +199,8 @@ class LinearBatch(ModelHeader):
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """Names of the n independent joints in state order."""
-        return _joints(self.state_names)
+        """Names of the n joints in state order."""
+        return self.joints
 
     @property
     def joint_positions(self) -> Array:
@@ -347,7 +360,7 @@ class LinearBatch(ModelHeader):
         if identity != (
             values["urdf_sha256"],
             values["locked"],
-            _joints(values["state_names"]),
+            values["joints"],
             n,
         ):
             raise InputError(
@@ -363,7 +376,7 @@ class LinearBatch(ModelHeader):
 
     def _arrays(self) -> dict[str, Array]:
         """Return {name: array} of all arrays of the batch; each array has one row per point."""
-        held = {key: getattr(self, key) for key in (*_ARRAYS, *_OPTIONAL_ARRAYS)}
+        held = {key: getattr(self, key) for key in (*_ARRAYS, *OPTIONAL)}
         return {key: value for key, value in held.items() if value is not None}
 
     def header(self, count: int) -> dict[str, str]:
@@ -371,7 +384,7 @@ class LinearBatch(ModelHeader):
         first = self[0]
         header = {key: getattr(self, key) for key in TEXTS}
         header |= {"_ignorable": first.ignorable, "mean_motion": first.mean_motion}
-        header["notes"] = self.notes
+        header |= {"notes": self.notes, "joints": self.joints}
         wheels = (
             first._robot.flown_wheels if first._robot else self._asked.get("_wheels")
         )
@@ -388,7 +401,7 @@ class LinearBatch(ModelHeader):
         common |= {key: getattr(self, key) for key in (*TEXTS, "verified")}
         # `asarray` converts a row of a memory-mapped file to a plain array, without a copy.
         arrays = self._arrays().items()
-        rows = {
+        rows: dict[str, Any] = {
             key.removeprefix("_"): np.asarray(array[index]) for key, array in arrays
         }
         lower, root = rows.pop("B_lower"), rows.pop("root")
@@ -400,6 +413,10 @@ class LinearBatch(ModelHeader):
         if self._reference is None and (root != AT_ROOT).any():
             placed = pin.XYZQUATToSE3(root) * pin.XYZQUATToSE3(base)
             rows["placement"] = frozen(pin.SE3ToXYZQUAT(placed))
+        rows.pop("residual", None)
+        if self._reduced_inertia is not None:
+            rows["_all_states"] = rows.pop("all_states")
+            rows["_inertia"] = partial(given, rows.pop("reduced_inertia"))
         return LinearModel({**common, **rows})
 
     def _states_at_rest(self, q: Array) -> Array:
@@ -443,8 +460,9 @@ _MODEL = {item.name for item in fields(LinearModel)} - {"verified"}
 # Fields of a model that are empty in a model of a batch.
 _EMPTY_TUPLES = ("added", "dependent", "_delays", "_lags", "_output_lags")
 _ARRAYS = [key for key, kind in _KINDS.items() if kind == "Array"]
-_OPTIONAL_ARRAYS = [key for key, kind in _KINDS.items() if kind == "Array | None"]
-TEXTS = [key for key, kind in _KINDS.items() if key in _MODEL and "Array" not in kind]
+OPTIONAL = [key for key, kind in _KINDS.items() if kind == "Array | None"]
+_TYPES = [key for key, kind in _KINDS.items() if "Array" not in kind]
+TEXTS = [key for key in _TYPES if key in _MODEL]
 
 
 def _checked_fields(
@@ -452,8 +470,8 @@ def _checked_fields(
 ) -> dict[str, Any]:
     """Return the fields of a batch from its file; raise `ValueError` for a wrong shape or type."""
     count = int(header["points"])
-    values: dict[str, Any] = dict.fromkeys(_OPTIONAL_ARRAYS)
-    for key in (*_ARRAYS, *(arrays.keys() & set(_OPTIONAL_ARRAYS))):
+    values: dict[str, Any] = dict.fromkeys(OPTIONAL)
+    for key in (*_ARRAYS, *(arrays.keys() & set(OPTIONAL))):
         array = arrays[key]
         if key in constant:
             array = np.broadcast_to(array, (count, *array.shape))
@@ -462,7 +480,9 @@ def _checked_fields(
                 f"{key} has {len(array)} rows of {array.dtype}, expected {count}"
             )
         values[key] = frozen(array)
-    for key in TEXTS:
+    # Files of earlier versions do not contain these.
+    header = {"dependent": [], "joints": _joints(header["state_names"]), **header}
+    for key in (*TEXTS, "joints"):
         values[key] = header[key]
         if isinstance(header[key], list):
             values[key] = tuple(header[key])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import closing
 from functools import partial
@@ -19,15 +19,15 @@ from fflin.base import __version__
 from fflin.base.errors import FflinWarning, located
 from fflin.base.record import content_digest
 from fflin.base.validation import Array, ArrayLike, Indices, Mask, frozen, vector
+from fflin.batch.closed_points import closed_points
 from fflin.batch.configurations import Configurations, checked_points, checked_rows
 from fflin.batch.files import FileStore, MemoryStore, is_constant, output_path
-from fflin.batch.linear_batch import AT_ROOT, TEXTS, LinearBatch
+from fflin.batch.linear_batch import AT_ROOT, OPTIONAL, TEXTS, LinearBatch
 from fflin.batch.run import Execution, Progress, Rows, run_chunks
 from fflin.dynamics.coordinates import (
     SMALLEST_Q0,
     Chart,
     ReferenceChart,
-    refuse_constraints,
     refuse_elliptic,
 )
 from fflin.dynamics.rnea import AccelerationDerivatives
@@ -51,6 +51,9 @@ _LARGEST_CHUNK = 2**16
 
 # Only one thread at a time may change the warning filters, because all threads share them.
 _TURN = Lock()
+
+# Attributes of a model whose names differ from the names of the arrays of a batch.
+_ATTRIBUTES = {"_all_states": "_all_states", "_reduced_inertia": "M"}
 
 # Attributes that identify a robot, in addition to its Pinocchio model.
 _OF_THE_ROBOT = (
@@ -78,6 +81,7 @@ def sweep(
     frame: Frame | None = None,
     reference: pin.SE3 | None = None,
     moving: bool = False,
+    independent: Sequence[str] | None = None,
     engine: str | None = None,
     executor: Executor | None = None,
     workers: int | None = None,
@@ -106,6 +110,11 @@ def sweep(
         Inputs of the robot; zero by default.
     frame, reference, moving : optional
         See `Linearizer`. By default the reference is the base pose at each point.
+    independent : sequence of str, optional
+        Coordinates of the models of a robot with constraints, see `Linearizer`. All points have the
+        same coordinates. The joints of a grid keep their values, and random configurations keep
+        the values of the independent joints; the other coordinates are changed such that the
+        constraints hold. A random configuration that cannot be closed is drawn again.
     engine : {"python", "compiled"}, optional
         Engine that linearises the points. The default is "compiled" if numba is installed and the
         robot's outputs are its state; otherwise the default is "python".
@@ -141,6 +150,8 @@ def sweep(
         is not available.
     UnknownNameError
         If the engine does not exist.
+    ConstraintError
+        If a configuration violates the constraints of the robot, or cannot be closed.
     SweepError
         If a point cannot be linearised, or a worker dies. The message names the chunks;
         `SweepError.batch` or the file contains the results of the other chunks.
@@ -163,13 +174,17 @@ def sweep(
     >>> len(batch), batch[3].B.shape
     (10, (18, 9))
     """
-    refuse_constraints(robot, "sweeps")
     how = Execution(executor, workers, threads, chunk, progress)
     path = None if out is None else output_path(out)
     refuse_elliptic(robot, "sweeps", "use fflin.linearize(robot, q, t=...)")
-    linearizer = Linearizer(robot, frame=frame, reference=reference, moving=moving)
+    linearizer = Linearizer(
+        robot, frame=frame, reference=reference, moving=moving, independent=independent
+    )
+    residual = None
+    if linearizer.constrained:
+        q, residual = closed_points(linearizer, checked_points(robot, q))
     job = ChunkJob(linearizer, at_rest=v is None and u is None, engine=engine)
-    task = SweepTask(job, q, v, u)
+    task = SweepTask(job, q, v, u, residual)
     count = task.count
     size = chunk
     row = job.row_bytes
@@ -212,6 +227,8 @@ def kernel_of(prepared: Prepared, engine: str | None) -> RowAccelerations | None
 
 def _reason(prepared: Prepared) -> str:
     """Return why the compiled kernel cannot be used, or an empty text if it can."""
+    if prepared.robot.constraints:
+        return f"the constraints of '{prepared.robot.name}' need Python"
     if prepared.robot.orbit and not prepared.map.axes[1]:
         return f"in orbit, models in base axes (of '{prepared.robot.name}') need Python"
     task = Task(robots=(prepared.robot,), outputs=prepared.sensing is not None)
@@ -251,6 +268,8 @@ class ChunkJob:
                 self.shapes["_drift"] = (nx,)
             if prepared.sensing is not None:
                 self.shapes |= {"C": (ny, nx), "D": (ny, nu), "_y0": (ny,)}
+        if linearizer.constrained:
+            self.shapes = _constrained_shapes(linearizer)
         self.row_bytes = 8 * (
             linearizer.robot.nq + sum(map(math.prod, self.shapes.values()))
         )
@@ -278,7 +297,8 @@ class ChunkJob:
                         if key == "B_lower":
                             array[row] = lin.B[nv:]
                         else:
-                            array[row] = getattr(lin, key.removeprefix("_"))
+                            name = _ATTRIBUTES.get(key, key.removeprefix("_"))
+                            array[row] = getattr(lin, name)
         return [str(note.message) for note in caught]
 
     def write(self, rows: Rows, out: Mapping[str, Array]) -> Indices:
@@ -356,6 +376,27 @@ class ChunkJob:
         return good
 
 
+def _constrained_shapes(linearizer: Linearizer) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of the arrays of a model of a robot with constraints."""
+    ready = linearizer.prepared
+    nx, d = ready.map.nx, len(linearizer.independent)
+    nu, ny = len(ready.actuation.names), len(ready.common["output_names"])
+    shapes: dict[str, tuple[int, ...]] = {
+        "A": (2 * d, 2 * d),
+        "B_lower": (d, nu),
+        "C": (ny, 2 * d),
+        "D": (ny, nu),
+        "f0": (2 * d,),
+        "_x0": (2 * d,),
+        "_y0": (ny,),
+        "_all_states": (nx, 2 * d),
+        "_reduced_inertia": (d, d),
+    }
+    if ready.moving:
+        shapes["_drift"] = (2 * d,)
+    return shapes
+
+
 class SweepTask:
     """Points of a sweep, and the arrays of its result that are the same at all points."""
 
@@ -365,8 +406,10 @@ class SweepTask:
         q: ArrayLike | Configurations,
         v: ArrayLike | None,
         u: ArrayLike | None,
+        residual: Array | None = None,
     ) -> None:
         self.job = job
+        self._residual = residual
         self.robot = (robot := job.linearizer.robot)
         prepared = job.linearizer.prepared
         root = robot.model.jointPlacements[ROOT]
@@ -422,13 +465,18 @@ class SweepTask:
     def batch(self, arrays: Mapping[str, Array]) -> LinearBatch:
         """Assemble a batch from the arrays that vary between points."""
         count = len(arrays["q"])
-        rows: dict[str, Any] = dict.fromkeys(("_x0", "_y0", "_reference", "_drift"))
+        rows: dict[str, Any] = dict.fromkeys(OPTIONAL)
         for key, value in self.constants.items():
             rows[key] = np.broadcast_to(value, (count, *value.shape))
         for key in self.shapes:
             rows[key] = frozen(arrays[key].view())
         common = self.job.linearizer.prepared.common
-        rows |= {key: common[key] for key in TEXTS}
+        linearizer = self.job.linearizer
+        texts = {"dependent": (), **common, **linearizer.constrained_names}
+        rows |= {key: texts[key] for key in TEXTS}
+        rows["joints"] = self.robot.joint_names
+        if self._residual is not None:
+            rows["residual"] = frozen(self._residual[:count])
         columns = list[tuple[int, int, float]]()
         for joint in self.robot.joints:
             second = joint.idx_q + 1 if joint.unbounded else -1

@@ -31,9 +31,10 @@ from fflin.base.writing import as_path, write_atomically
 from fflin.batch.files import read_rows, write_rows
 from fflin.campaign.pointing import campaign_pointing
 from fflin.campaign.report import campaign_card, campaign_report
-from fflin.campaign.runs import KINDS, MODES, WHEEL_SPEEDS, kind_named
+from fflin.campaign.runs import KINDS, MODES, kind_named
 from fflin.campaign.spreads import SEED
 from fflin.linear.files import labels, write_table
+from fflin.simulation.report import WHEEL_SPEEDS
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -60,12 +61,16 @@ _FACTORS = {  # {(unit in a condition, unit of the figure): conversion factor}
 
 
 class Bound(NamedTuple):
-    """Comparison in a condition, and the mask (N,) of runs that satisfy the comparison."""
+    """Comparison in a condition, and the mask (N,) of runs that satisfy the comparison.
+
+    `text` is the comparison with its unit, which users may omit.
+    """
 
     name: str
     sign: str
     limit: float
     met: Mask
+    text: str
 
 
 def bounds_of(
@@ -98,7 +103,8 @@ def bounds_of(
                 f"condition {part!r} has the unit {unit}, expected {figure_unit or 'no unit'}"
             )
         limit *= factor
-        bounds.append(Bound(name, sign, limit, _COMPARE[sign](values, limit)))
+        text = part.strip() if unit else f"{part.strip()} {figure_unit}".strip()
+        bounds.append(Bound(name, sign, limit, _COMPARE[sign](values, limit), text))
     return bounds
 
 
@@ -252,6 +258,10 @@ class Campaign(FrozenArrays):
         """All comparisons of a figure with a number in the goals."""
         return [bound for goal in self.goals for bound in bounds_of(goal, self.figure)]
 
+    def _with_units(self, goal: str) -> str:
+        """Return a goal with the unit of each number, for reports."""
+        return " and ".join(bound.text for bound in bounds_of(goal, self.figure))
+
     def values(self, name: str) -> Array:
         """Return the named figure of every run (N,), in SI units; attitude errors are in deg."""
         return self.figure(name)[0]
@@ -280,7 +290,7 @@ class Campaign(FrozenArrays):
             ]
         states = (self.state_names, self.state_units)
         inputs = (self.input_names, self.input_units)
-        kinds = tuple(KINDS), tuple(KINDS.values())
+        kinds = tuple(KINDS), self._units_of_kinds()
         groups: list[tuple[tuple[str, ...], tuple[str, ...], Array]] = {
             "final": [(*kinds, self.errors), (*states, self.x), (*inputs, self.u)],
             "worst": [
@@ -302,6 +312,21 @@ class Campaign(FrozenArrays):
         raise unknown(
             "figure", rest, [*known, *(name for name, at in indices.items() if at)]
         )
+
+    def _units_of_kinds(self) -> tuple[str, ...]:
+        """Return the units of the kinds of error; those of joints are the units of this robot."""
+        others = {*self.wheels, *self.modes}
+        joints: dict[str, list[str]] = {"q_m": [], "qdot_m": []}
+        for state, unit in zip(self.state_names, self.state_units, strict=True):
+            group, _, name = state.partition(".")
+            if group in joints and name not in others and unit not in joints[group]:
+                joints[group].append(unit)
+        units = {
+            **KINDS,
+            "joints": "|".join(joints["q_m"]) or KINDS["joints"],
+            "joint rates": "|".join(joints["qdot_m"]) or KINDS["joint rates"],
+        }
+        return tuple(units.values())
 
     def _indices(self, group: str, joints: tuple[str, ...]) -> list[int]:
         """Return the indices of the states of some joints, for "q_m" or "qdot_m"."""

@@ -11,7 +11,7 @@ from fflin.base.names import group_of, input_keys
 from fflin.base.validation import Array, instance, whole
 from fflin.campaign.campaign import Campaign
 from fflin.campaign.funnel import Funnel
-from fflin.campaign.report import ended_of, goal_met
+from fflin.campaign.report import ended_of, goal_met, shown_unit
 from fflin.campaign.runs import KINDS
 from fflin.campaign.validity import Validity, shown
 from fflin.simulation.report import DEGREES, TRUSTED
@@ -278,7 +278,8 @@ def _bands(
 
 
 def _error(axes: Axes, campaign: Campaign, kind: str, runs: list[int]) -> None:
-    history = campaign.error_history[..., list(KINDS).index(kind)]
+    unit, factor = shown_unit(campaign, kind)
+    history = factor * campaign.error_history[..., list(KINDS).index(kind)]
     _bands(axes, campaign, history, runs)
     ends = np.quantile(history, 0.05, axis=0, method="inverted_cdf")
     most = axes.get_ylim()[1]
@@ -288,14 +289,16 @@ def _error(axes: Axes, campaign: Campaign, kind: str, runs: list[int]) -> None:
             yscale="log", ylim=(max(0.5 * least, most * 10.0**-_DECADES), 1.5 * most)
         )
     _goals(axes.axhline, campaign, kind)
-    axes.set(title=f"{kind} error", ylabel=f"[{KINDS[kind]}]")
+    axes.set(title=f"{kind} error", ylabel=f"[{unit}]")
 
 
 def _goals(draw: Any, campaign: Campaign, *names: str) -> None:
     """Draw the bounds that the goals set for the named quantities."""
     for bound in campaign.bounds:
         if bound.name in names:
-            draw(bound.limit, ls="--", lw=1.0, color=_GOAL, label="goal or limit")
+            _, factor = shown_unit(campaign, bound.name)
+            limit = factor * bound.limit
+            draw(limit, ls="--", lw=1.0, color=_GOAL, label="goal or limit")
 
 
 def _histogram(axes: Axes, campaign: Campaign, kind: str) -> None:
@@ -304,7 +307,10 @@ def _histogram(axes: Axes, campaign: Campaign, kind: str) -> None:
     The histograms include only the completed runs. The percentiles include all runs.
     """
     names = {kind: ("final", _INK), f"worst {kind}": ("worst of run", COLORS[1])}
-    values_of = {name: campaign.values(name)[~campaign.stopped] for name in names}
+    unit, factor = shown_unit(campaign, kind)
+    values_of = {
+        name: factor * campaign.values(name)[~campaign.stopped] for name in names
+    }
     values = np.append(list(values_of.values()), 0.0)
     most = float(values.max()) or 1.0
     least = max(float(values[values > 0.0].min(initial=most)), most * 10.0**-_DECADES)
@@ -322,11 +328,11 @@ def _histogram(axes: Axes, campaign: Campaign, kind: str) -> None:
             label=label,
         )
         for p, mark, style in _PERCENTILES:
-            at = campaign.quantile(name, p).value
+            at = factor * campaign.quantile(name, p).value
             if math.isfinite(at):
                 axes.axvline(at, color=color, lw=1.2, ls=style, label=mark)
     _goals(axes.axvline, campaign, *names)
-    axes.set(xlabel=f"{kind} error [{KINDS[kind]}]", ylabel="runs", xlim=edges[[0, -1]])
+    axes.set(xlabel=f"{kind} error [{unit}]", ylabel="runs", xlim=edges[[0, -1]])
 
 
 def _inputs(

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 from fflin.base import html
 from fflin.base.tables import folded, grid
-from fflin.campaign.runs import KINDS, MODES, WHEEL_SPEEDS
+from fflin.campaign.runs import KINDS, MODES
+from fflin.simulation.report import DEGREES, WHEEL_SPEEDS
 from fflin.simulation.run import STOPS
 
 if TYPE_CHECKING:
@@ -59,13 +60,14 @@ def _quantiles(campaign: Campaign) -> list[list[str]]:
     """Return the table of the quantiles of all errors."""
     quantile = campaign.quantile
     rows = [["error", "unit", "median", "95 %", "99 %", "worst 95 %", "settle 95 %"]]
-    for name, unit in _errors(campaign).items():
+    for name in _errors(campaign):
+        unit, factor = shown_unit(campaign, name)
         figures = [quantile(name, p).value for p in _SHARES]
         figures.append(quantile(f"worst {name}", 0.95).value)
         when = "."
         if name in KINDS:
             when = _when(quantile(f"settle {name}", 0.95).value, " s")
-        rows.append([name, unit, *(f"{x:.3g}" for x in figures), when])
+        rows.append([name, unit, *(f"{factor * x:.3g}" for x in figures), when])
     return rows
 
 
@@ -83,22 +85,30 @@ def _correlations(campaign: Campaign) -> list[str]:
     ]
 
 
-def _errors(campaign: Campaign) -> dict[str, str]:
-    """Return {name of an error: unit} for the rows of the table.
+def _errors(campaign: Campaign) -> list[str]:
+    """Return the names of the errors in the table.
 
     Errors that are zero in all runs, for example of joints that a robot does not have, are left
     out.
     """
-    names = dict(KINDS)
+    names = [*KINDS]
     if campaign.wheels:
-        names[WHEEL_SPEEDS] = campaign.figure(WHEEL_SPEEDS)[1]
+        names.append(WHEEL_SPEEDS)
     if campaign.modes:
-        names[MODES] = campaign.figure(MODES)[1]
-    return {
-        name: unit
-        for name, unit in names.items()
-        if campaign.values(f"worst {name}").any()
-    }
+        names.append(MODES)
+    return [name for name in names if campaign.values(f"worst {name}").any()]
+
+
+def shown_unit(campaign: Campaign, name: str) -> tuple[str, float]:
+    """Return the unit in which reports and figures show a figure, and the factor to this unit.
+
+    Angles are in deg and rates in deg/s. The speeds of wheels are in rad/s.
+    """
+    unit = campaign.figure(name)[1]
+    kind = name.removeprefix("worst ")
+    if kind == WHEEL_SPEEDS or kind.partition(".")[2] in campaign.wheels:
+        return unit, 1.0
+    return DEGREES.get(unit, (unit, 1.0))
 
 
 def ended_of(campaign: Campaign) -> str:
@@ -111,7 +121,8 @@ def goal_met(campaign: Campaign, goal: str) -> str:
     """Format the success rate of a goal and the confidence interval of this rate."""
     met = campaign.fraction(goal, confidence=campaign.confidence)
     value, low, high = (f"{100.0 * x:.4g}" for x in met)
-    return f"{goal}: {value} % ({low} to {high} % at {100.0 * campaign.confidence:g} % confidence)"
+    sure = f"{100.0 * campaign.confidence:g} % confidence"
+    return f"{campaign._with_units(goal)}: {value} % ({low} to {high} % at {sure})"
 
 
 def influences(campaign: Campaign) -> dict[str, dict[str, float]]:
@@ -133,7 +144,8 @@ def worst_runs(campaign: Campaign, k: int) -> list[str]:
     """Return a table of the k worst runs, with the most influential drawn value of each run."""
     if not k:
         return []
-    about, (values, unit) = campaign.about, campaign.figure(campaign.about)
+    about, values = campaign.about, campaign.values(campaign.about)
+    unit, factor = shown_unit(campaign, about)
     rows = [["run", about, "unit", "settling [s]", "end [s]", "most influential draw"]]
     ranks = campaign.drawn.argsort(axis=0).argsort(axis=0)
     weights = {key.strip("|"): abs(x) for key, x in campaign.sensitivity().items()}
@@ -152,7 +164,8 @@ def worst_runs(campaign: Campaign, k: int) -> list[str]:
         drawn = "-"
         if out[run, far]:
             drawn = f"{campaign.names[far]} = {campaign.drawn[run, far]:.3g}"
-        rows.append([str(run), f"{values[run]:.3g}", unit, settled, ended, drawn])
+        size = f"{factor * values[run]:.3g}"
+        rows.append([str(run), size, unit, settled, ended, drawn])
     return ["", grid(rows, "rrlrll"), ""]
 
 
@@ -191,7 +204,7 @@ def campaign_record(campaign: Campaign, worst: int) -> dict[str, object]:
         **{key: getattr(campaign, key) for key in header},
         "runs": len(campaign),
         "stopped": _stops(campaign),
-        "units": KINDS,
+        "units": {kind: campaign.figure(kind)[1] for kind in KINDS},
         "quantiles": {
             name: {f"{p:g}": plain(campaign.quantile(name, p, **sure)) for p in _SHARES}
             for name in names

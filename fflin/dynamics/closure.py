@@ -12,7 +12,7 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import ConstraintError, FflinWarning, InputError, listed
-from fflin.base.validation import Array, ArrayLike, instance
+from fflin.base.validation import Array, ArrayLike, Indices, instance
 from fflin.dynamics.constraints import Constraints
 from fflin.dynamics.state import StateMap
 from fflin.robot.fields import travel_of
@@ -24,7 +24,7 @@ _SILENT, _NEAR = 1e-9, 1e-6
 
 # Newton's method: residual [m, rad] at which q counts as closed from the start, step at which the
 # iteration ends, and largest residual at its end per metre of distance from the world's origin.
-_CLOSED, _ARRIVED, _LEFT = 1e-13, 1e-11, 1e-11
+CLOSED, _ARRIVED, _LEFT = 1e-13, 1e-11, 1e-11
 
 # Relative singular values of J, with rows and columns in comparable units. Values above _REGULAR
 # count for the rank, and values below _ZERO are rounding errors. A value between them means that
@@ -36,6 +36,8 @@ _LEAST = 1e-3
 # A rank is constant nearby if no motion on the manifold accelerates redundant rows by more than
 # this fraction of the motion's own accelerations.
 _CONSTANT = 1e-7
+
+_NONE: Indices = np.zeros(0, dtype=np.intp)
 
 # Newton's method: largest number of steps, and largest step [rad] of a rotation.
 _STEPS, _LONGEST = 100, 0.5
@@ -132,16 +134,20 @@ class Closure:
         pair = next(x for x in pairs if x.rows.start <= index < x.rows.stop)
         return pair.constraint.title
 
-    def nearest(self, q: Array) -> Array:
-        """Return the closed configuration nearest to q (nq,), within the joint limits."""
+    def nearest(self, q: Array, kept: Indices = _NONE) -> Array:
+        """Return the closed configuration nearest to q (nq,), within the joint limits.
+
+        The coordinates with the indices `kept` do not change.
+        """
         low, high = self._travel(q)
         start, at = q, q
         fixed = np.zeros(6 + self.state.robot.n, dtype=bool)
+        fixed[kept] = True
         size = np.sqrt(self._inertia(q).diagonal())
-        row_scale = self._row_scale(q)
+        row_scale, _ = self.scales(q)
         for _ in range(_STEPS):
             residual = self.constraints.residual(at)
-            if np.abs(residual).max() <= _CLOSED:
+            if np.abs(residual).max() <= CLOSED:
                 return at
             columns = np.where(fixed, 0.0, 1.0 / size)
             J = self.state.columns(self.constraints.jacobian(at))
@@ -188,22 +194,22 @@ class Closure:
     def _inertia(self, q: Array) -> Array:
         return self.state.project(pin.crba(self._model, self._data, q).T)
 
-    def _row_scale(self, q: Array) -> Array:
-        """Return the scale (rows,) of the rows: 1 for lengths, radius of gyration for angles."""
-        M = self._inertia(q)
-        mass = float(np.mean(M.diagonal()[3:6]))
-        radius = float(np.sqrt(np.mean(M.diagonal()[:3]) / mass))
-        pairs = self.constraints.pairs
-        is_angular = [pair.selected[:, 3:].any(axis=1) for pair in pairs]
-        return np.where(np.concatenate(is_angular), radius, 1.0)
+    def scales(self, q: Array) -> tuple[Array, Array]:
+        """Return the scales of the rows (rows,) and columns (6 + n,) of J to comparable units.
+
+        The scale of a row is 1 for lengths, and the radius of gyration for angles. In the scaled
+        columns, all coordinates have the inertia of the whole robot.
+        """
+        inertia = self._inertia(q).diagonal()
+        mass = float(inertia[3:6].mean())
+        radius = float(np.sqrt(inertia[:3].mean() / mass))
+        rows = np.where(self.constraints.angular, radius, 1.0)
+        return rows, np.sqrt(mass / inertia)
 
     def tangent(self, q: Array) -> TangentSpace:
         """Return the tangent space at a closed q (nq,); raise an error for a singular posture."""
         J = self.state.columns(self.constraints.jacobian(q))
-        M = self._inertia(q)
-        mass = float(np.mean(M.diagonal()[3:6]))
-        columns = np.sqrt(mass / M.diagonal())
-        row_scale = self._row_scale(q)
+        row_scale, columns = self.scales(q)
         U, sizes, Vt = np.linalg.svd(row_scale[:, None] * J * columns)
         relative = sizes / max(sizes[0], _LEAST)
         rank = int(np.count_nonzero(relative > _REGULAR))

@@ -24,8 +24,8 @@ import pinocchio as pin
 
 from fflin.base.errors import InputError
 from fflin.base.rotation import skew
-from fflin.base.validation import Array
-from fflin.robot.constraints import Constraint, Hinge
+from fflin.base.validation import Array, Mask
+from fflin.robot.constraints import Constraint, Hinge, Spherical
 from fflin.robot.joints import ROOT, Carried, find_frame
 from fflin.robot.robot_data import RobotData
 
@@ -82,6 +82,8 @@ class Constraints:
         self._model = robot.model
         self._data = robot.model.createData()
         self._pairs: tuple[Pair, ...] = ()
+        self._signs: list[Array | None] = []
+        self._angular: Mask = np.zeros(0, dtype=bool)
 
     def settle(self, q: Array) -> None:
         """Store, in constraints without a placement, the pose of their frames at q (nq,)."""
@@ -100,7 +102,16 @@ class Constraints:
         """The frames of all constraints; raise `InputError` if a placement is not yet stored."""
         if not self._pairs:
             self._pairs = tuple(self._made())
+            self._signs = [self._sign(pair) for pair in self._pairs]
+            of_pairs = [pair.selected[:, 3:].any(axis=1) for pair in self._pairs]
+            self._angular = np.concatenate(of_pairs)
         return self._pairs
+
+    @property
+    def angular(self) -> Mask:
+        """Whether each row (rows,) is angular."""
+        _ = self.pairs
+        return self._angular
 
     def residual(self, q: Array) -> Array:
         """Return phi (rows,) at q (nq,): the distances [m] and angles [rad] left to close.
@@ -110,27 +121,57 @@ class Constraints:
         pin.forwardKinematics(self._model, self._data, q)
         residual = np.zeros(self.count)
         for pair in self.pairs:
-            apart = self._apart(pair)
-            rotation = pin.log3(apart.rotation)
-            if isinstance(pair.constraint, Hinge):
-                rotation = _tilt(np.array(pair.constraint.axis), apart.rotation)
-            twist = np.concatenate((apart.translation, rotation))
-            residual[pair.rows] = pair.selected @ twist
+            residual[pair.rows] = _distances(pair, self._apart(pair))
         return residual
 
     def jacobian(self, q: Array) -> Array:
         """Return J (rows, nv) at q (nq,)."""
-        pin.computeJointJacobians(self._model, self._data, q)
-        pin.updateGlobalPlacements(self._model, self._data)
-        jacobian = np.zeros((self.count, self._model.nv))
-        for pair in self.pairs:
-            X = self._apart(pair).action
-            second = _of_frame(pair.second, self._joint_jacobian(pair.second))
-            first = _of_frame(pair.first, self._joint_jacobian(pair.first))
-            jacobian[pair.rows] = pair.selected @ (X @ second - first)
-            if pair.is_loop:
-                jacobian[pair.rows, _BASE] = 0.0
-        return jacobian
+        return self.residual_and_jacobian(q)[1]
+
+    def residual_and_jacobian(self, q: Array) -> tuple[Array, Array]:
+        """Return phi (rows,), see `residual`, and J (rows, nv) at q (nq,)."""
+        pairs = self.pairs
+        columns = pin.computeJointJacobians(self._model, self._data, q)
+        residual = np.empty(self.count)
+        jacobian = np.empty((self.count, self._model.nv))
+        for pair, signs in zip(pairs, self._signs, strict=True):
+            first = self._pose(pair.first)
+            apart = first.actInv(self._pose(pair.second))
+            residual[pair.rows] = _distances(pair, apart)
+            if signs is None:
+                jacobian[pair.rows] = self._mimic_rows(pair, apart)
+                continue
+            # Column k of `columns` is the twist in world axes of all bodies that joint k moves.
+            selected = pair.selected.dot(first.actionInverse)
+            np.multiply(selected.dot(columns), signs, out=jacobian[pair.rows])
+        return residual, jacobian
+
+    def _mimic_rows(self, pair: Pair, apart: pin.SE3) -> Array:
+        """Return the rows of J (k, nv) of a constraint on a robot with mimic joints."""
+        second = _of_frame(pair.second, self._joint_jacobian(pair.second))
+        first = _of_frame(pair.first, self._joint_jacobian(pair.first))
+        rows: Array = pair.selected @ (apart.action @ second - first)
+        if pair.is_loop:
+            rows[:, _BASE] = 0.0
+        return rows
+
+    def _sign(self, pair: Pair) -> Array | None:
+        """Return the sign (nv,) of each velocity in the motion of frame 2 relative to frame 1.
+
+        It is zero if a velocity moves both frames or none. Return None for mimic joints.
+        """
+        if self._robot.followers:
+            return None
+        return self._moves(pair.second) - self._moves(pair.first)
+
+    def _moves(self, frame: Carried) -> Array:
+        """Return for each velocity (nv,) whether it moves a frame: 1 or 0."""
+        moves = np.zeros(self._model.nv)
+        if frame.joint >= ROOT:
+            for joint in self._model.supports[frame.joint]:
+                start = self._model.idx_vs[joint]
+                moves[start : start + self._model.nvs[joint]] = 1.0
+        return moves
 
     def bias(self, q: Array, v: Array) -> Array:
         """Return gamma (rows,) at q (nq,) and v (nv,), so that J dv/dt + gamma = 0."""
@@ -257,6 +298,20 @@ class Constraints:
             self._model, self._data, frame.joint, _LOCAL
         )
         return jacobian
+
+
+def _distances(pair: Pair, apart: pin.SE3) -> Array:
+    """Return the rows (k,) of phi from the pose of frame 2 in frame 1."""
+    if isinstance(pair.constraint, Spherical):
+        distances: Array = apart.translation
+        return distances
+    rotation = apart.rotation
+    if isinstance(pair.constraint, Hinge):
+        turned = _tilt(np.array(pair.constraint.axis), rotation)
+    else:
+        turned = pin.log3(rotation)
+    distances = pair.selected.dot(np.concatenate((apart.translation, turned)))
+    return distances
 
 
 def _of_frame(frame: Carried, columns: Array) -> Array:

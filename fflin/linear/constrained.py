@@ -18,7 +18,7 @@ import pinocchio as pin
 from fflin.base.errors import ConstraintError, InputError, listed
 from fflin.base.names import matching
 from fflin.base.rotation import skew
-from fflin.base.validation import Array, frozen
+from fflin.base.validation import Array, Indices, frozen
 from fflin.dynamics.closure import Closure, TangentSpace
 from fflin.dynamics.coordinates import ANGULAR, LINEAR, Chart
 from fflin.dynamics.state import StateMap
@@ -48,7 +48,7 @@ class Reduction:
         Inertia of the independent coordinates.
     """
 
-    kept: Array
+    kept: Indices
     T: Array
     M: Array
 
@@ -68,7 +68,7 @@ class Reducer:
             self.given = checked_independent(independent)
         self._state = closure.state
         self._moving = moving
-        self._picked: Array | None = None
+        self._picked: Indices | None = None
         self._data = closure.state.robot.create_data()
 
     @property
@@ -77,6 +77,14 @@ class Reducer:
         if self._picked is None:
             return self.given
         return tuple(self._state.names[index] for index in self._picked)
+
+    @property
+    def names(self) -> dict[str, tuple[str, ...]]:
+        """Names and units of the independent states, and names of the others, once chosen."""
+        state, picked = self._state, self._picked
+        assert picked is not None
+        kept = [*picked, *(picked + state.nx // 2)]
+        return _state_names(state, kept)
 
     def reduction(
         self, chart: Chart, q: Array, v: Array, nu: Array, space: TangentSpace
@@ -129,7 +137,7 @@ class Reducer:
         solved: Array = np.linalg.pinv(space.rows) @ space.selected @ by_q
         return solved
 
-    def _independent(self, size: Array, positions: Array, rates: Array) -> Array:
+    def _independent(self, size: Array, positions: Array, rates: Array) -> Indices:
         """Return the indices (d,) of the independent coordinates.
 
         `positions` and `rates` (6 + n, d) are the motions of unit kinetic energy, and `size` is
@@ -163,7 +171,7 @@ class Reducer:
             )
         return picked
 
-    def _named(self, count: int) -> Array:
+    def _named(self, count: int) -> Indices:
         """Return the indices of the coordinates that the user named."""
         state = self._state
         names = state.names[: state.nx // 2]
@@ -183,8 +191,6 @@ def reduced_fields(
 ) -> dict[str, Any]:
     """Return the fields of a model in the independent states from the model in all states."""
     kept, T = reduction.kept, reduction.T
-    names = [state.names[i] for i in kept]
-    chosen = set(names)
     arrays = {
         "A": whole.A[kept] @ T,
         "B": whole.B[kept],
@@ -199,6 +205,17 @@ def reduced_fields(
         arrays["drift"] = whole.drift[kept]
     return {
         **{key: frozen(array) for key, array in arrays.items()},
+        **_state_names(state, kept),
+    }
+
+
+def _state_names(
+    state: StateMap, kept: Sequence[int] | Indices
+) -> dict[str, tuple[str, ...]]:
+    """Return the names of states that are in the model and of states that are not."""
+    names = [state.names[i] for i in kept]
+    chosen = set(names)
+    return {
         "state_names": tuple(names),
         "state_units": tuple(state.units[i] for i in kept),
         "dependent": tuple(name for name in state.names if name not in chosen),

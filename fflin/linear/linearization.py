@@ -21,6 +21,7 @@ from fflin.dynamics.state import Actuation, StateMap
 from fflin.linear.aba_route import inertia_matrix
 from fflin.linear.check import certify
 from fflin.linear.constrained import Reducer, reduced_fields
+from fflin.linear.constrained_rest import RestSolver
 from fflin.linear.files import given
 from fflin.linear.model import LinearModel
 from fflin.linear.state_equations import assemble, drift, output_equations
@@ -51,6 +52,8 @@ class Prepared:
     moving : bool
     own_reference : bool
         Whether the reference is the base placement at each point.
+    unforced : bool
+        Whether no forces act on the robot at rest, and the outputs are the state.
     free : bool
         Whether `common` and `rest` contain all matrices except B, if the robot is at rest and the
         base is at the reference.
@@ -94,13 +97,9 @@ class Prepared:
             or robot.stored_momentum
             or np.any(robot.springs)
         )
+        self.unforced = self.sensing is None and not moving and not has_other_forces
         # In this case, all matrices of a model at rest except B are known in advance.
-        self.free = (
-            self.sensing is None
-            and not moving
-            and not has_other_forces
-            and not robot.constraints
-        )
+        self.free = self.unforced and not robot.constraints
         nx = state.nx
         nv = state.nx // 2
         nu = len(self.actuation.names)
@@ -284,9 +283,14 @@ class Linearizer:
         self.robot = robot
         self._closure: Closure | None = None
         self._reducer: Reducer | None = None
+        self._rest: RestSolver | None = None
         if robot.constraints:
             self._closure = Closure(ready.map)
             self._reducer = Reducer(self._closure, independent, moving=moving)
+            if ready.unforced and ready.own_reference and not ready.actuation.torquers:
+                self._rest = RestSolver(
+                    self._closure, ready.actuation, robot.create_data()
+                )
         elif independent is not None:
             raise InputError(
                 f"independent is given, but '{robot.name}' has no constraints, so that all "
@@ -329,7 +333,7 @@ class Linearizer:
         if t.__class__ is not float or t != 0.0:
             t = number("t", t)
         q = robot.neutral() if q is None else robot.checked_configuration(q).copy()
-        known = v is None and u is None and self._known
+        at_rest = v is None and u is None
         still_v, still_u = self._still
         v = still_v if v is None else robot.checked_velocity(v).copy()
         u = (
@@ -338,19 +342,42 @@ class Linearizer:
             else vector("u", u, len(still_u), "the robot's inputs").copy()
         )
         with self._lock:
-            if known:
+            if at_rest and self._known:
                 B = np.zeros(self._shape_B)
                 self._accelerations.inertia.invert(q, B[self._lower], quick=True)
                 B.setflags(write=False)
                 q.setflags(write=False)
                 return LinearModel(self._fields, B=B, q=q)
             _require_no_moment(self.prepared.actuation, u)
+            if at_rest and self._rest is not None:
+                resting = self._rest.model(q)
+                if resting is not None:
+                    return resting
             if self._closure is not None:
                 q = self._closure.configuration(q)
                 v = self._closure.velocity(q, v)
             # Suppress NumPy's overflow warnings, because `_require_finite` reports an overflow.
             with np.errstate(over="ignore", invalid="ignore"):
                 return self._anywhere(q, v, u, t)
+
+    @property
+    def constrained(self) -> bool:
+        """Whether the robot has constraints."""
+        return self._closure is not None
+
+    @property
+    def independent(self) -> tuple[str, ...]:
+        """Independent coordinates of a robot with constraints, once they are chosen."""
+        if self._reducer is None:
+            return ()
+        return self._reducer.independent or ()
+
+    @property
+    def constrained_names(self) -> dict[str, tuple[str, ...]]:
+        """Names and units of the states of a robot with constraints; empty without constraints."""
+        if self._reducer is None:
+            return {}
+        return self._reducer.names
 
     def write_by_u(self, q: Array, out: Array) -> None:
         """Write the lower half of B (6 + n, nu) about a valid q at rest; see `Prepared.free`."""
@@ -427,6 +454,8 @@ class Linearizer:
             whole = LinearModel(self._fields | made)
             reduction = self._reducer.reduction(chart, q, v, nu, contact.space)
             fields = reduced_fields(state, reduction, whole)
+            if self._rest is not None and self._rest.waits:
+                self._rest.choose(reduction.kept, q, self._fields | self._reducer.names)
             return LinearModel(
                 {**self._fields, "_computed": {}, **made, **fields}
                 | {"_inertia": partial(given, frozen(reduction.M))},

@@ -67,6 +67,7 @@ _TITLES = {
     "qdot_m": "joint rates",
 }
 _PLACES = ("attitude", "position", "joints")
+WHEEL_SPEEDS = "wheel speeds"
 # {group: titles} of the errors of flexible appendages and liquids. These errors do not decide
 # whether a motion has settled.
 _OF_MODES = {"q_m": ("modes", "slosh"), "qdot_m": ("mode rates", "slosh rates")}
@@ -76,7 +77,7 @@ _MODAL = "kg^0.5 m"  # unit of the amplitudes of flexible appendages
 # Rotation [deg] above which modal amplitudes are inaccurate, because the modal model is linear.
 _LINEAR = 5.0
 
-# Units of angles in figures and on pages: {unit of a curve: shown unit and its factor}.
+# Units of angles in reports, in figures and on pages: {unit: shown unit and its factor}.
 DEGREES = {
     "rad": ("deg", float(np.degrees(1.0))),
     "rad/s": ("deg/s", float(np.degrees(1.0))),
@@ -370,9 +371,17 @@ class ErrorSize(NamedTuple):
     tail: str = ""
 
     @property
+    def scale(self) -> tuple[str, float]:
+        """Unit in the report, and its factor: angles are in deg, wheel speeds in rad/s."""
+        if self.title == WHEEL_SPEEDS:
+            return self.unit, 1.0
+        return DEGREES.get(self.unit, (self.unit, 1.0))
+
+    @property
     def last(self) -> str:
         """Title, final value and unit of this error as text."""
-        return f"{self.title}\u00a0{self.final:.2g}\u00a0{self.unit}"
+        unit, factor = self.scale
+        return f"{self.title}\u00a0{factor * self.final:.2g}\u00a0{unit}"
 
     @property
     def row(self) -> list[str]:
@@ -380,16 +389,16 @@ class ErrorSize(NamedTuple):
         when = "not yet" if self.steered else "not controlled"
         if self.settled is not None:
             when = f"{self.settled:.3g}" if self.largest > THERE else "."
-        return [
-            self.title,
-            self.unit,
-            *_cells(self.initial, self.largest, self.final),
-            when,
-        ]
+        return [*self.cells(self.initial, self.largest, self.final), when]
+
+    def cells(self, *sizes: float) -> list[str]:
+        """Return the first cells of a table for this error: title, unit and sizes."""
+        unit, factor = self.scale
+        return [self.title, unit, *_cells(*sizes, factor=factor)]
 
 
-def _cells(*values: float) -> list[str]:
-    return ["." if value < _NOTHING else f"{value:.3g}" for value in values]
+def _cells(*values: float, factor: float = 1.0) -> list[str]:
+    return ["." if value < _NOTHING else f"{factor * value:.3g}" for value in values]
 
 
 def error_sizes(motion: Motion) -> list[ErrorSize]:
@@ -413,7 +422,7 @@ def error_sizes(motion: Motion) -> list[ErrorSize]:
         if group == "q_m" and entry in motion.wheels:
             continue
         if group == "qdot_m" and entry in motion.wheels:
-            title = "wheel speeds"
+            title = WHEEL_SPEEDS
         if group in _OF_MODES and entry in motion.modes:
             title = _OF_MODES[group][not unit.startswith(_MODAL)]
         shown_unit = "deg" if group == "q_b" else unit
@@ -502,7 +511,7 @@ def motion_report(motion: Motion) -> str:
         rows = [["change from the start", "unit", "largest", "final"]]
         for kind in error_sizes(replace(motion, target=motion.x[0])):
             if kind.title in (*_PLACES, *_OF_MODES["q_m"]):
-                rows.append([kind.title, kind.unit, *_cells(kind.largest, kind.final)])
+                rows.append(kind.cells(kind.largest, kind.final))
     parts.append(f"\n{grid(rows, 'll')}\n")
     if motion.modes:
         parts.append(_largest_modes(motion))
@@ -532,16 +541,24 @@ def motion_report(motion: Motion) -> str:
         parts.append(
             f"largest deviation of the centre of mass from its predicted path: {far}"
         )
-    if motion.linear is not None:
-        apart = np.abs(motion.x - motion.linear).max(axis=0)
-        # Wheel angles are excluded: they grow without bound, and nothing depends on them.
-        apart[[motion.state_names.index(f"q_m.{name}") for name in motion.wheels]] = 0.0
-        most = int(apart.argmax())
-        size = f"{apart[most]:.3g} {motion.state_units[most]}".removesuffix(" 1")
-        parts.append(
-            f"largest difference from the linear model: {size} in {motion.state_names[most]}"
-        )
+    parts += _largest_difference(motion)
     return "\n".join(parts)
+
+
+def _largest_difference(motion: Motion) -> list[str]:
+    """Return a line with the largest difference from the linear prediction, if there is one."""
+    if motion.linear is None:
+        return []
+    apart = np.abs(motion.x - motion.linear).max(axis=0)
+    # Wheel angles are excluded: they grow without bound, and nothing depends on them.
+    apart[[motion.state_names.index(f"q_m.{name}") for name in motion.wheels]] = 0.0
+    most = int(apart.argmax())
+    name, unit = motion.state_names[most], motion.state_units[most]
+    factor = 1.0
+    if name.partition(".")[2] not in motion.wheels:
+        unit, factor = DEGREES.get(unit, (unit, 1.0))
+    size = f"{factor * apart[most]:.3g} {unit}".removesuffix(" 1")
+    return [f"largest difference from the linear model: {size} in {name}"]
 
 
 def _largest_forces(motion: Motion) -> list[str]:
@@ -671,8 +688,9 @@ def verdict(motion: Motion, kinds: list[ErrorSize]) -> str:
     elif moved:
         when = max(kind.settled or 0.0 for kind in moved)
         band = [
-            f"{SETTLED * kind.largest:.2g}\u00a0{kind.unit} ({kind.title})"
+            f"{SETTLED * factor * kind.largest:.2g}\u00a0{unit} ({kind.title})"
             for kind in moved
+            for unit, factor in [kind.scale]
         ]
         text = f"settled after {when:.3g}\u00a0s to within {_and(band)} of the target"
         if late := [

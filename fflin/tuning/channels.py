@@ -116,10 +116,18 @@ def _sized(given: Sized) -> dict[str, float]:
     )
 
 
+def _expanded(sizes: dict[str, float], signals: Signals) -> dict[str, float]:
+    """Replace groups of inputs such as wheel by the names of the inputs."""
+    members = {
+        name: size for key, size in sizes.items() for name in signals.expanded(key)
+    }
+    return members | {key: size for key, size in sizes.items() if key in members}
+
+
 def _sources(given: Sized, signals: Signals) -> dict[tuple[str, int], float]:
     """Return {(kind, index): size} of the inputs of a goal."""
     names = (*signals.inputs, *signals.outputs)
-    chosen = by_name("signal", _sized(given), names)
+    chosen = by_name("signal", _expanded(_sized(given), signals), names)
     nu = len(signals.inputs)
     ends = {}
     for index, size in sorted(chosen.items()):
@@ -144,6 +152,7 @@ def _sinks(
     extra = [name for name in states if name not in signals.outputs]
     names = (*signals.inputs, *signals.outputs, *extra)
     ends = {}
+    others = _expanded(others, signals)
     for index, size in sorted(by_name("signal", others, names).items()):
         if index < nu:
             ends["command", index] = size

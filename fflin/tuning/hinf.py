@@ -22,7 +22,7 @@ from fflin.tuning.goals import Goal, MaxGain
 from fflin.tuning.law import law_of
 from fflin.tuning.plant import Plant, plant_of, signals_of
 from fflin.tuning.reduction import truncations
-from fflin.tuning.structures import Names, indices
+from fflin.tuning.structures import Names, indices, input_indices
 from fflin.tuning.tuned import matrices_of
 from fflin.tuning.verification import largest_in_band
 
@@ -158,6 +158,14 @@ class HInfinity(LinearController):
             "order, or tune a fflin.StateSpaceLaw of this order"
         )
 
+    def __repr__(self) -> str:
+        time = f"dt={self.dt:g} s" if self.dt else "continuous"
+        (nu, ny) = self.system.D.shape
+        return (
+            f"HInfinity('{self.lin.robot}', gamma={self.gamma:.4g}, order={self.order}, ny={ny}, "
+            f"nu={nu}, {time})"
+        )
+
 
 @in_one_thread
 def hinf(
@@ -216,7 +224,7 @@ def hinf(
         raise InputError(f"goals are {goals!r}, expected one goal or more")
     signals = signals_of(lin)
     rows = indices("output", measured, signals.outputs)
-    columns = indices("input", inputs, signals.inputs)
+    columns = input_indices(inputs, signals)
     ends = []
     for goal in every:
         instance("goal", goal, MaxGain, "a fflin.MaxGain, the goal of hinf")

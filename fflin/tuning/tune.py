@@ -15,7 +15,9 @@ from fflin.base.validation import Array, ArrayLike, count, instance, whole
 from fflin.linear.model import Delay
 from fflin.tuning.channels import ends_of
 from fflin.tuning.criteria import Piece
+from fflin.tuning.curves import GoalLoops
 from fflin.tuning.goals import Goal
+from fflin.tuning.law import Law
 from fflin.tuning.plant import Plant, Signals, plant_of, signals_of
 from fflin.tuning.points import Point, Points, points_of
 from fflin.tuning.problem import Case, Measure, Problem
@@ -235,7 +237,8 @@ class _Task:
                     "no law of this structure was found that stabilises all models; give narrower "
                     "ranges, or another structure"
                 )
-            minimum = minimise(problem.evaluate, start, problem.bounds, steps=steps)
+            more = minimise(problem.evaluate, start, problem.bounds, steps=steps)
+            minimum = more.after(minimum)
         return problem, minimum
 
     def _watch_missed(self, problem: Problem, x: Array, known: list[float]) -> bool:
@@ -374,7 +377,27 @@ class _Task:
             starts=starts,
             seconds=seconds,
             history=np.exp(np.array(minimum.history).reshape(-1, 2)),
+            parameter_history=np.array(
+                [problem.values(x)[0] for x in minimum.path]
+            ).reshape(-1, len(parameters)),
+            loops=self.loops(problem, minimum.x, law),
         )
+
+    def loops(self, problem: Problem, x: Array, law: Law) -> tuple[GoalLoops, ...]:
+        """Return the loops of each goal in the models of the search."""
+        cases = [
+            (self.case(point), self.case(point).loops(law)) for point in self.chosen
+        ]
+        results = []
+        for index, measure in enumerate(self.measures):
+            loops = tuple(
+                (of_goals[index], case.channels[index])
+                for case, of_goals in cases
+                if of_goals is not None
+            )
+            scaling = problem.scaling(x, index)
+            results.append(GoalLoops(measure.goal, measure.ends, loops, scaling))
+        return tuple(results)
 
     def _contradiction(
         self, problem: Problem, minimum: Minimum

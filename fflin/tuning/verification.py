@@ -166,6 +166,14 @@ def _swept(
 
 def _step_ratio(goal: Track, system: System, dt: float) -> float:
     """Return the largest ratio of the error of a step response to its template."""
+    times, errors = step_errors(goal, system, dt)
+    low, high = goal.bounds(times)
+    ratios = np.where(errors > 0.0, errors / high, errors / low)
+    return float(ratios[1:].max())
+
+
+def step_errors(goal: Track, system: System, dt: float) -> tuple[Array, Array]:
+    """Return times [s] and the errors y - 1 of a unit step of the reference."""
     A, B, C, D = system
     n = len(A)
     rows: Array = C
@@ -187,6 +195,4 @@ def _step_ratio(goal: Track, system: System, dt: float) -> float:
     for k in range(count + 1):
         errors[k] = -float(rows[0] @ state + through[0, 0]) - 1.0
         state[:] = advance @ state + drive[:, 0]
-    low, high = goal.bounds(times)
-    ratios = np.where(errors > 0.0, errors / high, errors / low)
-    return float(ratios[1:].max())
+    return times, errors

@@ -1,9 +1,12 @@
 """The figure of a campaign shows its figures."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import fflin
+from fflin.campaign.report import worst_runs
 
 pytest.importorskip("matplotlib")
 pytestmark = pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
@@ -102,3 +105,54 @@ def test_without_histories_and_with_none_that_ended(robots, campaign, tmp_path):
     fflin.plot_campaign(fflin.Campaign.of(arrays, header), tmp_path / "lost.png")
     with pytest.raises(fflin.InputError, match="Campaign"):
         fflin.plot_campaign(3)
+
+
+@pytest.mark.compiled
+def test_errors_of_joints_are_in_degrees(robots):
+    robot = robots["planar_detumble"]
+    lin = fflin.linearize(robot)
+    runs = fflin.monte_carlo(
+        robot,
+        fflin.StateFeedback(lin, fflin.lqr(lin).K),
+        {"q_m": 0.1},
+        runs=8,
+        duration=2.0,
+        dt=0.02,
+        histories=11,
+        goals=["joints < 0.05 and worst joint rates < 20 deg/s and settle < 40"],
+        seed=1,
+    )
+    values, unit = runs.figure("joints")
+    assert unit == "rad"  # every joint is revolute
+    rows = {line.split("  ")[0]: line.split() for line in str(runs).splitlines()}
+    assert rows["joints"][1:3] == [
+        "deg",
+        f"{np.degrees(runs.quantile('joints', 0.5).value):.3g}",
+    ]
+    assert rows["joint rates"][2] == rows["omega_b"][1] == "deg/s"
+    # A number without a unit is in the unit of the figure, which the report adds.
+    goal = "joints < 0.05 rad and worst joint rates < 20 deg/s and settle < 40 s:"
+    assert goal in " ".join(str(runs).split())
+    assert worst_runs(runs, 1)[1].splitlines()[1].split()[1:3] == [
+        f"{np.degrees(values.max()):.3g}",
+        "deg",
+    ]
+    axes = of(fflin.plot_campaign(runs), "joints error")
+    history = np.degrees(runs.error_history[..., 2])
+    half, *_ = axes.get_lines()
+    assert axes.get_ylabel() == "[deg]"
+    assert np.array_equal(half.get_ydata(), np.sort(history, axis=0)[3])
+    [goal_line] = [x for x in axes.get_lines() if x.get_label() == "goal or limit"]
+    assert goal_line.get_ydata()[0] == np.degrees(0.05)
+
+
+def test_a_robot_with_prismatic_joints_has_errors_in_two_units(robots):
+    robot = robots["planar_detumble"]
+    runs = fflin.monte_carlo(robot, None, {"q_m": 0.1}, runs=2, duration=0.1)
+    units = [
+        "m" if "joint_2" in name else unit
+        for name, unit in zip(runs.state_names, runs.state_units, strict=True)
+    ]
+    mixed = replace(runs, state_units=tuple(units))
+    assert mixed.figure("joints")[1] == "rad|m"
+    assert mixed.met("joints < 10 rad").all() and mixed.met("joints < 10 m").all()

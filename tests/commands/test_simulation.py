@@ -33,7 +33,7 @@ def test_a_loop_settles_is_saved_and_drawn(tmp_path):
     assert (tmp_path / "loop.png").stat().st_size > 50_000
     apart = np.abs(motion.x - motion.linear).max(axis=0)
     most = motion.state_names[apart.argmax()]
-    assert says(out, f"{apart.max():.3g} rad in {most}")
+    assert says(out, f"{np.degrees(apart.max()):.3g} deg in {most}")
     assert out.splitlines()[-2:] == ["wrote loop.npz", "wrote loop.png"]
 
 
@@ -275,7 +275,8 @@ def test_joints_alone_cannot_hold_the_base_but_the_reduced_part():
     )
     assert code == 0
     joints = next(line for line in out.splitlines() if line.startswith("joints"))
-    assert float(joints.split()[4]) < 1e-3
+    assert joints.split()[1] == "deg"
+    assert float(joints.split()[4]) < np.degrees(1e-3)
 
 
 @pytest.mark.parametrize(

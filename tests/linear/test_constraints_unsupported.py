@@ -41,7 +41,6 @@ CALLS = {
     "plan": lambda robot, _: fflin.plan(robot, {}, duration=10.0),
     "relative_equilibria": lambda robot, _: fflin.relative_equilibria(robot),
     "sensitivity": lambda _, lin: fflin.sensitivity(lin),
-    "sweep": lambda robot, lin: fflin.sweep(robot, lin.q[None]),
     "to": lambda _, lin: lin.to("mujoco"),
     "gain.to": lambda _, lin: fflin.lqr(lin).to("drake"),
     "transform": lambda robot, lin: fflin.transform(robot, lin, "pinocchio"),

@@ -60,11 +60,11 @@ def test_the_margin_is_two_percent_of_the_largest_error_for_the_last_twentieth(
 
 def test_a_motion_that_does_not_settle_reports_its_error():
     motion = course(lambda t: np.exp(-t / 10.0))
-    assert says(first(motion), "not settled", "2.7 deg", "0.068 rad")
+    assert says(first(motion), "not settled", "2.7 deg", "joints 3.9 deg")
     motion = course(lambda t: np.exp(-t), joint=0.0)
     x = motion.x.copy()
     x[:, 7] = 1e-3 * motion.t
-    assert says(first(replace(motion, x=x)), "not settled", "0.02 rad")
+    assert says(first(replace(motion, x=x)), "not settled", "joints 1.1 deg")
 
 
 def test_the_headline_names_the_rates_that_the_table_calls_unsettled():
@@ -77,7 +77,7 @@ def test_the_headline_names_the_rates_that_the_table_calls_unsettled():
     )
     assert headline.startswith("positions settled after 7.83")
     assert (
-        says(headline, "not yet settled: omega_b 0.001 rad/s")
+        says(headline, "not yet settled: omega_b 0.057 deg/s")
         and "joint rates" not in headline
     )
     assert cells(replace(motion, x=x), "omega_b")[-2:] == ["not", "yet"]
@@ -99,7 +99,7 @@ def test_a_motion_that_leaves_its_target_only_by_rounding_has_settled(size):
 def test_values_below_the_rounding_error_are_shown_as_zero():
     motion = course(lambda t: np.exp(-25.0 * t))
     assert 0.0 < motion.x[-1, 6] < 1e-199
-    assert cells(motion, "joints") == ["rad", "0.5", "0.5", ".", "0.16"]
+    assert cells(motion, "joints") == ["deg", "28.6", "28.6", ".", "0.16"]
 
 
 def test_a_stopped_motion_reports_the_reason_first():
@@ -128,6 +128,7 @@ def test_a_motion_without_a_target_tells_how_far_it_went():
         np.abs(motion.x[:, part]).max(axis=1) for part in (slice(3, 6), slice(6, 12))
     )
     assert "change from the start" in motion_report(motion)
+    swung = np.degrees(swung)
     for title, size in (("attitude", turned), ("position", moved), ("joints", swung)):
         assert cells(motion, title)[1:] == [f"{size.max():.3g}", f"{size[-1]:.3g}"]
     orbit = fflin.load("ets_vii", orbit=fflin.CircularOrbit(altitude=700e3))
@@ -211,7 +212,7 @@ def test_lengths_and_angles_of_joints_have_separate_rows():
         for row in motion_report(slides).splitlines()
         if "joints " in row
     ]
-    assert ["joints", "rad"] in rows and ["joints", "m"] in rows
+    assert ["joints", "deg"] in rows and ["joints", "m"] in rows
 
 
 def test_states_that_no_policy_controls_are_distinguished():
