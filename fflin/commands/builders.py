@@ -290,7 +290,8 @@ def model_about(
         held = fflin.equilibrium(robot, q, v=v, tilt=tilt, **axes)
         q, u = held.q, held.u
         warn_beyond_limits(robot, u)
-    return fflin.linearize(robot, q, v, u, **axes)
+    time = getattr(arguments, "time", None) or 0.0
+    return fflin.linearize(robot, q, v, u, t=time, **axes)
 
 
 def may_tilt(robot: fflin.Robot, arguments: Namespace) -> bool:
@@ -307,6 +308,25 @@ def may_tilt(robot: fflin.Robot, arguments: Namespace) -> bool:
     return arguments.tilt is not False
 
 
+def held_model(
+    robot: fflin.Robot,
+    arguments: Namespace,
+    q: Array,
+    v: Array | None,
+    reference: pin.SE3 | None,
+) -> fflin.LinearModel:
+    """Linearise as `model_about` does, with the inputs that hold the robot at the point.
+
+    With --no-tilt, an error is raised if no inputs hold the robot at the given attitude.
+    """
+    from fflin.linear.holding import held, held_if_possible
+
+    point = model_about(robot, arguments, q, v, reference)
+    if not may_tilt(robot, arguments):
+        return held(point, tilt=False)
+    return held_if_possible(point)
+
+
 def model_to_regulate(
     robot: fflin.Robot,
     arguments: Namespace,
@@ -316,16 +336,9 @@ def model_to_regulate(
 ) -> fflin.LinearModel:
     """Linearise as `model_about` does, with the inputs that hold the robot at the point.
 
-    With --no-tilt, an error is raised if no inputs hold the robot at the given attitude. With
-    --reduce, the conserved momenta are removed from the model.
+    With --reduce, the conserved momenta are removed from the model.
     """
-    from fflin.linear.holding import held, held_if_possible
-
-    point = model_about(robot, arguments, q, v, reference)
-    hold = held_if_possible
-    if not may_tilt(robot, arguments):
-        hold = partial(held, tilt=False)
-    lin = hold(point)
+    lin = held_model(robot, arguments, q, v, reference)
     if arguments.reduce:
         return fflin.momentum_reduction(lin, wheel_speeds=arguments.wheel_speeds)
     return lin
@@ -342,9 +355,19 @@ def attitude(
 
 
 def models_along(
-    arguments: Namespace, robot: fflin.Robot | None = None
+    arguments: Namespace, robot: fflin.Robot | None = None, prefix: str = ""
 ) -> fflin.LinearTrajectory:
-    """Return the linear models along the trajectory of --trajectory."""
+    """Return the linear models along the trajectory of --trajectory, or over one period.
+
+    `prefix` is the prefix of the options of the point of --periodic, see `point_of`.
+    """
+    if getattr(arguments, "periodic", None):
+        return _models_of_period(arguments, robot or load_robot(arguments), prefix)
+    refuse(arguments, ("motion",), "without --periodic N, this has no effect")
+    if arguments.trajectory is None:
+        raise InputError(
+            "neither --trajectory FILE nor --periodic N is given; give one of them"
+        )
     point = ("joint", "velocity", "effort", "equilibrium", "tilt", "rpy", "position")
     refuse(
         arguments,
@@ -357,35 +380,59 @@ def models_along(
     return fflin.linearize_trajectory(robot, motion, strict=arguments.strict)
 
 
+def _models_of_period(
+    arguments: Namespace, robot: fflin.Robot, prefix: str
+) -> fflin.LinearTrajectory:
+    """Return the linear models of --periodic, over one period of the robot's orbit."""
+    of_point = ("effort", "equilibrium", "tilt", "relative_equilibrium", "time")
+    names = ("trajectory", "hold", "strict", "frame", f"{prefix}velocity", *of_point)
+    why = "--periodic N computes a periodic motion at rest, in base axes"
+    refuse(arguments, names, why)
+    states = (robot.point, robot.target) if prefix else (robot.point,)
+    q, _ = state_of(robot, arguments, *states, prefix=prefix)
+    motion = arguments.motion or "held"
+    return fflin.linearize_orbit(robot, q, motion=motion, steps=arguments.periodic)
+
+
 def robot_of_design(
     robot: fflin.Robot,
     allocate: bool | None,
     law: fflin.Gain | fflin.GainSchedule | fflin.Compensator | None = None,
 ) -> fflin.Robot:
-    """Return the robot for a design; for allocation, base torque and force replace the thrusters.
+    """Return the robot for a design; for allocation, base torque and force replace other inputs.
 
-    If `allocate` is None, thrusters are allocated under two conditions: they can produce every
-    wrench on the base, and `law` commands a base torque or is None.
+    These inputs are the thrusters and magnetorquers. The base force is omitted without thrusters.
+    If `allocate` is None, they are allocated under two conditions: the thrusters can produce every
+    wrench on the base, or the magnetorquers every moment, and `law` commands a base torque or is
+    None.
     """
     if allocate is None:
-        from fflin.control.authority import thrusters_give_every_wrench
+        from fflin.control.authority import (
+            thrusters_give_every_wrench,
+            torquers_give_every_moment,
+        )
 
         of_wrench = law is None or "tau_b.x" in law.input_names
-        allocate = of_wrench and thrusters_give_every_wrench(robot)
+        allocate = of_wrench and (
+            thrusters_give_every_wrench(robot) or torquers_give_every_moment(robot)
+        )
     if not allocate:
         return robot
-    others = tuple(
-        item for item in robot.inputs if not isinstance(item, fflin.Thruster)
-    )
-    if len(others) == len(robot.inputs):
+    kinds = {*map(type, robot.inputs)}
+    if not kinds & {fflin.Thruster, fflin.Magnetorquer}:
         raise InputError(
-            f"--allocate needs thrusters, but '{robot.name}' has none; define them in the file of "
-            "--inputs"
+            f"--allocate needs thrusters or magnetorquers, but '{robot.name}' has none; define "
+            "them in the file of --inputs"
         )
-    present = {*map(type, others)}
-    missing = [
-        kind() for kind in (fflin.BaseTorque, fflin.BaseForce) if kind not in present
-    ]
+    others = tuple(
+        item
+        for item in robot.inputs
+        if not isinstance(item, fflin.Thruster | fflin.Magnetorquer)
+    )
+    wanted: list[type[fflin.BaseTorque | fflin.BaseForce]] = [fflin.BaseTorque]
+    if fflin.Thruster in kinds:
+        wanted.append(fflin.BaseForce)
+    missing = [kind() for kind in wanted if kind not in kinds]
     return robot.replace(inputs=(*missing, *others))
 
 
@@ -397,6 +444,82 @@ def designed(
     design = robot_of_design(robot, arguments.allocate)
     lin = model_to_regulate(design, arguments, *point_of(design, arguments))
     return robot, design, lin, gain_of(lin, arguments, allocated=design is not robot)
+
+
+def tuning_of(
+    arguments: Namespace,
+) -> tuple[fflin.Robot, object, fflin.Structure, list[fflin.Goal], dict[str, Any]]:
+    """Return the robot, plant, structure, goals and settings of a search.
+
+    The options --law, --goal and --vary replace the entries of the table [tune] of the robot file.
+    All names are checked.
+    """
+    from fflin.tuning.specification import (
+        check_signals,
+        goals_of,
+        structure_of,
+        table_of,
+    )
+
+    robot = load_robot(arguments)
+    given = dict(robot.tune)
+    for key in ("law", "goal"):
+        if texts := getattr(arguments, key):
+            given[key] = [table_of(text) for text in texts]
+        if not given.get(key):
+            raise InputError(
+                f"no {key} is given; add --{key}, or tables [[tune.{key}]] to the robot file"
+            )
+    if arguments.vary:
+        given["vary"] = once("--vary", arguments.vary)
+    settings: dict[str, Any] = {}
+    for option in ("sample", "delay", "starts", "steps", "seed"):
+        value = getattr(arguments, option)
+        if value is None:
+            value = given.get(option)
+        if value is not None:
+            settings["dt" if option == "sample" else option] = value
+    if settings.get("delay") and settings.get("dt") is None:
+        settings["dt"] = settings["delay"]
+    goals = goals_of(given["goal"])
+    design = robot_of_design(robot, arguments.allocate)
+    lin = held_model(design, arguments, *point_of(design, arguments))
+    structure = structure_of(given["law"], lin)
+    check_signals(structure, goals, lin)
+    plant: object = lin
+    if given.get("vary"):
+        if lin.v.any() or arguments.effort:
+            raise InputError(
+                "velocities and --effort have no effect on uncertain models; remove them, or "
+                "remove the ranges (--vary, [tune.vary])"
+            )
+        plant = fflin.uncertain(design, given["vary"])
+        settings["q"] = lin.q
+    return design, plant, structure, goals, settings
+
+
+def tuned_law(
+    path: Path, name: str | None
+) -> tuple[fflin.LinearController, fflin.Robot]:
+    """Return the law that `fflin tune` saved, and its robot, `name` or the robot of the file."""
+    from fflin.base.errors import FflinError
+    from fflin.base.record import text, texts
+    from fflin.tuning.files import read_law, saved_law
+
+    record = read_law(path)
+    try:
+        robot = fflin.load(name or text(record["robot"]))
+    except FflinError:
+        if name:
+            raise
+        raise InputError(
+            f"the robot '{text(record['robot'])}' of the law is not known; give the robot of the "
+            "design with --robot"
+        ) from None
+    inputs = {entry for _, names in robot.named_inputs for entry in names}
+    if not {*texts(record["output_names"])} <= inputs:
+        robot = robot_of_design(robot, None)
+    return saved_law(record, robot), robot
 
 
 def weights_of(arguments: Namespace) -> dict[str, object]:
@@ -456,17 +579,23 @@ def loop_of(
             ("negative_feedback",),
             "only --controller has a sign of the feedback",
         )
-    if arguments.trajectory or arguments.schedule:
+    if arguments.trajectory or arguments.schedule or arguments.periodic:
         design = robot_of_design(robot, bool(arguments.allocate))
         tracking = along(design, arguments)
         if offset := once("--offset", arguments.offset):
             settings["q0"], settings["v0"] = tracking.beside(offset)
+        elif tracking.trajectory.period:
+            settings["q0"], settings["v0"] = _start_beside(robot, tracking, arguments)
         if arguments.allocate:
             return fflin.Allocation(tracking, design), settings
         return tracking, settings
     refuse(
-        arguments, ("offset", "hold"), "without --trajectory FILE, this has no effect"
+        arguments,
+        ("offset", "hold", "motion"),
+        "without --trajectory FILE or --periodic N, this has no effect",
     )
+    if arguments.bdot is not None:
+        return _detumbling(robot, arguments, settings)
     if arguments.free:
         of_law = ("limit", "delay", "reduce", "allocate", "gain", "controller", "mpc")
         names = (*_WEIGHTS, *_POSE, *_TARGETS[:2], "tilt", *of_law)
@@ -497,6 +626,43 @@ def loop_of(
     return policy, settings
 
 
+def _detumbling(
+    robot: fflin.Robot, arguments: Namespace, settings: dict[str, Any]
+) -> tuple[fflin.Policy, dict[str, Any]]:
+    """Return the B-dot law of --bdot, and keyword arguments of `simulate`."""
+    other_laws = ("free", "mpc", "gain", "controller", "reduce", "allocate")
+    names = (*_WEIGHTS, *_POSE, *_TARGETS, *other_laws)
+    refuse(arguments, names, "--bdot replaces the regulator and its options")
+    policy = fflin.BDot(arguments.bdot)
+    policy.form(robot)  # raises an error for a robot without magnetorquers
+    q, v = start_of(robot, arguments)
+    settings |= {"q0": q, "v0": v, "frame": arguments.frame}
+    assert robot.orbit is not None  # since it has magnetorquers
+    if arguments.duration is None:
+        settings["duration"] = robot.orbit.period
+    return policy, settings
+
+
+def _start_beside(
+    robot: fflin.Robot, tracking: fflin.TrajectoryFeedback, arguments: Namespace
+) -> tuple[Array, Array]:
+    """Return the initial q (nq,) and v (nv,) of a simulation along a periodic motion.
+
+    By default, they are on the motion. If the motion displaces the base so that the centre of mass
+    is on the orbit, the start is displaced, too.
+    """
+    from fflin.linear.equilibrium import on_orbit
+
+    q_star, v_star, _ = tracking.reference(0.0)
+    given = any(getattr(arguments, name) for name in ("joint", "rpy", "position"))
+    q, v = start_of(robot, arguments)
+    if not (given or robot.start or robot.point):
+        q = q_star
+    elif q_star[:3].any() and not q[:3].any():
+        q = on_orbit(robot, q, "lvlh")
+    return q, v_star if v is None else v
+
+
 def with_errors(
     policy: fflin.Policy | None, arguments: Namespace
 ) -> fflin.Policy | None:
@@ -525,8 +691,7 @@ def with_errors(
         sizes[name] = np.zeros(len(policy.sensors))
         for index, value in by_name("measured signal", by_key, policy.sensors).items():
             sizes[name][index] = value
-    seed = np.zeros(1)
-    return with_sensor_errors(policy.fresh(), sizes["bias"], sizes["noise"], seed)
+    return with_sensor_errors(policy.fresh(), sizes["bias"], sizes["noise"], 0.0)
 
 
 def budget_of(
@@ -630,6 +795,9 @@ def about_point(
         refuse(
             arguments, of_gain, "--controller replaces the regulator and its options"
         )
+        from fflin.tuning.files import in_time_of
+
+        lin = in_time_of(arguments.controller, lin)
         sign = -1.0 if arguments.negative_feedback else 1.0
         feedback = fflin.LinearController(arguments.controller, lin, sign=sign)
     else:
@@ -703,16 +871,20 @@ def along(robot: fflin.Robot, arguments: Namespace) -> fflin.TrajectoryFeedback:
         "on the command line, MPC holds a fixed target; in Python, fflin.mpc(models, ...) follows "
         "the models = fflin.linearize_trajectory(robot, motion) of a trajectory",
     )
-    refuse(arguments, (*regulator, "joint", "rpy", "position", "velocity"), why)
     refuse(arguments, ("integral",), "a law along a trajectory has no integral action")
+    start = ("joint", "rpy", "position", "velocity")
     if arguments.schedule is None:
-        models = models_along(arguments, robot)
+        if not getattr(arguments, "periodic", None):
+            refuse(arguments, (*regulator, *start), why)
+        models = models_along(arguments, robot, "target_")
         weights = weights_of(arguments)
-        schedule = fflin.tvlqr(models, sample=arguments.sample, weights=weights)
+        end = "periodic" if models.period else "steady"
+        schedule = fflin.tvlqr(models, Qf=end, sample=arguments.sample, weights=weights)
         return fflin.TrajectoryFeedback(models, schedule)
-    why = "the file of --schedule already contains the trajectory and the design of its gains"
-    refuse(arguments, ("trajectory", "hold", *_WEIGHTS), why)
+    designed = "the file of --schedule already contains the trajectory and the design of its gains"
+    refuse(arguments, ("trajectory", "hold", "periodic", "motion", *_WEIGHTS), designed)
     schedule = fflin.GainSchedule.load(arguments.schedule)
+    refuse(arguments, regulator if schedule.period else (*regulator, *start), why)
     return fflin.TrajectoryFeedback(schedule.trajectory(robot), schedule)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from argparse import Namespace
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
@@ -33,6 +34,8 @@ from fflin.commands.builders import (
     refuse,
     robot_of_design,
     state_of,
+    tuned_law,
+    tuning_of,
     weights_of,
     with_errors,
 )
@@ -46,6 +49,11 @@ _ROWS = 240  # number of instants per run at which --plot shows errors and input
 _ALLOCATED = (
     "allocation: tau_b and F_b are realised by the thrusters, in `fflin simulate --gain` too; "
     "--no-allocate designs the thrusts themselves"
+)
+
+_MAGNETIC = (
+    "allocation: magnetorquers realise the part of tau_b across the magnetic field, in `fflin "
+    "simulate --gain` too; simulate several orbits to see whether the loop is stable"
 )
 
 _NOT_ALLOCATED = (
@@ -67,7 +75,8 @@ def lqr(arguments: Namespace) -> Report:
         x for x in str(gain).split("\n\n") if not x.startswith("warning: ")
     )
     if design is not robot:
-        text += f"\n\n{folded([_ALLOCATED])}"
+        thrusters = any(isinstance(x, fflin.Thruster) for x in robot.inputs)
+        text += f"\n\n{folded([_ALLOCATED if thrusters else _MAGNETIC])}"
     result = {
         **record_of(gain),
         "margins": gain.margins,
@@ -80,8 +89,25 @@ def lqr(arguments: Namespace) -> Report:
     return Report(gain.robot, result, text, files)
 
 
+def tune(arguments: Namespace) -> Report:
+    """Tune a PD, PID or other law to goals; show the goals, the parameters and the search.
+
+    example: fflin tune satellite.toml --law 'pd shared=true' --goal 'margin disk=0.75' -o law.npz
+    """
+    robot, plant, structure, goals, settings = tuning_of(arguments)
+    tuned = fflin.tune(plant, structure, goals, **settings)
+    files: dict[Path | None, Callable[[Path], object]] = {
+        arguments.output_file: tuned.save,
+        arguments.plot: lambda path: fflin.plot_tuned(tuned, path),
+    }
+    code = DONE
+    if not all(goal.met for goal in tuned.goals if goal.hard):
+        code = FELL_SHORT
+    return Report(robot.name, tuned.record(), str(tuned), files, code)
+
+
 def tvlqr(arguments: Namespace) -> Report:
-    """Design a time-varying linear quadratic regulator along a trajectory.
+    """Design a time-varying linear quadratic regulator along a trajectory or over an orbit.
 
     example: fflin tvlqr planar_detumble --trajectory plan.csv --hold previous --sample 0.1 -o
     gains.npz
@@ -89,7 +115,10 @@ def tvlqr(arguments: Namespace) -> Report:
     why = "along a trajectory no reduced model is needed, because the finite-horizon cost exists"
     refuse(arguments, ("reduce",), why)
     along = models_along(arguments)
-    Qf = once("--qf", arguments.qf) or "steady"
+    Qf: dict[str, float] | str = once("--qf", arguments.qf) or "steady"
+    if along.period:
+        refuse(arguments, ("qf",), "the cost of --periodic N has no end")
+        Qf = "periodic"
     schedule = fflin.tvlqr(
         along, Qf=Qf, sample=arguments.sample, weights=weights_of(arguments)
     )
@@ -102,7 +131,7 @@ def tvlqr(arguments: Namespace) -> Report:
 
 
 def export(arguments: Namespace) -> Report:
-    """Write C99 code of a gain, compensator or gain schedule, with a test program.
+    """Write C99 code of a gain, compensator, gain schedule or tuned law, with a test program.
 
     example: fflin export gain.npz --robot servicer_7dof --limits urdf -o flight
     """
@@ -112,13 +141,17 @@ def export(arguments: Namespace) -> Report:
         kind.__name__: kind
         for kind in (fflin.Gain, fflin.GainSchedule, fflin.Compensator)
     }
-    with reading(arguments.file, "Gain, GainSchedule or Compensator"):
+    with reading(arguments.file, "Gain, GainSchedule, Compensator or tuned law"):
         kind_name = text(read_record(arguments.file)[0]["kind"])
-        if kind_name not in kinds:
+        if kind_name not in (*kinds, "Tuned"):
             raise ValueError(f"the file contains: {kind_name}")
-    law = kinds[kind_name].load(arguments.file)
+    law: Any
     robot = None
-    if arguments.robot:
+    if kind_name == "Tuned":
+        law, robot = tuned_law(arguments.file, arguments.robot)
+    else:
+        law = kinds[kind_name].load(arguments.file)
+    if arguments.robot and robot is None:
         robot = robot_of_design(fflin.load(arguments.robot), None, law)
     limits = None if arguments.limits == "none" else arguments.limits
     name, real = arguments.name, arguments.real
@@ -133,8 +166,12 @@ def export(arguments: Namespace) -> Report:
     message = f"C99 code of {law!r}, with numbers of type {real}\nto test it:\n  {test}"
     result = {"name": name, "real": real, "folder": str(folder)}
     endings = (".h", ".c", "_test.c", ".json")
+    name_of_robot = robot.name if robot else law.robot
     return Report(
-        law.robot, result, message, {folder / f"{name}{end}": None for end in endings}
+        name_of_robot,
+        result,
+        message,
+        {folder / f"{name}{end}": None for end in endings},
     )
 
 
@@ -183,6 +220,8 @@ def simulate(arguments: Namespace) -> Report:
     measuring = with_errors(policy, arguments)
     if measuring is not policy:
         settings.pop("linear", None)  # the linear model has no sensor errors
+    if arguments.no_noise:
+        settings["noise"] = 0.0
     motion = fflin.simulate(
         robot, measuring, every=arguments.every, engine=arguments.engine, **settings
     )
@@ -200,6 +239,9 @@ def simulate(arguments: Namespace) -> Report:
     record = motion_record(motion)
     record["margins"], line = _margins_of(policy, settings)
     if line:
+        text += f"\n{folded([line])}"
+    if arguments.bdot is not None and not motion.stopped:
+        record["detumbling_time"], line = _detumbling_of(motion)
         text += f"\n{folded([line])}"
     if window is not None and not motion.stopped:
         pointing = motion.pointing(window, accuracy=arguments.accuracy)
@@ -230,6 +272,18 @@ def _margins_of(policy: object, settings: Mapping[str, Any]) -> tuple[object, st
         f"{margins.phase:.3g} deg (disk margin {margins.disk:.3g})"
     )
     return margins, line
+
+
+def _detumbling_of(motion: fflin.Motion) -> tuple[float, str]:
+    """Return the detumbling time [s] of a motion, and a line on it."""
+    orbit = motion.orbit
+    assert orbit is not None
+    time = fflin.detumbling_time(motion)
+    bound = f"{4.0 * orbit.mean_motion:.3g} rad/s, four times the orbital rate"
+    line = f"detumbled after {time:.5g} s"
+    if not math.isfinite(time):
+        return time, f"not detumbled: the mean rate over one orbit is not below {bound}"
+    return time, f"{line}: the mean rate over one orbit is below {bound}"
 
 
 def _window(arguments: Namespace) -> float | None:
@@ -263,6 +317,8 @@ def montecarlo(arguments: Namespace) -> Report:
     settings.pop("linear", None)  # the runs are not compared with a linear model
     for name in ("runs", "seed", "until", "width", "confidence", "workers", "threads"):
         settings[name] = getattr(arguments, name)
+    if arguments.no_noise:
+        settings["noise"] = 0.0
     settings["histories"] = _ROWS if arguments.plot else 0
     settings["out"] = None if is_table else path
     with going_on(path, "runs") as progress:
@@ -323,7 +379,10 @@ def validity(arguments: Namespace) -> Report:
             saturation = "saturated at the limits of the robot"
         text += f"\n{folded([f'inputs were {saturation}'])}"
     if design is not robot:
-        text += "\nan ideal torque and force on the base replace the thrusters (--no-allocate)"
+        text += (
+            "\nideal torques and forces on the base replace the thrusters and magnetorquers "
+            "(--no-allocate)"
+        )
     files = {arguments.plot: lambda path: fflin.plot_validity(result, path)}
     return Report(robot.name, result, text, files)
 

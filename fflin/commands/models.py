@@ -195,21 +195,17 @@ def linearize(arguments: Namespace) -> Report:
     tool = getattr(arguments, "for")
     if tool and not path:
         raise InputError("--for saves the converted model; add -o FILE")
-    if path and (tool or arguments.trajectory):
+    many = arguments.trajectory or arguments.periodic
+    if path and (tool or many):
         check_ending(path, RECORDS)
-    if arguments.trajectory:
-        refuse(
-            arguments,
-            ("for",),
-            "this option converts one model, but --trajectory gives many",
-        )
-        refuse(
-            arguments, ("plot",), "with --trajectory, there is no single model to plot"
-        )
+    if many:
+        why = "this option is for one model, but --trajectory and --periodic give many"
+        refuse(arguments, ("for", "plot", "time"), why)
         along = models_along(arguments)
         if arguments.dt is not None:
             along = along.discretize(arguments.dt)
-        return Report(along.robot.name, along, str(along), {path: along.save})
+        return _report_along(along, path)
+    refuse(arguments, ("motion",), "without --periodic N, this has no effect")
     _, lin = linear_model(arguments)
     if arguments.dt is not None:
         lin = lin.discretize(arguments.dt)
@@ -223,12 +219,25 @@ def linearize(arguments: Namespace) -> Report:
     return Report(lin.robot, model, text, files)
 
 
+def _report_along(along: fflin.LinearTrajectory, path: Path | None) -> Report:
+    """Return the report of linear models along a trajectory or over one period."""
+    from fflin.base.record import record_of
+
+    text, result = str(along), record_of(along)
+    if along.period:
+        sizes = abs(along.multipliers)
+        shown = ", ".join(f"{size:.6g}" for size in sizes)
+        text += f"\n{folded([f'magnitudes of all multipliers: {shown}'])}"
+        result["multipliers"] = along.multipliers
+    return Report(along.robot.name, result, text, {path: along.save})
+
+
 def check(arguments: Namespace) -> Report:
     """Compare A and B with two independent computations; the exit code is 1 if the results differ.
 
     example: fflin check canadarm2 --rpy 20 0 0 --reference world --frame world
     """
-    if arguments.trajectory:
+    if arguments.trajectory or arguments.periodic:
         along = models_along(arguments)
         robot = along.robot
         comparison = along.check(tolerance=arguments.tolerance)
@@ -259,6 +268,8 @@ def model_report(lin: fflin.LinearModel) -> str:
     head = f"{lin.robot}: {nx} states, {nu} inputs, frame {lin.frame}"
     if lin.dt:
         head += f", sampled every {lin.dt:g} s"
+    if lin.t is not None:
+        head += f", at t = {lin.t:g} s"
     head += f"; the operating point is {point}"
     parts = [folded([head, *_units(lin)])]
     if lin.dependent:

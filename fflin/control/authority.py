@@ -13,6 +13,7 @@ from fflin.dynamics.state import Actuation, StateMap
 from fflin.robot.equipment.assembly import carrier
 from fflin.robot.fields import input_limits, limits_of
 from fflin.robot.inputs import named_wheels
+from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
 from fflin.robot.rotors import spin_axis
 
@@ -210,6 +211,13 @@ def thrusters_give_every_wrench(robot: Robot) -> bool:
         return False
     W = actuation.columns(robot.create_data(), robot.neutral())[:6]
     return gives_every_wrench(W, np.isin(np.arange(W.shape[1]), thrusters))
+
+
+def torquers_give_every_moment(robot: Robot) -> bool:
+    """Return whether magnetorquers on the base can have a magnetic moment in every direction."""
+    actuation = Actuation(StateMap(robot))
+    axes = [axis for joint, _, axis in actuation.torquers if joint == ROOT]
+    return len(axes) > 2 and int(np.linalg.matrix_rank(axes)) == 3
 
 
 def least_reach(W: Array, low: Array, high: Array, kept: Array) -> float:

@@ -13,6 +13,7 @@ from fflin.base.validation import Array, positive
 from fflin.control.policy import BDotForm, Command, Policy
 from fflin.dynamics.coordinates import PIN_ANGULAR, Frame
 from fflin.dynamics.state import Actuation, StateMap
+from fflin.robot.inputs import has_magnetorquers
 from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
 
@@ -64,12 +65,13 @@ class BDot(Policy):
 
     def form(self, robot: Robot) -> BDotForm:
         """Return the gain of the law for a robot."""
-        return BDotForm(self._gains(Actuation(StateMap(robot, frame=_FRAME))))
+        return BDotForm(self._gains(_actuation(robot)))
 
     def bind(self, robot: Robot) -> Command:
         """Return the law as a function of t, q and v."""
-        state = StateMap(robot, frame=_FRAME)
-        gains = self._gains(Actuation(state))
+        actuation = _actuation(robot)
+        gains = self._gains(actuation)
+        state = actuation.state
         assert state.field is not None
         field = state.field.magnetic
         assert field is not None
@@ -85,12 +87,6 @@ class BDot(Policy):
 
     def _gains(self, actuation: Actuation) -> Array:
         """Return the gain (nu, 3) for the derivative of the flux density in base axes."""
-        robot = actuation.state.robot
-        if not actuation.torquers:
-            raise InputError(
-                f"'{robot.name}' has no magnetorquers, which BDot commands; give it inputs such as "
-                "Magnetorquer((1, 0, 0), max=0.2)"
-            )
         gains = np.zeros((len(actuation.names), 3))
         for joint, index, axis in actuation.torquers:
             if joint != ROOT:
@@ -100,3 +96,13 @@ class BDot(Policy):
                 )
             gains[index] = -self.gain * axis
         return gains
+
+
+def _actuation(robot: Robot) -> Actuation:
+    """Return the actuation of a robot; raise `InputError` if it has no magnetorquers."""
+    if not has_magnetorquers(robot.inputs):
+        raise InputError(
+            f"'{robot.name}' has no magnetorquers, which BDot commands; give it inputs such as "
+            "Magnetorquer((1, 0, 0), max=0.2)"
+        )
+    return Actuation(StateMap(robot, frame=_FRAME))

@@ -19,6 +19,7 @@ from fflin.base.validation import Array
 from fflin.kernel import vectors as vec
 from fflin.kernel.bodies import factorise, solve_inwards, write_columns
 from fflin.kernel.forward import MECHANICS, POINT, configure, push, turn_held
+from fflin.kernel.orbit import flux_at, write_now
 from fflin.kernel.tree import INDICES, LANED, Struct, empty
 from fflin.kernel.vectors import Entries, called, load, root, store
 
@@ -181,12 +182,13 @@ def least_squares(least: Entries, most: Entries, size: int) -> LeastSquares:
 
 
 @called
-def allocate(allocation, point, commanded):
+def allocate(allocation, orbit, point, commanded, t):
     """Write to `point.u` the inputs of `giving` that replace a command for the inputs of `asking`.
 
     Within their bounds, these inputs minimise e^T M e, where e is the difference between their
     accelerations and the accelerations of the command. If the problem has no inputs, the command is
-    written unchanged.
+    written unchanged. In orbit, magnetorquers act in the field at the time t [s]; `orbit` is None
+    without an orbit.
     """
     if len(allocation.problem.least) == 0:
         vec.copy(commanded, 0, point.u, 0, len(point.u))
@@ -199,11 +201,13 @@ def allocate(allocation, point, commanded):
     vec.copy(point.q, 0, work_point.q, 0, len(work_point.q))
     configure(work, asking, work_point.q)
     factorise(work, tree)
-    write_columns(work, tree, None)
+    if orbit is not None:
+        write_now(orbit, t)
+    _write_columns(work, tree, orbit, point)
     vec.copy(commanded, 0, work_point.pushing, 0, len(commanded))
     _write_force(work, asking, work_point, columns, count * size)
     # Write the generalised forces of unit inputs of `giving`, one after the other.
-    write_columns(work, giving.tree, None)
+    _write_columns(work, giving.tree, orbit, point)
     for unit in range(count):
         for index in range(count):
             store(work_point.pushing, index, 1.0 if index == unit else 0.0)
@@ -217,7 +221,7 @@ def allocate(allocation, point, commanded):
 
 
 @called
-def write_difference(allocation, point, commanded):
+def write_difference(allocation, orbit, point, commanded):
     """Replace a command by the difference of the applied and the commanded inputs of `asking`.
 
     `point.u` contains the applied inputs of `giving`. Call this function after `allocate`, whose
@@ -234,7 +238,7 @@ def write_difference(allocation, point, commanded):
     work_point, tree = allocation.point, asking.tree
     achieved = allocation.problem.columns
     size = len(tree.row)
-    write_columns(work, tree, None)
+    _write_columns(work, tree, orbit, point)
     for unit in range(inputs):
         for index in range(inputs):
             store(work_point.pushing, index, 1.0 if index == unit else 0.0)
@@ -249,6 +253,14 @@ def write_difference(allocation, point, commanded):
         solve_unbounded(back, size, lane)
         for index in range(inputs):
             vec.poke(commanded, index, lane, back.x[index])
+
+
+def _write_columns(work, tree, orbit, point):
+    """Write the columns of B_u; in orbit, with the magnetic field that `orbit.now` contains."""
+    if orbit is not None:
+        write_columns(work, tree, flux_at(orbit, point.q))
+    else:
+        write_columns(work, tree, None)
 
 
 def _scale(work, tree, columns, at):

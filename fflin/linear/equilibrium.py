@@ -639,6 +639,9 @@ class RelativeEquilibrium(FrozenArrays):
         moments = ", ".join(f"{moment:.5g}" for moment in self.moments)
         return f"RelativeEquilibrium({self.stability}, moments=({moments}) kg m^2)"
 
+    def _repr_html_(self) -> str:
+        return html.result_card(self)
+
 
 class RelativeEquilibria(html.Reported, tuple[RelativeEquilibrium, ...]):
     """Tuple of the 24 relative equilibria, most stable first; ``print`` shows a table.

@@ -378,10 +378,11 @@ def transitions(traj: LinearTrajectory, dt: float) -> Iterator[tuple[Steps, Arra
     """
     times = traj.samples(dt)
     if times[-1] != traj.t[-1]:
-        duration = traj.t[-1] - traj.t[0]
+        duration = float(traj.t[-1] - traj.t[0])
+        nearest = duration / max(1, round(duration / dt))
         raise InputError(
             f"dt is {dt:g} s, but the duration of the trajectory, {duration:g} s, is not a "
-            "multiple of dt; give a dt that divides the duration"
+            f"multiple of dt; give a dt that divides the duration, such as {nearest!r}"
         )
     cuts = []
     for start, end in pairwise(times.tolist()):

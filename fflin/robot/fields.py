@@ -26,15 +26,20 @@ from fflin.base.validation import (
     looks_like_degrees,
     number,
     numbers,
+    whole,
 )
 from fflin.robot.constraints import checked_constraints, checked_independent
 from fflin.robot.disturbance import checked_disturbance
 from fflin.robot.inputs import (
     KINDS,
+    BaseForce,
+    BaseTorque,
     Input,
     JointTorque,
+    Magnetorquer,
     Range,
     ReactionWheel,
+    Thruster,
     named_inputs,
     three_numbers,
 )
@@ -51,7 +56,12 @@ RULES = ("urdf", "identity")
 
 def input_keys_of(robot: RobotData) -> tuple[str, ...]:
     """Return the name GROUP.ENTRY of each input, such as "thrust.NAME"; see `names.input_keys`."""
-    pairs = ((item.GROUP, name) for item, names in robot.named_inputs for name in names)
+    return _keys_of(robot.named_inputs)
+
+
+def _keys_of(named: Iterable[tuple[Input, tuple[str, ...]]]) -> tuple[str, ...]:
+    """Return the name GROUP.ENTRY of each named input."""
+    pairs = ((item.GROUP, name) for item, names in named for name in names)
     keys = []
     for group, name in pairs:
         key = name if name.startswith(f"{group}.") else f"{group}.{name}"
@@ -283,7 +293,7 @@ def _weights(value: object, robot: RobotData) -> dict[str, object]:
     The keys of the mappings are names, groups or patterns of states and inputs. `integral` contains
     names of states or outputs, or a mapping {name: weight of the integral}.
     """
-    states, inputs = state_keys(robot.joint_names), input_keys_of(robot)
+    states, inputs = state_keys(robot.joint_names), _weighted_inputs(robot)
     both = (*states, *inputs)
     kinds = {
         "q": ("state", states),
@@ -314,6 +324,47 @@ def _weights(value: object, robot: RobotData) -> dict[str, object]:
     if given.get("integral"):
         checked["integral"] = _integrated(given["integral"])
     return checked
+
+
+# Keys of the field `tune`: laws and goals, ranges, and numbers.
+TUNE = ("law", "goal", "vary", "sample", "delay", "starts", "steps", "seed")
+
+
+def _tune(value: object, robot: RobotData) -> dict[str, object]:
+    """Return the checked settings of `fflin tune`, which checks the laws and goals itself."""
+    given = _parts("tune", value, TUNE)
+    for key in ("law", "goal"):
+        tables = given.get(key, [])
+        if not isinstance(tables, list | tuple) or not all(
+            isinstance(table, Mapping) for table in tables
+        ):
+            raise InputError(
+                f"{key} of tune is {tables!r}, expected tables [[tune.{key}]]"
+            )
+    if not isinstance(given.get("vary", {}), Mapping):
+        raise InputError(
+            f"vary of tune is {given['vary']!r}, expected {{parameter: range}}"
+        )
+    for key in ("sample", "delay"):
+        if key in given:
+            given[key] = number(f"{key} of tune", given[key])
+    for key in ("starts", "steps", "seed"):
+        if key in given:
+            given[key] = whole(f"{key} of tune", given[key], 0)
+    return given
+
+
+def _weighted_inputs(robot: RobotData) -> tuple[str, ...]:
+    """Return the names and groups of the inputs that may have weights.
+
+    The commands of a design with base torque and force may be allocated to thrusters and
+    magnetorquers, so a robot with such inputs may have weights of the base torque and force.
+    """
+    keys = input_keys_of(robot)
+    if not any(isinstance(item, Thruster | Magnetorquer) for item in robot.inputs):
+        return keys
+    of_base = _keys_of(named_inputs((BaseTorque(), BaseForce())))
+    return tuple(dict.fromkeys((*keys, *of_base)))
 
 
 def _integrated(value: object) -> object:
@@ -369,6 +420,7 @@ FIELDS: dict[str, Callable[[object, RobotData], Any] | None] = {
     "disturbance": lambda value, _: checked_disturbance(value),
     "limits": _given_limits,
     "weights": _weights,
+    "tune": _tune,
     **{name: partial(_state, name) for name in ("point", "target", "start")},
 }
 

@@ -41,6 +41,8 @@ CLOSED_LOOP = "closed loop"
 ROTATION = "rotation of the base or of a joint"
 LAG = "lag of the inputs and outputs"
 LONGEST_STEP = 0.01  # [s] default time step, if no pole requires a shorter step
+# [s] the same for magnetorquers and for laws that repeat, which act slowly
+SLOW_STEP = 1.0
 _DAMPING, _AMPLITUDE = 0.05, 0.01  # tolerances in (11.4)
 _SHORTEST_STEP = 1e-12  # [s] at which the search for a step ends
 
@@ -288,11 +290,16 @@ class Pace:
     """The limits of the time step for a run of a given duration with a given method."""
 
     def __init__(
-        self, limits: Sequence[Limit], method: type[Integrator], duration: float
+        self,
+        limits: Sequence[Limit],
+        method: type[Integrator],
+        duration: float,
+        longest: float = LONGEST_STEP,
     ) -> None:
         self.limits = tuple(limits)
         self._method = method
         self._duration = duration
+        self._longest = longest
 
     def demand(self, h: float) -> Demand:
         """Return the largest step error (11.4) of a step of h [s]; it should be at most 1."""
@@ -301,13 +308,13 @@ class Pace:
         ]
         return max(demands, key=lambda limit: limit.error, default=Demand(0.0, str))
 
-    def step(self, longest: float = LONGEST_STEP) -> tuple[float, str]:
+    def step(self, longest: float | None = None) -> tuple[float, str]:
         """Return the longest accurate step [s] of 1, 2 or 5 units, and the mode that limits it.
 
         The unit is a power of ten of a second. If `longest` is accurate, return `longest` and an
-        empty text.
+        empty text. By default, `longest` is the longest default step.
         """
-        h = longest
+        h = longest or self._longest
         mode = ""
         while h > _SHORTEST_STEP and (demand := self.demand(h)).error > 1.0:
             mode = demand.mode()

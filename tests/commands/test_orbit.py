@@ -1,0 +1,137 @@
+"""Commands for robots in orbit: models over one period, magnetorquers and the B-dot law."""
+
+import json
+
+import numpy as np
+import pytest
+
+import fflin
+from tests.support.commands import refused, run
+
+SATELLITE = "cubesat_magnetic"
+ELLIPSE = ("--orbit", "500e3/1900e3")
+STILL = ("--velocity", "omega_b=0")
+PERIOD = fflin.load(SATELLITE).orbit.period
+SAMPLE = PERIOD / 24
+
+
+def test_the_robot_file_of_a_magnetic_satellite_is_short():
+    robot = fflin.load(SATELLITE)
+    assert [type(item) for item in robot.inputs] == [fflin.Magnetorquer] * 3
+    assert len(robot.urdf.with_name(f"{SATELLITE}.toml").read_text().splitlines()) <= 25
+
+
+def test_linearize_at_a_time():
+    code, out, _ = run("linearize", "cubesat", *ELLIPSE, "--time", 1800)
+    assert code == 0 and "at t = 1800 s" in " ".join(out.split())
+    code, out, _ = run("linearize", "cubesat", *ELLIPSE, "--time", 1800, "--json")
+    robot = fflin.load("cubesat", orbit={"perigee": 500e3, "apogee": 1900e3})
+    assert np.array_equal(json.loads(out)["A"], fflin.linearize(robot, t=1800.0).A)
+    assert run("check", SATELLITE, "--time", 1000)[0] == 0
+
+
+def test_the_models_of_one_period_and_their_multipliers(tmp_path):
+    command = ("linearize", "cubesat", *ELLIPSE, "--periodic", 8)
+    code, out, _ = run(*command, "-o", "models.npz", cwd=tmp_path)
+    assert code == 0 and "magnitudes of all multipliers: " in " ".join(out.split())
+    robot = fflin.load("cubesat", orbit={"perigee": 500e3, "apogee": 1900e3})
+    expected = fflin.linearize_orbit(robot, steps=8)
+    along = fflin.LinearTrajectory.load(tmp_path / "models.npz", robot)
+    assert np.array_equal(along.A, expected.A) and along.period == expected.period
+    assert len(json.loads(run(*command, "--json")[1])["multipliers"]) == 12
+
+
+@pytest.mark.exhaustive
+def test_a_free_motion_and_checks_of_one_period():
+    command = ("linearize", "cubesat", *ELLIPSE, "--periodic", 8)
+    assert run("check", *command[1:])[0] == 0
+    robot = fflin.load("cubesat", orbit={"perigee": 500e3, "apogee": 1900e3})
+    record = json.loads(run(*command, "--motion", "free", "--json")[1])
+    free = fflin.linearize_orbit(robot, steps=8, motion="free")
+    assert np.allclose(record["q"], free.q, atol=1e-12)
+
+
+def test_a_periodic_schedule_from_the_command_line(tmp_path):
+    design = ("--periodic", 8, "--sample", repr(SAMPLE), "--r", "dipole=1e6")
+    code, out, _ = run("tvlqr", SATELLITE, *design, "-o", "gains.npz", cwd=tmp_path)
+    assert code == 0 and "repeats after 5676.98 s" in " ".join(out.split())
+    assert fflin.GainSchedule.load(tmp_path / "gains.npz").period == PERIOD
+
+
+@pytest.mark.exhaustive
+def test_a_periodic_schedule_is_simulated_from_a_file_or_designed_first(tmp_path):
+    design = ("--periodic", 8, "--sample", repr(SAMPLE), "--r", "dipole=1e6")
+    run("tvlqr", SATELLITE, *design, "-o", "gains.npz", cwd=tmp_path)
+    flight = ("--rpy", 3, 2, -3, *STILL, "--duration", repr(SAMPLE), "--json")
+    both = []
+    for law in (("--schedule", "gains.npz"), design):
+        code, out, err = run("simulate", SATELLITE, *law, *flight, cwd=tmp_path)
+        assert code == 0, err
+        both.append(json.loads(out)["x"])
+    assert both[0] == both[1]
+    assert max(map(abs, both[0][:3])) < 0.04  # the run begins at --rpy
+
+
+def test_a_regulator_is_allocated_to_magnetorquers_by_default(tmp_path):
+    code, out, _ = run("lqr", SATELLITE, "--sample", 10, "-o", "g.npz", cwd=tmp_path)
+    assert code == 0 and "the part of tau_b across the magnetic" in " ".join(
+        out.split()
+    )
+    flight = ("--sample", 10, "--dt", 10, "--duration", 100)
+    code, out, _ = run("simulate", SATELLITE, *flight)
+    assert code == 0 and "the commanded tau_b are realised by dipole" in out
+    flight = ("--gain", "g.npz", "--dt", 10, "--duration", 100)
+    assert run("simulate", SATELLITE, *flight, cwd=tmp_path)[0] == 0
+    assert "magnetorquers; use" in refused("lqr", SATELLITE, "--no-allocate")
+    assert "none; define" in refused("lqr", "ets_vii", "--allocate")
+
+
+@pytest.mark.exhaustive
+def test_a_satellite_detumbles_and_points_to_the_earth(tmp_path):
+    flight = ("--sample", 10, "--dt", 10, "--duration", 20000, "-o", "m.npz")
+    assert run("simulate", SATELLITE, *flight, cwd=tmp_path)[0] == 0
+    motion = fflin.Motion.load(tmp_path / "m.npz")
+    assert np.degrees(np.linalg.norm(motion.v[0, 3:6])) > 5.0
+    late = motion.t > 2.5 * PERIOD
+    assert late.any() and motion.attitude_error[late].max() < 5.0
+    assert np.abs(motion.u).max() <= 0.2
+
+
+def test_the_b_dot_law(tmp_path):
+    command = ("simulate", SATELLITE, "--bdot", 2e4, "--dt", 5)
+    code, out, _ = run(*command, "--duration", 100)
+    assert code == 0 and "not detumbled: the mean rate" in " ".join(out.split())
+    assert "--bdot replaces" in refused(*command, "--sample", 20, "--r", "dipole=1")
+    assert "magnetorquers" in refused("simulate", "cubesat", "--bdot", 1)
+
+
+@pytest.mark.exhaustive
+def test_the_b_dot_law_detumbles():
+    command = ("simulate", SATELLITE, "--bdot", 2e4, "--dt", 5, "--json")
+    record = json.loads(run(*command, "--duration", 12000)[1])
+    assert PERIOD < record["detumbling_time"] < 12000.0
+
+
+@pytest.mark.compiled
+@pytest.mark.exhaustive
+def test_a_campaign_from_detumbling_to_the_earth(tmp_path):
+    spread = '[dispersions]\n"base.mass" = 0.02\nomega_b = 0.02\n'
+    (tmp_path / "spread.toml").write_text(spread)
+    command = ("montecarlo", SATELLITE, "spread.toml", "--runs", 8, "--sample", 10)
+    options = ("--dt", 5, "--duration", 20000, "--goal", "attitude < 5 deg", "--json")
+    code, out, err = run(*command, *options, cwd=tmp_path)
+    assert code == 0, err
+    (goal,) = json.loads(out)["goals"].values()
+    assert goal["fraction"] == 1.0
+
+
+def test_errors_of_periodic_models():
+    for command in ("linearize", "tvlqr"):
+        text = refused(command, "cubesat", "--periodic", 8)
+        assert "not in orbit" in text
+    both = ("--periodic", 8, "--trajectory", "m.npz")
+    assert "remove --trajectory" in refused("tvlqr", SATELLITE, *both)
+    assert "neither --trajectory" in refused("tvlqr", SATELLITE)
+    assert "without --periodic" in refused("linearize", SATELLITE, "--motion", "free")
+    wrong = refused("tvlqr", SATELLITE, "--periodic", 8, "--sample", 60)
+    assert "59.75766345816693" in wrong
