@@ -134,10 +134,8 @@ class TrajectoryFeedback(Feedback):
         """Return the poles [1/s] of the robot and of the loop; empty for a sampled schedule."""
         return poles_along(self.schedule)
 
-    def form(self, robot: Robot) -> PathForm | OutputForm | None:
-        """Return the trajectory and the gains; None if they repeat, which only Python supports."""
-        if self.trajectory.period:
-            return None
+    def form(self, robot: Robot) -> PathForm | OutputForm:
+        """Return the trajectory and the gains."""
         return PathForm(self)
 
     @property
@@ -399,13 +397,14 @@ class TrajectoryOutputFeedback(OutputSensing, TrajectoryFeedback):
         """Names of the outputs."""
         return self.filter.output_names
 
-    def form(self, robot: Robot) -> OutputForm | None:
+    def form(self, robot: Robot) -> OutputForm:
         """Return the matrices for each sample of the trajectory, and for the robot at rest.
 
-        Return None if the trajectory repeats, which only Python supports.
+        If the trajectory repeats, the matrices repeat, too.
         """
         if self.trajectory.period:
-            return None
+            samples = len(self.filter.A)
+            return OutputForm(self.bind(robot), self.terms, samples, cyclic=True)
         return OutputForm(self.bind(robot), self.terms, len(self.filter.A) + 2)
 
     @cached_property

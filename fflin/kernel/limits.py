@@ -112,8 +112,8 @@ LIMITS = (
         lambda task: task.lagging, "lags of inputs and outputs are computed in Python"
     ),
     Limit(
-        lambda task: task.first(_is_in_elliptic_orbit),
-        "'{}' is in an elliptic orbit, whose field is computed in Python",
+        lambda task: "" if task.simulated else task.first(_is_in_elliptic_orbit),
+        "sweeps of '{}' in its elliptic orbit are computed in Python",
     ),
     Limit(lambda task: task.python_policy, "a {} is computed in Python"),
     Limit(
