@@ -83,6 +83,7 @@ _PUBLIC = {
         "Structure",
         "tuning.goals": "Goal MaxGain RollOff Margin Decay Damping Variance Track",
         "tuning.hinf": "hinf HInfinity",
+        "tuning.plots": "plot_tuned",
     },
     "Policies": {
         "control.policy": "Policy StateForm",

@@ -145,6 +145,7 @@ from fflin.tuning.goals import Variance as Variance
 from fflin.tuning.goals import Track as Track
 from fflin.tuning.hinf import hinf as hinf
 from fflin.tuning.hinf import HInfinity as HInfinity
+from fflin.tuning.plots import plot_tuned as plot_tuned
 
 # Policies
 from fflin.control.policy import Policy as Policy

@@ -54,8 +54,13 @@ def input_keys(model: Any) -> tuple[str, ...]:
     The model is any object with the attributes `input_names` and `input_units`. An input without a
     known group gets the group "thrust", "wheel" or "dipole" of its unit, or the group "input".
     """
+    return grouped(model.input_names, model.input_units)
+
+
+def grouped(names: Sequence[str], units: Sequence[str]) -> tuple[str, ...]:
+    """Return the names GROUP.ENTRY of inputs; see `input_keys`."""
     keys = []
-    for name, unit in zip(model.input_names, model.input_units, strict=True):
+    for name, unit in zip(names, units, strict=True):
         key = name
         if group_of(name) not in _GROUPS:
             key = f"{_OF_UNIT.get(unit, 'input')}.{name}"

@@ -131,6 +131,14 @@ class TomlFile:
         return *table, *[key for key in keys if stands_for_any(key, names)][:1]
 
 
+def toml_value(text: str) -> object:
+    """Return the value that a TOML text stands for; raise `ValueError` if it stands for none."""
+    record = tomllib.loads(f"value = {text}")
+    if len(record) > 1:
+        raise ValueError("more than one value")
+    return record["value"]
+
+
 def flat(table: object) -> object:
     """Flatten nested tables, so that ``{"a": {"b": 1}}`` becomes ``{"a.b": 1}``.
 

@@ -308,6 +308,25 @@ def may_tilt(robot: fflin.Robot, arguments: Namespace) -> bool:
     return arguments.tilt is not False
 
 
+def held_model(
+    robot: fflin.Robot,
+    arguments: Namespace,
+    q: Array,
+    v: Array | None,
+    reference: pin.SE3 | None,
+) -> fflin.LinearModel:
+    """Linearise as `model_about` does, with the inputs that hold the robot at the point.
+
+    With --no-tilt, an error is raised if no inputs hold the robot at the given attitude.
+    """
+    from fflin.linear.holding import held, held_if_possible
+
+    point = model_about(robot, arguments, q, v, reference)
+    if not may_tilt(robot, arguments):
+        return held(point, tilt=False)
+    return held_if_possible(point)
+
+
 def model_to_regulate(
     robot: fflin.Robot,
     arguments: Namespace,
@@ -317,16 +336,9 @@ def model_to_regulate(
 ) -> fflin.LinearModel:
     """Linearise as `model_about` does, with the inputs that hold the robot at the point.
 
-    With --no-tilt, an error is raised if no inputs hold the robot at the given attitude. With
-    --reduce, the conserved momenta are removed from the model.
+    With --reduce, the conserved momenta are removed from the model.
     """
-    from fflin.linear.holding import held, held_if_possible
-
-    point = model_about(robot, arguments, q, v, reference)
-    hold = held_if_possible
-    if not may_tilt(robot, arguments):
-        hold = partial(held, tilt=False)
-    lin = hold(point)
+    lin = held_model(robot, arguments, q, v, reference)
     if arguments.reduce:
         return fflin.momentum_reduction(lin, wheel_speeds=arguments.wheel_speeds)
     return lin
@@ -432,6 +444,82 @@ def designed(
     design = robot_of_design(robot, arguments.allocate)
     lin = model_to_regulate(design, arguments, *point_of(design, arguments))
     return robot, design, lin, gain_of(lin, arguments, allocated=design is not robot)
+
+
+def tuning_of(
+    arguments: Namespace,
+) -> tuple[fflin.Robot, object, fflin.Structure, list[fflin.Goal], dict[str, Any]]:
+    """Return the robot, plant, structure, goals and settings of a search.
+
+    The options --law, --goal and --vary replace the entries of the table [tune] of the robot file.
+    All names are checked.
+    """
+    from fflin.tuning.specification import (
+        check_signals,
+        goals_of,
+        structure_of,
+        table_of,
+    )
+
+    robot = load_robot(arguments)
+    given = dict(robot.tune)
+    for key in ("law", "goal"):
+        if texts := getattr(arguments, key):
+            given[key] = [table_of(text) for text in texts]
+        if not given.get(key):
+            raise InputError(
+                f"no {key} is given; add --{key}, or tables [[tune.{key}]] to the robot file"
+            )
+    if arguments.vary:
+        given["vary"] = once("--vary", arguments.vary)
+    settings: dict[str, Any] = {}
+    for option in ("sample", "delay", "starts", "steps", "seed"):
+        value = getattr(arguments, option)
+        if value is None:
+            value = given.get(option)
+        if value is not None:
+            settings["dt" if option == "sample" else option] = value
+    if settings.get("delay") and settings.get("dt") is None:
+        settings["dt"] = settings["delay"]
+    goals = goals_of(given["goal"])
+    design = robot_of_design(robot, arguments.allocate)
+    lin = held_model(design, arguments, *point_of(design, arguments))
+    structure = structure_of(given["law"], lin)
+    check_signals(structure, goals, lin)
+    plant: object = lin
+    if given.get("vary"):
+        if lin.v.any() or arguments.effort:
+            raise InputError(
+                "velocities and --effort have no effect on uncertain models; remove them, or "
+                "remove the ranges (--vary, [tune.vary])"
+            )
+        plant = fflin.uncertain(design, given["vary"])
+        settings["q"] = lin.q
+    return design, plant, structure, goals, settings
+
+
+def tuned_law(
+    path: Path, name: str | None
+) -> tuple[fflin.LinearController, fflin.Robot]:
+    """Return the law that `fflin tune` saved, and its robot, `name` or the robot of the file."""
+    from fflin.base.errors import FflinError
+    from fflin.base.record import text, texts
+    from fflin.tuning.files import read_law, saved_law
+
+    record = read_law(path)
+    try:
+        robot = fflin.load(name or text(record["robot"]))
+    except FflinError:
+        if name:
+            raise
+        raise InputError(
+            f"the robot '{text(record['robot'])}' of the law is not known; give the robot of the "
+            "design with --robot"
+        ) from None
+    inputs = {entry for _, names in robot.named_inputs for entry in names}
+    if not {*texts(record["output_names"])} <= inputs:
+        robot = robot_of_design(robot, None)
+    return saved_law(record, robot), robot
 
 
 def weights_of(arguments: Namespace) -> dict[str, object]:
@@ -613,8 +701,7 @@ def with_errors(
         sizes[name] = np.zeros(len(policy.sensors))
         for index, value in by_name("measured signal", by_key, policy.sensors).items():
             sizes[name][index] = value
-    seed = np.zeros(1)
-    return with_sensor_errors(policy.fresh(), sizes["bias"], sizes["noise"], seed)
+    return with_sensor_errors(policy.fresh(), sizes["bias"], sizes["noise"], 0.0)
 
 
 def budget_of(
@@ -718,6 +805,9 @@ def about_point(
         refuse(
             arguments, of_gain, "--controller replaces the regulator and its options"
         )
+        from fflin.tuning.files import in_time_of
+
+        lin = in_time_of(arguments.controller, lin)
         sign = -1.0 if arguments.negative_feedback else 1.0
         feedback = fflin.LinearController(arguments.controller, lin, sign=sign)
     else:

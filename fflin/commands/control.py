@@ -35,6 +35,8 @@ from fflin.commands.builders import (
     refuse,
     robot_of_design,
     state_of,
+    tuned_law,
+    tuning_of,
     weights_of,
     with_errors,
 )
@@ -88,6 +90,23 @@ def lqr(arguments: Namespace) -> Report:
     return Report(gain.robot, result, text, files)
 
 
+def tune(arguments: Namespace) -> Report:
+    """Tune a PD, PID or other law to goals; show the goals, the parameters and the search.
+
+    example: fflin tune satellite.toml --law 'pd shared=true' --goal 'margin disk=0.75' -o law.npz
+    """
+    robot, plant, structure, goals, settings = tuning_of(arguments)
+    tuned = fflin.tune(plant, structure, goals, **settings)
+    files: dict[Path | None, Callable[[Path], object]] = {
+        arguments.output_file: tuned.save,
+        arguments.plot: lambda path: fflin.plot_tuned(tuned, path),
+    }
+    code = DONE
+    if not all(goal.met for goal in tuned.goals if goal.hard):
+        code = FELL_SHORT
+    return Report(robot.name, tuned.record(), str(tuned), files, code)
+
+
 def tvlqr(arguments: Namespace) -> Report:
     """Design a time-varying linear quadratic regulator along a trajectory or over an orbit.
 
@@ -113,7 +132,7 @@ def tvlqr(arguments: Namespace) -> Report:
 
 
 def export(arguments: Namespace) -> Report:
-    """Write C99 code of a gain, compensator or gain schedule, with a test program.
+    """Write C99 code of a gain, compensator, gain schedule or tuned law, with a test program.
 
     example: fflin export gain.npz --robot servicer_7dof --limits urdf -o flight
     """
@@ -123,13 +142,17 @@ def export(arguments: Namespace) -> Report:
         kind.__name__: kind
         for kind in (fflin.Gain, fflin.GainSchedule, fflin.Compensator)
     }
-    with reading(arguments.file, "Gain, GainSchedule or Compensator"):
+    with reading(arguments.file, "Gain, GainSchedule, Compensator or tuned law"):
         kind_name = text(read_record(arguments.file)[0]["kind"])
-        if kind_name not in kinds:
+        if kind_name not in (*kinds, "Tuned"):
             raise ValueError(f"the file contains: {kind_name}")
-    law = kinds[kind_name].load(arguments.file)
+    law: Any
     robot = None
-    if arguments.robot:
+    if kind_name == "Tuned":
+        law, robot = tuned_law(arguments.file, arguments.robot)
+    else:
+        law = kinds[kind_name].load(arguments.file)
+    if arguments.robot and robot is None:
         robot = robot_of_design(fflin.load(arguments.robot), None, law)
     limits = None if arguments.limits == "none" else arguments.limits
     name, real = arguments.name, arguments.real
@@ -144,8 +167,12 @@ def export(arguments: Namespace) -> Report:
     message = f"C99 code of {law!r}, with numbers of type {real}\nto test it:\n  {test}"
     result = {"name": name, "real": real, "folder": str(folder)}
     endings = (".h", ".c", "_test.c", ".json")
+    name_of_robot = robot.name if robot else law.robot
     return Report(
-        law.robot, result, message, {folder / f"{name}{end}": None for end in endings}
+        name_of_robot,
+        result,
+        message,
+        {folder / f"{name}{end}": None for end in endings},
     )
 
 
@@ -194,6 +221,8 @@ def simulate(arguments: Namespace) -> Report:
     measuring = with_errors(policy, arguments)
     if measuring is not policy:
         settings.pop("linear", None)  # the linear model has no sensor errors
+    if arguments.no_noise:
+        settings["noise"] = 0.0
     motion = fflin.simulate(
         robot, measuring, every=arguments.every, engine=arguments.engine, **settings
     )
@@ -289,6 +318,8 @@ def montecarlo(arguments: Namespace) -> Report:
     settings.pop("linear", None)  # the runs are not compared with a linear model
     for name in ("runs", "seed", "until", "width", "confidence", "workers", "threads"):
         settings[name] = getattr(arguments, name)
+    if arguments.no_noise:
+        settings["noise"] = 0.0
     settings["histories"] = _ROWS if arguments.plot else 0
     settings["out"] = None if is_table else path
     with going_on(path, "runs") as progress:

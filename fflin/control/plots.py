@@ -455,17 +455,8 @@ def _plot_closed(
         (sizes, nichols), (phases, sensitivity) = figure.subplots(2, 2)
         _bode(sizes, phases, w, response)
         colors = cycle(response.shape[1])
-        for panel in (nichols, sensitivity):
-            panel.set_prop_cycle(color=colors)
-        decibels = 20.0 * np.log10(np.abs(response))
-        angles = np.column_stack([_phase(values) for values in response.T])
-        nichols.plot(angles, decibels, lw=1.0)
-        turns = np.arange(math.floor(angles.min() / 360.0), 1)
-        critical = 360.0 * turns + 180.0
-        critical = critical[critical < max(angles.max(), 0.0)]
-        nichols.plot(critical, np.zeros(len(critical)), "+", color=_LINE, ms=10)
-        nichols.set(title="Nichols plot", xlabel="phase [deg]", ylabel="|L| [dB]")
-        nichols.set_ylim(-_DECIBELS, _DECIBELS)
+        sensitivity.set_prop_cycle(color=colors)
+        draw_nichols(nichols, response)
         size = np.abs(1.0 / (1.0 + response))
         sensitivity.semilogx(w, 20.0 * np.log10(size), lw=1.0)
         sensitivity.axhline(0.0, color=_LINE, lw=0.8)
@@ -500,6 +491,20 @@ def _plot_closed(
             ha="left",
         )
     return figure
+
+
+def draw_nichols(panel: Axes, response: Values) -> None:
+    """Draw the Nichols plot of loop gains (k, n)."""
+    panel.set_prop_cycle(color=cycle(response.shape[1]))
+    decibels = 20.0 * np.log10(np.abs(response))
+    angles = np.column_stack([_phase(values) for values in response.T])
+    panel.plot(angles, decibels, lw=1.0)
+    turns = np.arange(math.floor(angles.min() / 360.0), 1)
+    critical = 360.0 * turns + 180.0
+    critical = critical[critical < max(angles.max(), 0.0)]
+    panel.plot(critical, np.zeros(len(critical)), "+", color=_LINE, ms=10)
+    panel.set(title="Nichols plot", xlabel="phase [deg]", ylabel="|L| [dB]")
+    panel.set_ylim(-_DECIBELS, _DECIBELS)
 
 
 def _plot_gain(gain: Gain, path: str | Path | None, axes: Axes | None) -> Figure:

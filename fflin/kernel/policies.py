@@ -10,6 +10,7 @@ import numpy as np
 from fflin.kernel import vectors as vec
 from fflin.kernel.allocation import ALLOCATION
 from fflin.kernel.bodies import move_bodies
+from fflin.kernel.extension import lag_sensors, lagged
 from fflin.kernel.forward import COMMON_POINT, joint_position
 from fflin.kernel.orbit import flux_at, flux_rate_at, spin_at, write_now
 from fflin.kernel.tree import (
@@ -303,7 +304,7 @@ def read_state(robot, law, point, row):
     vec.copy(nu, 6, x, 12 + n, n)
 
 
-def _row(law, count):
+def row_at(law, count):
     """Return the row of the arrays with one row per sample at the sample `count`."""
     rows = len(law.origin) // 7
     if law.cyclic:
@@ -320,12 +321,39 @@ def _times(matrix, row, x):
     return total
 
 
-def command(work, robot, orbit, law, point, t, count, stage):
+def measure(work, robot, law, point, row):
+    """Write the state and the rates of the gyroscopes into `law.x`.
+
+    `row` is the argument of `read_state`. The motion of the bodies must be in `work`.
+    """
+    read_state(robot, law, point, row)
+    gyros = law.gyros
+    offsets = robot.tree.offsets
+    for index in range(len(gyros)):
+        rate = vec.get3(work, offsets.motion + gyros[index] * MOTION)
+        axes = vec.get_columns(work, offsets.places + gyros[index] * PLACE)
+        rate = vec.across(
+            vec.get_columns(law.gyro_axes, 9 * index), vec.across(axes, rate)
+        )
+        vec.put3(law.x, 2 * len(point.nu) + 3 * index, rate)
+
+
+def observe(work, robot, law, lag, speed, point, count, stage):
+    """Advance the sensors with a lag by a stage; see `extension.lag_sensors`.
+
+    `count` and `stage` are the arguments of `command`. The motion of the bodies must be in `work`.
+    """
+    if len(lag.values) > 0:
+        measure(work, robot, law, point, row_at(law, count))
+        lag_sensors(lag, speed, law.x, law.measured, stage)
+
+
+def command(work, robot, orbit, law, extension, point, t, count, stage):
     """Write the command of a policy into `law.u`.
 
     t [s] is the time of the run, and `stage` the index of the stage in the step. `count` is the
     index of the sample, or the index of the step if commands are continuous. `orbit` is None
-    without an orbit.
+    without an orbit, and `extension` is an `Extension` with lags of sensors, or None.
     """
     if law.kind == TRACK:
         track(robot, law.path, point, law.u, t)
@@ -341,33 +369,23 @@ def command(work, robot, orbit, law, point, t, count, stage):
             gain = vec.get3(law.filter.D, 3 * index)
             store(law.u, index, vec.dot(gain, measured))
         return
-    row = _row(law, count)
-    read_state(robot, law, point, row)
+    row = row_at(law, count)
     # Compute the outputs y, with the noise of the sample.
     outputs = len(law.measured)
-    gyros = law.gyros
     tree = robot.tree
-    offsets = tree.offsets
-    if len(gyros) > 0:
+    if len(law.gyros) > 0:
         omega_b = vec.get3(point.nu, 0)
         if orbit is not None:
             write_now(orbit, t)
             omega_b = vec.plus(omega_b, spin_at(orbit, point.q))
         move_bodies(work, tree, point.nu, omega_b)
-    for index in range(len(gyros)):
-        rate = vec.get3(work, offsets.motion + gyros[index] * MOTION)
-        axes = vec.get_columns(work, offsets.places + gyros[index] * PLACE)
-        rate = vec.across(
-            vec.get_columns(law.gyro_axes, 9 * index), vec.across(axes, rate)
-        )
-        vec.put3(law.x, 2 * len(point.nu) + 3 * index, rate)
+    measure(work, robot, law, point, row)
     added = count % max(len(law.added) // max(outputs, 1), 1) * outputs
     for index in range(outputs):
-        store(
-            law.y,
-            index,
-            load(law.x, law.measured[index]) + load(law.added, added + index),
-        )
+        value = load(law.x, law.measured[index])
+        if extension is not None:
+            value = lagged(extension.sensors, index, value)
+        store(law.y, index, value + load(law.added, added + index))
     if len(law.grid.joint) > 0:
         _feed_back_between(robot, law, point)
     else:
@@ -466,7 +484,7 @@ def correct(law, count, stage):
     """
     controller = law.filter
     size = len(controller.z)
-    row = _row(law, count)
+    row = row_at(law, count)
     along = len(controller.rates) > size
     for index in range(size):
         change = _times(controller.E, row * size + index, law.u)

@@ -26,6 +26,7 @@ from fflin.base.validation import (
     looks_like_degrees,
     number,
     numbers,
+    whole,
 )
 from fflin.robot.constraints import checked_constraints, checked_independent
 from fflin.robot.disturbance import checked_disturbance
@@ -325,6 +326,34 @@ def _weights(value: object, robot: RobotData) -> dict[str, object]:
     return checked
 
 
+# Keys of the field `tune`: laws and goals, ranges, and numbers.
+TUNE = ("law", "goal", "vary", "sample", "delay", "starts", "steps", "seed")
+
+
+def _tune(value: object, robot: RobotData) -> dict[str, object]:
+    """Return the checked settings of `fflin tune`, which checks the laws and goals itself."""
+    given = _parts("tune", value, TUNE)
+    for key in ("law", "goal"):
+        tables = given.get(key, [])
+        if not isinstance(tables, list | tuple) or not all(
+            isinstance(table, Mapping) for table in tables
+        ):
+            raise InputError(
+                f"{key} of tune is {tables!r}, expected tables [[tune.{key}]]"
+            )
+    if not isinstance(given.get("vary", {}), Mapping):
+        raise InputError(
+            f"vary of tune is {given['vary']!r}, expected {{parameter: range}}"
+        )
+    for key in ("sample", "delay"):
+        if key in given:
+            given[key] = number(f"{key} of tune", given[key])
+    for key in ("starts", "steps", "seed"):
+        if key in given:
+            given[key] = whole(f"{key} of tune", given[key], 0)
+    return given
+
+
 def _weighted_inputs(robot: RobotData) -> tuple[str, ...]:
     """Return the names and groups of the inputs that may have weights.
 
@@ -391,6 +420,7 @@ FIELDS: dict[str, Callable[[object, RobotData], Any] | None] = {
     "disturbance": lambda value, _: checked_disturbance(value),
     "limits": _given_limits,
     "weights": _weights,
+    "tune": _tune,
     **{name: partial(_state, name) for name in ("point", "target", "start")},
 }
 

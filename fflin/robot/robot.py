@@ -90,6 +90,8 @@ class Robot(RobotData):
     weights : mapping
         Default weights of `lqr`, which take precedence over the weights of the rule "urdf" or
         "identity"; see `replace`.
+    tune : mapping
+        Laws, goals and settings of the command `fflin tune`, see `replace`.
     point : mapping
         Default operating point of commands such as `fflin linearize`, see `replace`.
     target : mapping
@@ -199,6 +201,11 @@ class Robot(RobotData):
             ``bryson`` contains largest values: {state, input, group or pattern: value}.
             ``integral`` contains the signals that `lqr` also integrates, as its argument
             ``integral_action``: names of states or outputs, or {name: weight}.
+        tune : mapping
+            Laws, goals and settings of the command `fflin tune`, as in the table ``[tune]`` of a
+            robot file: ``law`` and ``goal`` are sequences of mappings, ``vary`` contains ranges as
+            for `uncertain`, and ``sample``, ``delay``, ``starts``, ``steps`` and ``seed`` are
+            numbers. Functions ignore `tune`.
         point : mapping
             Default operating point of commands such as `fflin linearize`, `fflin check` and
             `fflin lqr`. Functions ignore `point`, because their arguments define the operating

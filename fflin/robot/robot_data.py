@@ -87,6 +87,7 @@ class RobotData(Coordinates):
     passive: tuple[str, ...] = ()
     wheel_joints: tuple[str, ...] = ()
     weights: Mapping[str, Any] = field(default_factory=dict)
+    tune: Mapping[str, Any] = field(default_factory=dict)
     point: Mapping[str, Any] = field(default_factory=dict)
     target: Mapping[str, Any] = field(default_factory=dict)
     start: Mapping[str, Any] = field(default_factory=dict)

@@ -31,7 +31,8 @@ class Ends:
     """Inputs and outputs of a goal as indices of signals, with their sizes.
 
     `sources` and `sinks` contain pairs of a kind and an index. The kinds of sources are "input" and
-    "sensor"; the kinds of sinks are "command", "output" (also for states) and "error".
+    "sensor"; the kinds of sinks are "command", "output" (also for states) and "error". `watched`
+    contains frequencies [rad/s] of peaks that the grid of a search missed.
     """
 
     sources: tuple[tuple[str, int], ...]
@@ -42,6 +43,7 @@ class Ends:
         default_factory=lambda: Weight(np.array([1.0]), np.array([1.0]))
     )
     band: tuple[float, float] = (0.0, math.inf)
+    watched: list[float] = field(default_factory=list)
 
 
 def ends_of(
@@ -114,10 +116,18 @@ def _sized(given: Sized) -> dict[str, float]:
     )
 
 
+def _expanded(sizes: dict[str, float], signals: Signals) -> dict[str, float]:
+    """Replace groups of inputs such as wheel by the names of the inputs."""
+    members = {
+        name: size for key, size in sizes.items() for name in signals.expanded(key)
+    }
+    return members | {key: size for key, size in sizes.items() if key in members}
+
+
 def _sources(given: Sized, signals: Signals) -> dict[tuple[str, int], float]:
     """Return {(kind, index): size} of the inputs of a goal."""
     names = (*signals.inputs, *signals.outputs)
-    chosen = by_name("signal", _sized(given), names)
+    chosen = by_name("signal", _expanded(_sized(given), signals), names)
     nu = len(signals.inputs)
     ends = {}
     for index, size in sorted(chosen.items()):
@@ -142,6 +152,7 @@ def _sinks(
     extra = [name for name in states if name not in signals.outputs]
     names = (*signals.inputs, *signals.outputs, *extra)
     ends = {}
+    others = _expanded(others, signals)
     for index, size in sorted(by_name("signal", others, names).items()):
         if index < nu:
             ends["command", index] = size

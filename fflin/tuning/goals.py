@@ -67,9 +67,9 @@ def _band(band: object) -> tuple[float, float]:
 
 def shown(signals: Sized) -> str:
     """Return signals as a short text."""
-    if isinstance(signals, str):
-        return signals
-    return ", ".join(map(str, signals))
+    if isinstance(signals, Sequence | Mapping) and not isinstance(signals, str):
+        return ", ".join(map(str, signals))
+    return str(signals)
 
 
 @dataclass(frozen=True, eq=False)

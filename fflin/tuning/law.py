@@ -143,6 +143,13 @@ def total(first: Law, second: Law) -> Law:
     )
 
 
+def distributed(matrix: Array, law: Law) -> Law:
+    """Return a law whose commands pass a fixed matrix."""
+    return law._replace(
+        C=matrix @ law.C, D=matrix @ law.D, dC=matrix @ law.dC, dD=matrix @ law.dD
+    )
+
+
 def embedded(
     law: Law,
     measured: Sequence[int],

@@ -12,6 +12,7 @@ from functools import cached_property
 
 import numpy as np
 
+from fflin.base.names import group_of, grouped
 from fflin.base.validation import Array
 from fflin.linear.model import LinearModel
 
@@ -30,6 +31,22 @@ class Signals:
     A: Array
     B: Array
     C: Array
+
+    @cached_property
+    def input_keys(self) -> tuple[str, ...]:
+        """Names GROUP.ENTRY of the inputs, such as wheel.wheel_1."""
+        return grouped(self.inputs, self.input_units)
+
+    def expanded(self, key: str) -> tuple[str, ...]:
+        """Return the names for which a key stands: those of a group such as wheel, or itself."""
+        if key in self.inputs or any(group_of(name) == key for name in self.inputs):
+            return (key,)
+        names = [
+            name
+            for name, full in zip(self.inputs, self.input_keys, strict=True)
+            if key in (full, group_of(full))
+        ]
+        return tuple(names) or (key,)
 
     @cached_property
     def _markov(self) -> tuple[Array, ...]:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Hashable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -70,7 +70,8 @@ class Minimum:
 
     `stationarity` is the norm of the convex combination of gradients that the last quadratic
     program found, plus the distance of these pieces from the largest. `weights` are the
-    coefficients of the functions in this combination.
+    coefficients of the functions in this combination. `history` contains the largest objective and
+    the largest constraint at each point of `path`.
     """
 
     x: Array
@@ -80,6 +81,15 @@ class Minimum:
     steps: int
     history: list[tuple[float, float]]
     weights: dict[Hashable, float] | None
+    path: list[Array]
+
+    def after(self, earlier: Minimum) -> Minimum:
+        """Return this result with the steps of an earlier search before its own."""
+        return replace(
+            self,
+            history=[*earlier.history, *self.history],
+            path=[*earlier.path, *self.path],
+        )
 
 
 def levels(terms: list[Term]) -> tuple[float, float]:
@@ -125,9 +135,11 @@ def minimise(
     proximity = 0.0
     trials = _Trials()
     history: list[tuple[float, float]] = []
+    path: list[Array] = []
     while len(history) < steps:
         objective, constraint = levels(terms)
         history.append((objective, constraint))
+        path.append(x)
         if is_done is not None and is_done(terms):
             break
         if is_done is None and _stagnates(history):
@@ -146,14 +158,19 @@ def minimise(
         x, terms = trials.x, trials.terms
     objective, constraint = levels(terms)
     violation = max(constraint, 0.0)
+    count = len(history)
+    if not path or path[-1] is not x:
+        history.append((objective, constraint))
+        path.append(x)
     return Minimum(
         x,
         objective,
         violation,
         trials.stationarity,
-        len(history),
+        count,
         history,
         trials.weights,
+        path,
     )
 
 

@@ -50,7 +50,8 @@ def searched(
         values.append(value)
         done(number + 1)
     if best is not None and best.steps == _SCREENING and steps > _SCREENING:
-        best = minimise(problem.evaluate, best.x, problem.bounds, steps=steps)
+        more = minimise(problem.evaluate, best.x, problem.bounds, steps=steps)
+        best = more.after(best)
     return best, tuple(values)
 
 

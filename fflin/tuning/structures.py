@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -24,6 +25,7 @@ from fflin.base.validation import (
 from fflin.tuning.law import (
     Law,
     Matrices,
+    distributed,
     embedded,
     law_of,
     repeated,
@@ -39,6 +41,9 @@ Names: TypeAlias = str | Sequence[str]
 
 # Without a given bandwidth [rad/s], the first search starts from this one.
 _BANDWIDTH = 0.3
+
+# Units such as rad/s or 1/s^2.
+_PER_SECONDS = re.compile(r"([^/]+)/s(?:\^(\d+))?")
 
 # Relative step of the differences for laws that users define.
 _STEP = 6e-6
@@ -127,7 +132,9 @@ class _Sum(Structure):
                 "structure that has signals, such as PD"
             )
         first, second = parts
-        ny, nu = len(signals.outputs), len(signals.inputs)
+        every = _united(first.measured, second.measured)
+        commanded_by = _united(first.commanded, second.commanded)
+        ny, nu = len(every), len(commanded_by)
         split = len(first.parameters)
 
         def law(values: Array, width: int) -> Law:
@@ -136,13 +143,23 @@ class _Sum(Structure):
                 (first, values[:split]),
                 (second, values[split:]),
             ):
-                measured, commanded = part.measured or (), part.commanded or ()
+                measured = [every.index(index) for index in part.measured or ()]
+                commanded = [
+                    commanded_by.index(index) for index in part.commanded or ()
+                ]
                 part_law = part.law(part_values, len(measured))
                 laws.append(embedded(part_law, measured, commanded, ny, nu))
             return total(*laws)
 
-        every = tuple(range(ny)), tuple(range(nu))
-        return Element((*first.parameters, *second.parameters), *every, law)
+        parameters = (*first.parameters, *second.parameters)
+        return Element(parameters, every, commanded_by, law)
+
+
+def _united(
+    first: tuple[int, ...] | None, second: tuple[int, ...] | None
+) -> tuple[int, ...]:
+    """Return the indices of two sets of signals, in order."""
+    return tuple(sorted({*(first or ()), *(second or ())}))
 
     def simpler(self) -> Structure | None:
         """Return a structure with fewer states, whose parameters have the same names."""
@@ -178,14 +195,28 @@ class _Series(Structure):
             measured, commanded = right.measured, right.commanded
         split = len(left.parameters)
 
+        before, after = len(measured or ()), len(commanded or ())
+        # A filter of all channels gives the same law before and after the structure. It is placed
+        # where there are fewer channels, and so has fewer states.
+        is_swapped = measured is not None and (
+            (left.measured is None and before < after)
+            or (right.measured is None and after < before)
+        )
+
         def law(values: Array, width: int) -> Law:
-            before = after = width
-            if measured is not None and commanded is not None:
-                before, after = len(measured), len(commanded)
-            return series(
-                left.law(values[:split], after if left.measured is None else before),
-                right.law(values[split:], before),
+            narrow = width if measured is None else min(before, after)
+            first = left.law(
+                values[:split], narrow if left.measured is None else before
             )
+            second = right.law(
+                values[split:], narrow if right.measured is None else before
+            )
+            if not is_swapped:
+                return series(first, second)
+            swapped = series(second, first)
+            order = np.roll(np.arange(len(values)), split)
+            derivatives = [stack[order] for stack in swapped[4:]]
+            return Law(*swapped[:4], *derivatives)
 
         part = right if left.measured is None else left
         of_gain = part.of_gain
@@ -218,6 +249,15 @@ def _require_name(name: object) -> None:
         printable("name", name)
 
 
+def input_indices(keys: object, signals: Signals) -> tuple[int, ...]:
+    """Return the indices of inputs in the order of the keys; a key may be a group such as wheel."""
+    if isinstance(keys, str):
+        keys = (keys,)
+    if isinstance(keys, Sequence) and all(isinstance(key, str) for key in keys):
+        keys = [name for key in keys for name in signals.expanded(key)]
+    return indices("input", keys, signals.inputs)
+
+
 def indices(kind: str, keys: object, names: Sequence[str]) -> tuple[int, ...]:
     """Return the indices of signals in the order of the keys."""
     if isinstance(keys, str):
@@ -234,13 +274,36 @@ def quotient(above: str, below: str) -> str:
     """Return the unit of the ratio of two quantities."""
     if below in ("1", ""):
         return above or "1"
+    if above == below:
+        return "1"
+    if above.startswith(f"{below}/"):
+        return f"1{above.removeprefix(below)}"
     divisor = f"({below})" if " " in below or "/" in below else below
     return f"{above or '1'}/{divisor}"
 
 
+def power_of_seconds(order: int) -> str:
+    """Return the unit of a power of time."""
+    return "s" if order == 1 else f"s^{order}"
+
+
 def times_seconds(unit: str) -> str:
     """Return the unit of a quantity multiplied by a time."""
-    return "s" if unit == "1" else f"{unit} s"
+    rate = _PER_SECONDS.fullmatch(unit)
+    if not rate:
+        return "s" if unit == "1" else f"{unit} s"
+    order = int(rate[2] or 1) - 1
+    if not order:
+        return rate[1]
+    return f"{rate[1]}/{power_of_seconds(order)}"
+
+
+def per_second(unit: str) -> str:
+    """Return the unit of a quantity divided by a time."""
+    rate = _PER_SECONDS.fullmatch(unit)
+    if not rate:
+        return f"{unit}/s"
+    return f"{rate[1]}/{power_of_seconds(int(rate[2] or 1) + 1)}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,7 +317,8 @@ class PID(Structure):
     measured : str or sequence of str
         Names, groups or patterns of the measured outputs, such as "q_b".
     inputs : str or sequence of str
-        Inputs of the robot, one for each measured output, in the same order.
+        Inputs of the robot, one for each measured output, in the same order; or with `distribution`
+        any number of inputs, such as four wheels.
     rates : str or sequence of str, optional
         Measured rates of the outputs, such as a gyroscope. The derivative term is then ``k_d``
         times these rates, without a lag.
@@ -269,6 +333,11 @@ class PID(Structure):
         Whether the gains are full matrices. By default, each axis has its own loop.
     shared : bool
         Whether all axes have the same gains.
+    distribution : array_like (nu, k), optional
+        Fixed matrix from the commands of the k axes to the inputs. By default, if there are more
+        inputs than axes, the axes command the accelerations of the outputs, and the pseudo-inverse
+        of the response of the plant distributes them. For an attitude q_b and wheels, the units of
+        kp and kd are then 1/s^2 and 1/s.
     name : str, optional
         First part of the names of the parameters, such as "roll" for "roll.kp".
 
@@ -292,6 +361,7 @@ class PID(Structure):
     bandwidth: float = _BANDWIDTH
     coupled: bool = False
     shared: bool = False
+    distribution: object = None
     name: str = ""
 
     _INTEGRAL = True
@@ -305,21 +375,59 @@ class PID(Structure):
     def element(self, signals: Signals) -> Element:
         """Return the part of a law for the signals of a plant."""
         measured = indices("output", self.measured, signals.outputs)
-        inputs = indices("input", self.inputs, signals.inputs)
+        inputs = input_indices(self.inputs, signals)
         rates: tuple[int, ...] = ()
         if self.rates is not None:
             rates = indices("output", self.rates, signals.outputs)
         k = len(measured)
-        if len(inputs) != k or (rates and len(rates) != k):
+        matrix = self._distribution(signals, measured, inputs)
+        if (matrix is None and len(inputs) != k) or (rates and len(rates) != k):
             raise InputError(
                 f"{type(self).__name__} has {k} measured outputs, {len(inputs)} inputs and "
-                f"{len(rates)} rates, expected the same number of each"
+                f"{len(rates)} rates, expected the same number of each, or more inputs than "
+                "measured outputs"
             )
+        axes, axis_signals = inputs, signals
+        if matrix is not None:
+            axis_signals = self._axes(signals, measured, inputs, matrix)
+            axes = tuple(range(k))
         if rates and self.lag is not None:
             raise InputError(
                 "lag acts on the derivative of outputs, but the rates are measured; leave out lag, "
                 "and multiply the structure by LowPass"
             )
+        parameters, places = self._gain_parameters(
+            axis_signals, signals, axes, measured, rates
+        )
+        with_lag = not rates
+        if with_lag:
+            start = 0.1 / self.bandwidth
+            least = 0.1 * start
+            lag = Parameter(f"{self._prefix}lag", "s", start, least, math.inf, start)
+            parameters.append(resolved(lag, self.lag))
+
+        def law(values: Array, width: int) -> Law:
+            if with_lag:
+                lag = float(values[-1])
+                of_axes = _pid(values[:-1], places, k, self._INTEGRAL, lag)
+            else:
+                of_axes = _pid_of_rates(values, places, k, self._INTEGRAL)
+            if matrix is None:
+                return of_axes
+            return distributed(matrix, of_axes)
+
+        return Element(tuple(parameters), (*measured, *rates), inputs, law)
+
+    def _gain_parameters(
+        self,
+        axis_signals: Signals,
+        signals: Signals,
+        axes: Sequence[int],
+        measured: Sequence[int],
+        rates: Sequence[int],
+    ) -> tuple[list[Parameter], list[tuple[str, list[tuple[int, int]]]]]:
+        """Return the gains, and for each of them its term and its entries in the gain matrix."""
+        k = len(measured)
         pairs = [(axis, axis) for axis in range(k)]
         if self.coupled:
             pairs = [(row, column) for row in range(k) for column in range(k)]
@@ -333,32 +441,68 @@ class PID(Structure):
                 groups = [pairs]
             for group in groups:
                 row, column = group[0]
-                command, signal = inputs[row], measured[column]
+                command, signal = axes[row], measured[column]
                 if term == "kd" and rates:
                     signal = rates[column]
                 where = ""
                 if not self.shared and k > 1:
-                    where = f".{signals.inputs[command]}"
+                    where = f".{axis_signals.inputs[command]}"
                     if self.coupled:
                         where += f".{signals.outputs[signal]}"
-                default = self._default(signals, term, command, signal, row == column)
+                default = self._default(
+                    axis_signals, term, command, signal, row == column
+                )
                 label = f"{self._prefix}{term}{where}"
                 default = _named(default, label)
                 parameters.append(resolved(default, given))
                 places.append((term, group))
-        with_lag = not rates
-        if with_lag:
-            start = 0.1 / self.bandwidth
-            least = 0.1 * start
-            lag = Parameter(f"{self._prefix}lag", "s", start, least, math.inf, start)
-            parameters.append(resolved(lag, self.lag))
+        return parameters, places
 
-        def law(values: Array, width: int) -> Law:
-            if with_lag:
-                return _pid(values[:-1], places, k, self._INTEGRAL, float(values[-1]))
-            return _pid_of_rates(values, places, k, self._INTEGRAL)
+    def _distribution(
+        self, signals: Signals, measured: Sequence[int], inputs: Sequence[int]
+    ) -> Array | None:
+        """Return the matrix from the axes to the inputs, or None if each axis has one input."""
+        shape = len(inputs), len(measured)
+        if self.distribution is not None:
+            matrix = as_double("distribution", self.distribution)
+            if matrix.shape != shape:
+                raise InputError(
+                    f"distribution has shape {matrix.shape}, expected {shape}: inputs and measured "
+                    "outputs"
+                )
+            return matrix
+        if shape[0] <= shape[1]:
+            return None
+        response = np.zeros(shape[::-1])
+        for row, output in enumerate(measured):
+            for column, command in enumerate(inputs):
+                response[row, column] = signals.response(output, command)[0]
+        if np.linalg.matrix_rank(response) < len(measured):
+            raise InputError(
+                f"the inputs {self.inputs!r} cannot accelerate the outputs {self.measured!r} "
+                "independently of each other; give distribution=, or other inputs"
+            )
+        return np.asarray(np.linalg.pinv(response))
 
-        return Element(tuple(parameters), (*measured, *rates), inputs, law)
+    def _axes(
+        self,
+        signals: Signals,
+        measured: Sequence[int],
+        inputs: Sequence[int],
+        matrix: Array,
+    ) -> Signals:
+        """Return signals whose inputs are the commands of the axes."""
+        units = [signals.input_units[inputs[0]] for _ in measured]
+        if self.distribution is None:
+            units = []
+            for index in measured:
+                responses = [signals.response(index, command) for command in inputs]
+                order = min(order for gain, order in responses if gain)
+                unit = signals.output_units[index]
+                units.append(quotient(unit, power_of_seconds(order)))
+        names = tuple(signals.outputs[index] for index in measured)
+        B = signals.B[:, list(inputs)] @ matrix
+        return replace(signals, inputs=names, input_units=tuple(units), B=B)
 
     @property
     def _prefix(self) -> str:
@@ -374,7 +518,7 @@ class PID(Structure):
         unit = quotient(signals.input_units[command], signals.output_units[signal])
         if term == "ki":
             size *= 0.1 * w
-            unit = f"{unit}/s"
+            unit = per_second(unit)
         if term == "kd" and self.rates is None:
             size *= 1.4 / w
             unit = times_seconds(unit)
@@ -739,7 +883,7 @@ class StaticGain(Structure):
     def element(self, signals: Signals) -> Element:
         """Return the part of a law for the signals of a plant."""
         measured = indices("output", self.measured, signals.outputs)
-        inputs = indices("input", self.inputs, signals.inputs)
+        inputs = input_indices(self.inputs, signals)
         shape = len(inputs), len(measured)
         pattern = (
             np.ones(shape) if self.pattern is None else self._array("pattern", shape)
@@ -843,7 +987,7 @@ class StateSpaceLaw(Structure):
     def element(self, signals: Signals) -> Element:
         """Return the part of a law for the signals of a plant."""
         measured = indices("output", self.measured, signals.outputs)
-        inputs = indices("input", self.inputs, signals.inputs)
+        inputs = input_indices(self.inputs, signals)
         n, ny, nu = self.order, len(measured), len(inputs)
         rng = np.random.default_rng(0)
         prefix = self.name or "law"
@@ -963,7 +1107,7 @@ class CustomLaw(Structure):
     def element(self, signals: Signals) -> Element:
         """Return the part of a law for the signals of a plant."""
         measured = indices("output", self.measured, signals.outputs)
-        inputs = indices("input", self.inputs, signals.inputs)
+        inputs = input_indices(self.inputs, signals)
         parameters = []
         for key, given in zip(self._keys, self.parameters.values(), strict=True):
             default = Parameter(key, "", math.nan, -math.inf, math.inf, 1.0)

@@ -15,7 +15,9 @@ from fflin.base.validation import Array, ArrayLike, count, instance, whole
 from fflin.linear.model import Delay
 from fflin.tuning.channels import ends_of
 from fflin.tuning.criteria import Piece
+from fflin.tuning.curves import GoalLoops
 from fflin.tuning.goals import Goal
+from fflin.tuning.law import Law
 from fflin.tuning.plant import Plant, Signals, plant_of, signals_of
 from fflin.tuning.points import Point, Points, points_of
 from fflin.tuning.problem import Case, Measure, Problem
@@ -23,7 +25,7 @@ from fflin.tuning.search import Minimum, Term, minimise
 from fflin.tuning.starts import searched, stabilised
 from fflin.tuning.structures import Structure, Structured
 from fflin.tuning.tuned import GoalValue, Tuned, is_active
-from fflin.tuning.verification import second_value
+from fflin.tuning.verification import peak_above, second_value
 
 # Steps of the search for the least factor by which all goals would hold.
 _RELAXING = 150
@@ -218,15 +220,14 @@ class _Task:
         self, problem: Problem, minimum: Minimum, steps: int, bar: Progress
     ) -> tuple[Problem, Minimum]:
         """Add the worst models until none is worse, and return the last problem and result."""
-        if not self.points.candidates:
-            return problem, minimum
-        few = self.points.candidates[: self.points.corners + _FEW]
+        candidates = self.points.candidates
+        few = candidates[: self.points.corners + _FEW]
         for number in range(_ROUNDS):
             bar(number + 1, _ROUNDS, "worst models")
-            added = self._worse(problem, minimum.x, few)
+            added, values = self._worse(problem, minimum.x, few)
             if not added:
-                added = self._worse(problem, minimum.x, self.points.candidates)
-            if not added:
+                added, values = self._worse(problem, minimum.x, candidates)
+            if not added and not self._watch_missed(problem, minimum.x, values):
                 break
             self.chosen += added
             problem = self.problem()
@@ -236,31 +237,67 @@ class _Task:
                     "no law of this structure was found that stabilises all models; give narrower "
                     "ranges, or another structure"
                 )
-            minimum = minimise(problem.evaluate, start, problem.bounds, steps=steps)
+            more = minimise(problem.evaluate, start, problem.bounds, steps=steps)
+            minimum = more.after(minimum)
         return problem, minimum
+
+    def _watch_missed(self, problem: Problem, x: Array, known: list[float]) -> bool:
+        """Return whether a gain exceeds its limit, or its largest known value, at any model.
+
+        The frequencies of such gains are then watched, and the worst models are added to the
+        search.
+        """
+        soft = self._soft_level(known)
+        levels = []
+        for value, measure in zip(known, self.measures, strict=True):
+            limit = 1.0 if measure.goal.hard else min(soft, 1.0)
+            levels.append(_WORSE * max(value, limit))
+        law = problem.law(x)
+        missed: dict[int, tuple[float, Point]] = {}
+        for point in (*self.points.fixed, *self.points.candidates):
+            case = self.case(point)
+            for index, loop in enumerate(case.loops(law) or []):
+                measure, scaling = self.measures[index], problem.scaling(x, index)
+                goal, ends, channel = measure.goal, measure.ends, case.channels[index]
+                peak = peak_above(goal, ends, channel, loop, scaling, levels[index])
+                if peak is None or ends is None:
+                    continue
+                gain, frequency = peak
+                ends.watched.append(frequency)
+                if index not in missed or gain > missed[index][0]:
+                    missed[index] = gain, point
+        for _, point in missed.values():
+            if point not in self.chosen:
+                self.chosen.append(point)
+        return bool(missed)
+
+    def _soft_level(self, values: Sequence[float]) -> float:
+        """Return the largest value of the soft goals, or of all goals if all are hard."""
+        soft = [
+            value
+            for value, measure in zip(values, self.measures, strict=True)
+            if not measure.goal.hard
+        ]
+        return max(soft, default=max(values))
 
     def _worse(
         self, problem: Problem, x: Array, candidates: Sequence[Point]
-    ) -> list[Point]:
-        """Return the worst model of each goal among candidates, if it is worse than all chosen."""
+    ) -> tuple[list[Point], list[float]]:
+        """Return the worst model of each goal among candidates, if it is worse than all chosen.
+
+        The second result contains the largest values of the goals over all of these models.
+        """
         known = [worst.value for worst in self.worst(problem, x, self.chosen)]
-        soft = [
-            value
-            for value, measure in zip(known, self.measures, strict=True)
-            if not measure.goal.hard
-        ]
-        level = max(soft, default=0.0)
-        added = []
+        level = self._soft_level(known)
+        added: list[Point] = []
         others = [point for point in candidates if point not in self.chosen]
-        if not others:
-            return []
-        for worst, measure in zip(
-            self.worst(problem, x, others), self.measures, strict=True
-        ):
-            limit = 1.0 if measure.goal.hard else level
+        largest = list(known)
+        for index, worst in enumerate(self.worst(problem, x, others)):
+            limit = 1.0 if self.measures[index].goal.hard else level
             if worst.value > limit * _WORSE and worst.point not in added:
                 added.append(worst.point)
-        return added
+            largest[index] = max(largest[index], worst.value)
+        return added, largest
 
     def worst(
         self, problem: Problem, x: Array, points: Sequence[Point]
@@ -295,12 +332,7 @@ class _Task:
         distinct = list({id(point): point for point in every}.values())
         worst = self.worst(problem, minimum.x, distinct)
         law = problem.law(minimum.x)
-        soft = [
-            w.value
-            for w, m in zip(worst, self.measures, strict=True)
-            if not m.goal.hard
-        ]
-        level = max(soft, default=max(w.value for w in worst))
+        level = self._soft_level([found.value for found in worst])
         goals = []
         for index, (found, measure) in enumerate(
             zip(worst, self.measures, strict=True)
@@ -345,7 +377,27 @@ class _Task:
             starts=starts,
             seconds=seconds,
             history=np.exp(np.array(minimum.history).reshape(-1, 2)),
+            parameter_history=np.array(
+                [problem.values(x)[0] for x in minimum.path]
+            ).reshape(-1, len(parameters)),
+            loops=self.loops(problem, minimum.x, law),
         )
+
+    def loops(self, problem: Problem, x: Array, law: Law) -> tuple[GoalLoops, ...]:
+        """Return the loops of each goal in the models of the search."""
+        cases = [
+            (self.case(point), self.case(point).loops(law)) for point in self.chosen
+        ]
+        results = []
+        for index, measure in enumerate(self.measures):
+            loops = tuple(
+                (of_goals[index], case.channels[index])
+                for case, of_goals in cases
+                if of_goals is not None
+            )
+            scaling = problem.scaling(x, index)
+            results.append(GoalLoops(measure.goal, measure.ends, loops, scaling))
+        return tuple(results)
 
     def _contradiction(
         self, problem: Problem, minimum: Minimum

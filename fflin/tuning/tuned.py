@@ -10,12 +10,15 @@ from pathlib import Path
 import numpy as np
 
 from fflin.base import html
+from fflin.base.figures import Figure
 from fflin.base.record import write_record
-from fflin.base.tables import cut, folded, grid
+from fflin.base.tables import cut, folded, grid, width
 from fflin.base.validation import Array
 from fflin.base.writing import as_path
 from fflin.control.linear_controller import LinearController
 from fflin.linear.model import LinearModel
+from fflin.tuning.curves import GoalLoops
+from fflin.tuning.files import record_of_law
 from fflin.tuning.law import Law
 
 # A goal whose value is this near to the largest one is active.
@@ -105,7 +108,10 @@ class Tuned(LinearController):
     seconds : float
         CPU time of the search [s].
     history : ndarray (k, 2)
-        Largest value of the soft and of the hard goals after each step of the last search.
+        Largest value of the soft and of the hard goals in each step of the search, from the best
+        start on. The values grow where worse models are added.
+    parameter_history : ndarray (k, p)
+        Values of the parameters in each step.
 
     Examples
     --------
@@ -127,9 +133,18 @@ class Tuned(LinearController):
     starts: tuple[float, ...]
     seconds: float
     history: Array
+    parameter_history: Array
+    _loops: tuple[GoalLoops, ...]
 
-    def __init__(self, law: Law, lin: LinearModel, **results: object) -> None:
+    def __init__(
+        self,
+        law: Law,
+        lin: LinearModel,
+        loops: tuple[GoalLoops, ...] = (),
+        **results: object,
+    ) -> None:
         super().__init__(matrices_of(law, lin.dt), lin)
+        self._loops = loops
         self.__dict__.update(results)
 
     @property
@@ -143,7 +158,7 @@ class Tuned(LinearController):
     def _repr_html_(self) -> str:
         parts = [
             html.paragraph(self._verdict()),
-            html.table(self._goal_rows(), "lrrrrl"),
+            html.table(self._goal_rows(), "llrrrr"),
         ]
         parts.append(html.table(self._parameter_rows(), "lrl"))
         return html.result_card(self, *parts)
@@ -166,25 +181,29 @@ class Tuned(LinearController):
 
     def _goal_rows(self) -> list[list[str]]:
         """Return the table of the goals."""
-        rows = [["goal", "value/limit", "second method", "at", "", "model"]]
+        several = any(goal.parameters for goal in self.goals)
+        rows = [["goal", "", "value", "check", "at", *(["model"] if several else [])]]
         for goal in self.goals:
-            kind = "hard" if goal.hard else ""
+            mark = "hard " if goal.hard else ""
             if goal.active:
-                kind = f"{kind}, active" if kind else "active"
-            label = f"{goal.label} ({kind})" if kind else goal.label
+                mark += "*"
             check = "" if math.isnan(goal.check) else f"{goal.check:.6g}"
-            where = "" if math.isnan(goal.frequency) else f"{goal.frequency:.4g}"
-            unit = "s" if goal.label.startswith("step") else "rad/s"
-            rows.append(
-                [
-                    label,
-                    f"{goal.value:.6g}",
-                    check,
-                    where,
-                    unit if where else "",
-                    self._model(goal.parameters),
-                ]
-            )
+            where = ""
+            if not math.isnan(goal.frequency):
+                unit = "s" if goal.label.startswith("step") else "rad/s"
+                where = f"{goal.frequency:.3g} {unit}"
+            model = [self._model(goal.parameters)] if several else []
+            rows.append([goal.label, mark, f"{goal.value:.6g}", check, where, *model])
+        return rows
+
+    def _fitting_rows(self) -> list[list[str]]:
+        """Return the table of the goals in the width of the terminal; long labels are cut."""
+        rows = self._goal_rows()
+        sizes = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        room = width() - sum(sizes[1:]) - 2 * (len(sizes) - 1)
+        for row in rows:
+            if len(row[0]) > room:
+                row[0] = row[0][: max(room, 8) - 3] + "..."
         return rows
 
     def _models(self) -> list[Mapping[str, float]]:
@@ -225,12 +244,47 @@ class Tuned(LinearController):
             f"stationarity {self.stationarity:.1e}; "
             f"{_counted(len(self.points))} in the search, {_counted(self.examined)} examined"
         )
-        goals = grid(cut(self._goal_rows(), "see goals"), "lrrrl")
+        rows = cut(self._fitting_rows(), "see goals")
+        goals = grid(rows, "llrrrr"[: len(rows[0])])
         parameters = grid(cut(self._parameter_rows(), "see parameters"), "lr")
-        parts = [folded([self._verdict()]), goals]
+        legend = (
+            "value: largest value divided by its limit, which must be at most 1; check: the same "
+            "by a second method; *: active, limits the other goals"
+        )
+        parts = [folded([self._verdict()]), goals, folded([legend])]
         if lines := self._model_lines():
             parts.append(folded(lines))
         return "\n\n".join((*parts, parameters, folded([search])))
+
+    def record(self) -> dict[str, object]:
+        """Return the law, its parameters and the figures of the report, for JSON."""
+        record = record_of_law(self) | {
+            name: getattr(self, name)
+            for name in (
+                *("parameters", "units", "met", "factor", "conflict", "stationarity"),
+                *("points", "examined", "starts", "seconds"),
+            )
+        }
+        goals = [
+            {
+                "label": goal.label,
+                "hard": goal.hard,
+                "value": goal.value,
+                "check": goal.check,
+                "met": goal.met,
+                "active": goal.active,
+                "frequency": goal.frequency,
+                "parameters": goal.parameters,
+            }
+            for goal in self.goals
+        ]
+        return record | {"goals": goals}
+
+    def plot(self, path: str | Path | None = None) -> Figure:
+        """Draw the goals, the loops and the search by `plot_tuned`; save a file if given."""
+        from fflin import plot_tuned
+
+        return plot_tuned(self, path)
 
     def save(self, path: str | Path) -> None:
         """Write the law to a file, which `LinearController` and other tools read.
@@ -245,18 +299,7 @@ class Tuned(LinearController):
         FileError
             If the path has another ending or the file cannot be written.
         """
-        system = self.system
-        record = {
-            "kind": "Tuned",
-            "A": system.A,
-            "B": system.B,
-            "C": system.C,
-            "D": system.D,
-            "dt": self.dt,
-            "input_names": system.inputs,
-            "output_names": system.outputs,
-            "parameters": dict(self.parameters),
-        }
+        record = record_of_law(self) | {"parameters": dict(self.parameters)}
         write_record(as_path(path), record, checksummed=self.lin.verified)
 
 

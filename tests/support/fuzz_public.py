@@ -243,6 +243,7 @@ def light(folder):
             key: {
                 **{"measured": "q_b", "inputs": "tau_b", "kp": 1.0, "kd": (1.0, 2.0)},
                 **{"lag": 0.1, "bandwidth": 1.0, "coupled": False, "name": "axis"},
+                "distribution": np.eye(3),
             }
             for key in ("PD", "PID")
         },
@@ -285,6 +286,7 @@ def light(folder):
             "goals": fflin.Decay(0.1),
             **{"dt": 0.1, "delay": 0.0, "q": q, "starts": 1, "steps": 2, "seed": 0},
         },
+        "plot_tuned": {"tuned": None, "path": None, "axes": None},
         "load_dispersions": {"path": "nosuch.toml"},
         "load_inputs": {"path": "nosuch.toml"},
         "line_up": {"gain": gain, "lin": lin},

@@ -24,6 +24,11 @@ STRUCTURES = {
     + fflin.LowPass() * fflin.PID("y1", "u1"),
     "state space": fflin.StateSpaceLaw(2),
     "shared": fflin.PD("y0", "u0", lag=LAG) + fflin.PD("y1", "u1", lag=LAG),
+    "more inputs than axes": fflin.PID("y0", "*", coupled=True),
+    "distribution": fflin.LowPass()
+    * (
+        fflin.PD("*", "*", distribution=[[1.0, 0.2], [0.0, 0.7]]) + fflin.PD("y0", "u0")
+    ),
     "function": fflin.CustomLaw(
         lambda k: ([[-(k["w"] ** 2)]], [[k["w"]]], [[k["k"]]], [[-k["k"]]]),
         {"w": (0.5, 2.0), "k": (0.1, 0.5)},

@@ -1,0 +1,110 @@
+"""Files of tuned laws: the matrices with the operating point, the sample time and the delay."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from fflin.base.names import input_keys
+from fflin.base.record import figure, read_record, reading, text, texts
+from fflin.base.validation import Array
+from fflin.base.writing import as_path
+from fflin.control.linear_controller import LinearController
+from fflin.control.policy import System
+from fflin.dynamics.coordinates import frame_of
+from fflin.linear.linearization import linearize
+from fflin.linear.model import LinearModel
+from fflin.robot.robot import Robot
+
+KIND = "Tuned"
+
+
+def record_of_law(law: LinearController) -> dict[str, object]:
+    """Return the entries of the file of a law: its matrices and its operating point."""
+    system, lin = law.system, law.lin
+    return {
+        "kind": KIND,
+        "A": system.A,
+        "B": system.B,
+        "C": system.C,
+        "D": system.D,
+        "dt": law.dt,
+        "delay": lin.delay,
+        "input_names": system.inputs,
+        "output_names": system.outputs,
+        "robot": lin.robot,
+        "frame": lin.frame,
+        "q": lin.q,
+        "v": lin.v,
+        "u0": lin.u0,
+        "placement": lin.placement,
+    }
+
+
+def read_law(path: str | Path) -> dict[str, Any]:
+    """Return the entries of a file of a tuned law, or raise `FileError` for another file."""
+    target = as_path(path)
+    with reading(target, "tuned law"):
+        record, _ = read_record(target)
+        kind = text(record.get("kind", ""))
+        if kind != KIND:
+            raise ValueError(f"the file contains: {kind or 'no law of fflin'}")
+    return record
+
+
+def saved_law(record: Mapping[str, Any], robot: Robot) -> LinearController:
+    """Return the law of a file about the operating point for which it was tuned."""
+    reference = pin.XYZQUATToSE3(_vector(record, "placement"))
+    lin = linearize(
+        robot,
+        _vector(record, "q"),
+        _vector(record, "v"),
+        _vector(record, "u0"),
+        frame=frame_of(robot, text(record["frame"])),
+        reference=reference,
+    )
+    names = texts(record["input_names"]), texts(record["output_names"])
+    ny, nu = len(names[0]), len(names[1])
+    D = np.reshape(record["D"], (nu, ny))
+    A = np.atleast_2d(record["A"])
+    nz = len(A) if A.size else 0
+    system = System(
+        np.reshape(record["A"], (nz, nz)),
+        np.reshape(record["B"], (nz, ny)),
+        np.reshape(record["C"], (nu, nz)),
+        D,
+        figure(record["dt"]),
+        *names,
+    )
+    return LinearController(system, _in_time(record, lin))
+
+
+def in_time_of(path: str | Path, lin: LinearModel) -> LinearModel:
+    """Return a model with the sample time and the delay of the tuned law in a file.
+
+    The model does not change if the file contains another controller, or a law without a delay.
+    """
+    target = as_path(path)
+    with reading(target, "controller"):
+        record, _ = read_record(target)
+    if "delay" not in record or text(record.get("kind", "")) != KIND or lin.dt:
+        return lin
+    return _in_time(record, lin)
+
+
+def _in_time(record: Mapping[str, Any], lin: LinearModel) -> LinearModel:
+    delays = _vector(record, "delay")
+    if not delays.any():
+        return lin
+    by_input = dict(zip(texts(record["output_names"]), delays.tolist(), strict=True))
+    keys = dict(zip(lin.input_names, input_keys(lin), strict=True))
+    named = {keys[name]: value for name, value in by_input.items() if name in keys}
+    return lin.discretize(figure(record["dt"]), delay=named)
+
+
+def _vector(record: Mapping[str, Any], key: str) -> Array:
+    return np.asarray(record[key], float).ravel()
