@@ -135,11 +135,11 @@ class TrajectoryFeedback(Feedback):
         return poles_along(self.schedule)
 
     def form(self, robot: Robot) -> PathForm | OutputForm | None:
-        """Return the trajectory and the gains; None if only Python supports them.
+        """Return the trajectory and the gains; None for a robot with constraints.
 
-        This is so if they repeat, or if the robot has constraints.
+        Only Python supports trajectories of robots with constraints.
         """
-        if self.trajectory.period or robot.constraints:
+        if robot.constraints:
             return None
         return PathForm(self)
 
@@ -414,13 +414,14 @@ class TrajectoryOutputFeedback(OutputSensing, TrajectoryFeedback):
         """Names of the outputs."""
         return self.filter.output_names
 
-    def form(self, robot: Robot) -> OutputForm | None:
+    def form(self, robot: Robot) -> OutputForm:
         """Return the matrices for each sample of the trajectory, and for the robot at rest.
 
-        Return None if the trajectory repeats, which only Python supports.
+        If the trajectory repeats, the matrices repeat, too.
         """
         if self.trajectory.period:
-            return None
+            samples = len(self.filter.A)
+            return OutputForm(self.bind(robot), self.terms, samples, cyclic=True)
         return OutputForm(self.bind(robot), self.terms, len(self.filter.A) + 2)
 
     @cached_property
