@@ -218,9 +218,9 @@ ABOUT: dict[str, str] = {
     "position. In every option, NAME can also be a pattern such as 'hinge_*'",
     "weld": "weld a frame to the frame TO or, without TO, to inertial space, in the pose that they "
     "have at the operating point. The welds are added to the constraints in robot.toml",
-    "independent": "coordinate that the linear model of a robot with constraints keeps. NAME is a "
-    "coordinate, a group or a pattern, such as q_b or left_1; repeat the option for each. By "
-    "default, the coordinates are chosen automatically",
+    "independent": "coordinate kept in the linear model. NAME is a coordinate, a group or a "
+    "pattern, such as q_b or left_1; repeat the option for each. The linear model of a robot with "
+    "constraints has only independent coordinates, by default chosen automatically",
     "xacro": "value of an argument of a xacro file",
     "orbit": "circular orbit at an altitude [m], or elliptic orbit with the heights [m] of perigee "
     "and apogee, above a central body: earth (default), moon, mars ... The world is then the "

@@ -74,7 +74,7 @@ def list_robots() -> tuple[str, ...]:
     Examples
     --------
     >>> fflin.list_robots()[:3]
-    ('astrobee_arm', 'canadarm2', 'cubesat')
+    ('astrobee_arm', 'berthed_stack', 'canadarm2')
     """
     return tuple({**_bundled(), **_example_robot_data()})
 

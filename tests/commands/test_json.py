@@ -1,6 +1,7 @@
 """With --json every command prints one object of one schema, with the figures of the Python API."""
 
 import json
+import shlex
 
 import numpy as np
 import pytest
@@ -41,6 +42,9 @@ class Python:
         )
         self.region = fflin.validity(self.robot, self.lin, self.gain, samples=3)
         ranges = {"base.mass": 0.2}
+        self.tuned = fflin.tune(
+            self.lin, fflin.PD("q_b", "tau_b"), fflin.Decay(rate=0.01), starts=1
+        )
         self.lft = fflin.uncertain(self.robot, ranges).lft()
 
 
@@ -120,6 +124,12 @@ CASES = {
             (x["energy"], py.motion.energy[[0, -1]]),
         ],
     ),
+    "tune": (
+        f"{ROBOT} --law pd --goal 'decay rate=0.01' --starts 1",
+        lambda x, py: [
+            (x["parameters"]["kp.tau_b.x"], py.tuned.parameters["kp.tau_b.x"])
+        ],
+    ),
     "export": ("gain.npz -o flight", lambda x, py: []),
     "sweep": (f"{ROBOT} --random 3 -o many.npz", lambda x, py: [(x["points"], 3)]),
     "montecarlo": (
@@ -162,7 +172,7 @@ def python(tmp_path_factory, brief_validity):
 @pytest.mark.parametrize("command", CASES)
 def test_json_has_one_schema_and_the_figures_of_python(command, python):
     words, figures = CASES[command]
-    code, out, err = run(command, *words.split(), "--json", cwd=python.folder)
+    code, out, err = run(command, *shlex.split(words), "--json", cwd=python.folder)
     assert code == 0 and "error" not in err and out.count("\n") == 1
     message = json.loads(out, parse_constant=pytest.fail)  # NaN is no JSON
     assert list(message)[: len(HEAD)] == HEAD

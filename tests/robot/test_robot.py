@@ -26,13 +26,21 @@ def free_flyer(*joints):
 
 def test_bundled_names_come_first():
     names = (
-        *("astrobee_arm", "berthed_stack", "canadarm2", "cubesat", "dual_arm"),
+        *("astrobee_arm", "berthed_stack", "canadarm2", "cubesat", "cubesat_magnetic"),
+        "dual_arm",
         *("ets_vii", "grasped_target", "inspector", "inspector_flexible"),
         *("planar_detumble", "scissor_mast", "servicer_7dof"),
     )
     assert fflin.list_robots()[: len(names)] == names
     closed = {"berthed_stack", "grasped_target", "scissor_mast"}
-    assert set(names) - set(BUNDLED) == {"inspector_flexible"} | closed
+    assert (
+        set(names) - set(BUNDLED)
+        == {
+            "inspector_flexible",
+            "cubesat_magnetic",
+        }
+        | closed
+    )
 
 
 def test_a_bundled_robot_file_loads_by_its_name():
