@@ -230,7 +230,9 @@ class Decay(Goal):
     Parameters
     ----------
     rate : float
-        Least decay rate [1/s]: the real parts of all poles are below -rate.
+        Least decay rate [1/s]: the real parts of all poles are below -rate. States that affect
+        no signal of the law or of a goal, such as the position under an attitude law, and states
+        that no input reaches, are excluded.
     hard : bool
 
     Raises
@@ -259,7 +261,7 @@ class Damping(Goal):
     Parameters
     ----------
     ratio : float
-        Least damping ratio, between 0 and 1.
+        Least damping ratio, between 0 and 1, of the same poles as for `Decay`.
     band : (float, float)
         Magnitudes [rad/s] of the poles to which the goal applies; all by default.
     hard : bool
