@@ -23,6 +23,7 @@ from fflin.commands.builders import (
     check_pictures,
     colors_of,
     designed,
+    detumbling_law,
     limits_of_options,
     load_robot,
     loop_of,
@@ -240,7 +241,7 @@ def simulate(arguments: Namespace) -> Report:
     record["margins"], line = _margins_of(policy, settings)
     if line:
         text += f"\n{folded([line])}"
-    if arguments.bdot is not None and not motion.stopped:
+    if detumbling_law(arguments) is not None and not motion.stopped:
         record["detumbling_time"], line = _detumbling_of(motion)
         text += f"\n{folded([line])}"
     if window is not None and not motion.stopped:

@@ -33,7 +33,7 @@ _LOOP = {
     "target": f"{_TARGET} {_INPUTS}",
     TRAJECTORY: _PATH,
     CONTROLLER: f"{_WEIGHTS} integral schedule gain controller negative-feedback allocate mpc "
-    "horizon bdot free limits limit delay",
+    "horizon bdot rate-damping free limits limit delay",
     SIMULATION: "duration dt step method frame",
     ROBOT: _SYSTEM,
 }
@@ -250,6 +250,8 @@ ABOUT: dict[str, str] = {
     "or with magnetorquers; 0 by default",
     "bdot": "detumble by the B-dot law with this gain [A m^2 s/T]: each magnetorquer has a moment "
     "proportional to the derivative of the magnetic field along its axis",
+    "rate-damping": "detumble from the measured angular velocity with this gain [N m s]: the "
+    "magnetorquers exert the part of -GAIN times the angular velocity across the magnetic field",
     "hold": "inputs between the knots of FILE: linearly interpolated (linear), or constant from "
     "each knot to the next (previous). The default is the setting in FILE or, if there is none, "
     "linear",

@@ -149,9 +149,12 @@ class PathForm(NamedTuple):
 
 
 class BDotForm(NamedTuple):
-    """Data of a law that feeds back the derivative of the magnetic flux density in base axes."""
+    """Data of a law that feeds back a vector of the magnetic field in base axes."""
 
-    gain: Array  # (nu, 3) [A m^2 s/T]; the command is its product with the derivative
+    gain: Array  # (nu, 3); the command is its product with the vector
+    # The vector is the derivative of the flux density b, or b x omega / |b|^2 with the inertial
+    # angular velocity omega if the law measures the rate.
+    measures_rate: bool = False
 
 
 Form: TypeAlias = StateForm | OutputForm | PathForm | BDotForm

@@ -22,6 +22,7 @@ from fflin.kernel.orbit import (
     RATE_CHANGE,
     STRENGTH,
     add_gradient,
+    changing_field,
     flux_at,
     from_inertial_axes,
     kinetic_energy,
@@ -236,6 +237,8 @@ def accelerate(work, robot, orbit, extension, point, t, rates, to):
     vec.copy(work, force, point.wrench, 0, 6)
     if orbit is not None:
         store(point.wrench, 0, _power(work, tree, nu))
+        if len(orbit.ellipse) > 0:
+            vec.add(point.wrench, 0, _field_power(work, robot, orbit, point))
         add_gradient(work, tree, outwards_at(orbit, point.q), orbit.now[STRENGTH])
     bodies.move_bodies(work, tree, nu, omega_b)
     bodies.load_bodies(work, tree)
@@ -271,6 +274,18 @@ def _power(work, tree, nu):
         rate = load(nu, 6 + joint)
         total = total - load(tree.damping, joint) * rate * rate
     return total
+
+
+@called
+def _field_power(work, robot, orbit, point):
+    """Return the power [W] that changes the Jacobi integral in an elliptic orbit (17.3)."""
+    q, z = point.q, normal_at(orbit, point.q)
+    zero = vec.minus(z, z)
+    angular, linear = _momentum_error(work, robot, point.nu, (zero, zero))
+    position = vec.across(vec.axes_of(q), vec.get3(q, 0))
+    angular = vec.plus(angular, vec.cross(position, linear))
+    power = orbit.now[RATE_CHANGE] * vec.dot(z, angular)
+    return power - 0.5 * changing_field(work, robot.tree, orbit, q)
 
 
 def _turn_with_orbit(orbit, point, rates, to):

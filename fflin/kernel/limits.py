@@ -108,8 +108,8 @@ LIMITS = (
         "lags of outputs are not computed for a law in an Allocation",
     ),
     Limit(
-        lambda task: task.first(_is_in_elliptic_orbit),
-        "'{}' is in an elliptic orbit, whose field is computed in Python",
+        lambda task: "" if task.simulated else task.first(_is_in_elliptic_orbit),
+        "sweeps of '{}' in its elliptic orbit are computed in Python",
     ),
     Limit(lambda task: task.python_policy, "a {} is computed in Python"),
     Limit(

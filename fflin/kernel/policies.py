@@ -12,7 +12,7 @@ from fflin.kernel.allocation import ALLOCATION
 from fflin.kernel.bodies import move_bodies
 from fflin.kernel.extension import lag_sensors, lagged
 from fflin.kernel.forward import COMMON_POINT, joint_position
-from fflin.kernel.orbit import flux_rate_at, spin_at, write_now
+from fflin.kernel.orbit import flux_at, flux_rate_at, spin_at, write_now
 from fflin.kernel.tree import (
     FLAG,
     FLAGS,
@@ -25,7 +25,7 @@ from fflin.kernel.tree import (
     WHOLE,
     Struct,
 )
-from fflin.kernel.vectors import angle, called, chosen, load, store, whole
+from fflin.kernel.vectors import angle, called, chosen, floor, load, store, whole
 
 # a time nearer to a knot than this fraction of the interval counts as the knot
 _NEAR = 1e-9
@@ -34,7 +34,8 @@ _NEAR = 1e-9
 class Path(
     namedtuple(
         "Path",
-        "t q u shift speed hold ahead ends held over last starts K order along e point",
+        "t q u smooth shift speed hold ahead ends held over last period slack starts K order along "
+        "e point",
     )
 ):
     """A trajectory and its feedback gains, both as piecewise polynomials.
@@ -43,8 +44,9 @@ class Path(
     - `shift`, `speed`: coefficients (4, 6 + n) of cubic polynomials for each interval between two
       knots. The cubics of `shift` give the displacement from the interval's first knot. The cubics
       of `speed` give nu. The variable of both cubics is the elapsed fraction of the interval.
-    - `hold`: if true, u is constant between knots, else linear. u is evaluated `ahead` [s] after
-      the current time.
+    - `hold`: if true, u is constant between knots, else linear. If `smooth` is not empty, u is a
+      cubic polynomial instead, with coefficients (4, nu) for each interval. u is evaluated `ahead`
+      [s] after the current time.
     - `held`: for each torque or force in world axes, the index of the first of the three inputs.
     - `K`: coefficients (m, `order`, nu, nx) of the gain. The gain is a polynomial in time on each
       of m intervals, which begin at the times `starts` (m,) [s]. The variable of each polynomial is
@@ -52,12 +54,14 @@ class Path(
       trajectory, the gain is constant.
     - `ends`: True if the trajectory ends before the run. In this case, `q`, `u`, `speed` and `K`
       have one further row, which applies after the time `over` [s] of the run.
+    - `period` [s]: time after which trajectory and gains repeat, or 0. A time less than `slack` [s]
+      before the end of a period counts as the start of the next one, for the gain.
     - Work space: `along` (6 + n,) for a displacement, `e` (nx,) for the error, and `point` for the
       followed point.
     """
 
 
-_OF_PATH = {FLAG: "hold ends", REAL: "ahead over last"}
+_OF_PATH = {FLAG: "hold ends", REAL: "ahead over last period slack"}
 PATH = Struct(
     Path, REALS, _OF_PATH, held=INDICES, order=WHOLE, e=LANED, point=COMMON_POINT
 )
@@ -88,6 +92,13 @@ def _placed(knots, time):
         k = k + 1
         s = 0.0
     return k, 0.0 if s < _NEAR else min(s, 1.0)
+
+
+def _in_period(path, since):
+    """Return the time since the start of the trajectory, within a period if there is one."""
+    if path.period > 0.0:
+        return since - path.period * floor(since / path.period)
+    return since
 
 
 def error(robot, path, point):
@@ -130,10 +141,11 @@ def track(robot, path, point, u, t):
     last = len(path.t) - 2
     knots = path.t
     count = len(path.point.u)
-    time = knots[0] + max(t, 0.0)
+    time = knots[0] + _in_period(path, max(t, 0.0))
     after = path.ends and t > path.over
     k, s = _placed(knots, time)
-    at, share = _placed(knots, min(time + path.ahead, knots[last + 1]))
+    middle = knots[0] + _in_period(path, max(t, 0.0) + path.ahead)
+    at, share = _placed(knots, min(middle, knots[last + 1]))
     if after:
         k = last + 2
         at = last + 2
@@ -144,6 +156,8 @@ def track(robot, path, point, u, t):
         if share > 0.0 and not path.hold:
             value += share * (path.u[(at + 1) * count + index] - value)
         followed.u[index] = value
+    if len(path.smooth) > 0:
+        _cubic(path.smooth, at, share, followed.u)
     if after:
         vec.copy(
             path.speed,
@@ -167,7 +181,10 @@ def track(robot, path, point, u, t):
     error(robot, path, point)
     starts = path.starts
     width = len(path.e)
-    since = path.starts[0] + min(max(t, 0.0), path.last)
+    since = _in_period(path, max(t, 0.0))
+    if path.period > 0.0 and path.period - since <= path.slack:
+        since = 0.0
+    since = path.starts[0] + min(since, path.last)
     k = _latest(starts, since)
     since = 0.0 if after else since - starts[k]
     k = len(starts) if after else k
@@ -183,7 +200,7 @@ def track(robot, path, point, u, t):
         store(u, row, total)
 
 
-NOTHING, LINEAR, TRACK, B_DOT = range(4)
+NOTHING, LINEAR, TRACK, B_DOT, DAMPING = range(5)
 
 
 class Law(
@@ -195,8 +212,10 @@ class Law(
 ):
     """A policy. In compiled code, `x`, `y`, `added` and `u` have one column per lane.
 
-    - `kind`: NOTHING, LINEAR, TRACK or B_DOT. B_DOT is for robots in orbit, and computes u from the
-      derivative of the magnetic flux density in base axes, with the gain `filter.D` (nu, 3).
+    - `kind`: NOTHING, LINEAR, TRACK, B_DOT or DAMPING. B_DOT and DAMPING are for robots in orbit,
+      and compute u from a vector in base axes, with the gain `filter.D` (nu, 3). For B_DOT, the
+      vector is the derivative of the magnetic flux density b. For DAMPING, it is b x w / |b|^2 with
+      the inertial angular velocity w.
       NOTHING computes no command. LINEAR computes u from y, with
       `grid` if the grid has joints, otherwise with `filter`. TRACK computes u = u* - K e along
       `path`.
@@ -339,12 +358,16 @@ def command(work, robot, orbit, law, extension, point, t, count, stage):
     if law.kind == TRACK:
         track(robot, law.path, point, law.u, t)
         return
-    if orbit is not None and law.kind == B_DOT:
+    if orbit is not None and law.kind >= B_DOT:
         write_now(orbit, t)
-        flux_rate = flux_rate_at(orbit, point.q, point.nu)
+        measured = flux_rate_at(orbit, point.q, point.nu)
+        if law.kind == DAMPING:
+            b = flux_at(orbit, point.q)
+            rate = vec.plus(vec.get3(point.nu, 0), spin_at(orbit, point.q))
+            measured = vec.times(vec.cross(b, rate), 1.0 / vec.dot(b, b))
         for index in range(len(law.u)):
             gain = vec.get3(law.filter.D, 3 * index)
-            store(law.u, index, vec.dot(gain, flux_rate))
+            store(law.u, index, vec.dot(gain, measured))
         return
     row = row_at(law, count)
     # Compute the outputs y, with the noise of the sample.

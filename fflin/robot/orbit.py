@@ -397,12 +397,17 @@ class EllipticOrbit:
         """Time of one revolution [s]."""
         return 2.0 * math.pi / self.mean_motion
 
+    @property
+    def mean_anomaly(self) -> float:
+        """Mean anomaly [rad] at t = 0."""
+        return _mean_anomaly(self.anomaly, self.eccentricity)
+
     def at(self, t: float) -> OrbitState:
         """Return the rotation and the gravity gradient of the orbital frame at time t [s]."""
         t = number("t", t)
         e = self.eccentricity
         n = self.mean_motion
-        mean = _mean_anomaly(self.anomaly, e) + n * t
+        mean = self.mean_anomaly + n * t
         revolutions = round(mean / (2.0 * math.pi))
         E = eccentric_anomaly(mean - 2.0 * math.pi * revolutions, e)
         # r / a, and (dr/dt) / r

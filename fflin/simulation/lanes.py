@@ -34,7 +34,7 @@ from fflin.robot.disturbance import BASE, INERTIAL, UNITS, DisturbanceTerm
 from fflin.robot.fields import input_limits, limits_of
 from fflin.robot.inputs import BaseTorque
 from fflin.robot.joints import ROOT, find_frame
-from fflin.robot.orbit import CircularOrbit
+from fflin.robot.orbit import EllipticOrbit
 from fflin.robot.outputs import Gyroscope
 from fflin.robot.robot import Robot
 from fflin.simulation.extension import DRAG, SUNLIGHT, extension_of, is_extended
@@ -678,14 +678,22 @@ def orbit_of(plant: Plant) -> orbit.Orbit:
     """Return the kernel's parameters of the orbit of a plant; empty without an orbit."""
     none: orbit.Orbit = empty(orbit.ORBIT)
     field = plant.field
-    circle = plant.robot.orbit
-    if field is None or not isinstance(circle, CircularOrbit):
+    path = plant.robot.orbit
+    if field is None or path is None:
         return none
+    ellipse = np.zeros(0)
+    latitude = 0.0
+    if isinstance(path, EllipticOrbit):
+        start = path.mean_anomaly, path.at(0.0).angle
+        ellipse = np.array([path.eccentricity, *start])
+    else:
+        latitude = path.argument_of_latitude
     return none._replace(
         outwards=field.axes[:, 0],
         normal=field.axes[:, 2],
         mean_motion=[mean_motion(plant.robot)],
-        latitude=[circle.argument_of_latitude],
+        ellipse=ellipse,
+        latitude=[latitude],
         dipole=_dipole_of(field),
         now=np.zeros(orbit.END),
     )
@@ -743,7 +751,8 @@ def _law(plan: Plan, mechanics: forward.Mechanics, noisy: bool) -> policies.Law:
         law = _linear(law, form, state)
     elif isinstance(form, BDotForm):
         direct = law.filter._replace(D=form.gain.ravel())
-        law = law._replace(kind=policies.B_DOT, filter=direct)
+        kind = policies.DAMPING if form.measures_rate else policies.B_DOT
+        law = law._replace(kind=kind, filter=direct)
     size = len(law.measured)
     slots = SLOTS if noisy or plan.noise else 1
     return law._replace(y=np.zeros(size), added=np.zeros(slots * size))
@@ -859,6 +868,7 @@ def _path(
     u = list(motion.u)
     held = [part.start for part in motion.actuation.held]
     ends = plan.times.steps * plan.times.dt > policy.duration * AT_THE_END
+    ends = ends and not motion.period
     pieces = schedule.K if schedule.dt else schedule.pieces
     pieces = pieces.reshape(len(schedule.starts), -1, len(u[0]) * state.nx)
     if ends:
@@ -874,6 +884,7 @@ def _path(
         t=motion.t,
         q=np.concatenate(q),
         u=np.concatenate(u),
+        smooth=motion.smooth_pieces.ravel(),
         shift=shift,
         speed=speed,
         hold=motion.hold == "previous",
@@ -881,6 +892,8 @@ def _path(
         ends=bool(ends),
         held=held,
         over=policy.over,
+        period=motion.period,
+        slack=1e-9 * schedule.dt,
         last=float(schedule.t[-1] - schedule.t[0]),
         starts=schedule.starts,
         K=pieces.ravel(),

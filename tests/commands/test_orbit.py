@@ -101,8 +101,13 @@ def test_the_b_dot_law(tmp_path):
     command = ("simulate", SATELLITE, "--bdot", 2e4, "--dt", 5)
     code, out, _ = run(*command, "--duration", 100)
     assert code == 0 and "not detumbled: the mean rate" in " ".join(out.split())
-    assert "--bdot replaces" in refused(*command, "--sample", 20, "--r", "dipole=1")
+    assert "replace the regulator" in refused(
+        *command, "--sample", 20, "--r", "dipole=1"
+    )
     assert "magnetorquers" in refused("simulate", "cubesat", "--bdot", 1)
+    other = ("simulate", SATELLITE, "--rate-damping", 3e-5, "--dt", 5)
+    assert run(*other, "--duration", 100)[0] == 0
+    assert "remove --bdot" in refused(*other, "--bdot", 2e4)
 
 
 @pytest.mark.exhaustive

@@ -48,7 +48,7 @@ TASKS = {
     "disturbances are computed in Python": Task(robots=(CUBESAT,), disturbance=True),
     "lags of outputs are not computed": Task(robots=(CUBESAT,), lagging=True),
     "a Mpc is computed in Python": Task(robots=(CUBESAT,), python_policy="Mpc"),
-    "'cubesat' is in an elliptic orbit": Task(robots=(CUBESAT, IN_ELLIPSE)),
+    "sweeps of 'cubesat' in its elliptic orbit": Task(robots=(CUBESAT, IN_ELLIPSE)),
     "the magnetic field of 'cubesat' is a function": Task(
         robots=(in_field(lambda t, position: np.zeros(3)),), simulated=True
     ),
