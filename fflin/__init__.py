@@ -88,7 +88,7 @@ _PUBLIC = {
     "Policies": {
         "control.policy": "Policy StateForm",
         "control.policies": "StateFeedback Allocation",
-        "control.bdot": "BDot",
+        "control.bdot": "BDot RateDamping",
         "control.tracking": "TrajectoryFeedback TrajectoryOutputFeedback",
         "control.linear_controller": "OutputFeedback LinearController",
         "control.multirate_feedback": "MultirateFeedback",

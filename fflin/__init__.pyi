@@ -152,6 +152,7 @@ from fflin.control.policy import Policy as Policy
 from fflin.control.policy import StateForm as StateForm
 from fflin.control.policies import StateFeedback as StateFeedback
 from fflin.control.bdot import BDot as BDot
+from fflin.control.bdot import RateDamping as RateDamping
 from fflin.control.tracking import TrajectoryFeedback as TrajectoryFeedback
 from fflin.control.policies import Allocation as Allocation
 from fflin.control.linear_controller import OutputFeedback as OutputFeedback

@@ -109,6 +109,60 @@ def test_a_card_is_well_formed_small_and_escapes_names(results, name):
     assert f"{name}(" not in parsed.text
 
 
+@pytest.fixture(scope="module")
+def further():
+    """Laws and orbits, by their classes."""
+    orbit = fflin.EllipticOrbit(perigee=500e3, eccentricity=0.05, inclination=0.9)
+    sensors = [fflin.StarTracker(sample=0.5, delay=0.25), fflin.Gyroscope("base")]
+    robot = fflin.load("cubesat", inputs=[fflin.BaseTorque()], outputs=sensors)
+    model = fflin.linearize(robot).discretize(0.25)
+    estimator = fflin.kalman(model, 1e-10, 1e-8)
+    compensator = fflin.lqg(fflin.lqr(model), estimator)
+    arm = fflin.load("planar_detumble")
+    lin = fflin.linearize(arm)
+    sampled = lin.discretize(0.1)
+    observer = fflin.lqg(fflin.lqr(sampled), fflin.kalman(sampled, 1e-3, 1e-4))
+    motion = fflin.simulate(arm, duration=1.0, dt=0.1)
+    along = fflin.linearize_trajectory(arm, motion.trajectory())
+    law = fflin.PD("q_b", "tau_b", rates="omega_b")
+    feedback = fflin.StateFeedback(sampled, fflin.lqr(sampled))
+    periodic = fflin.linearize_orbit(fflin.load("cubesat", orbit=orbit), steps=8)
+    springs = fflin.linearize(arm.replace(stiffness=10.0, damping=0.1))
+    objects = [
+        *(orbit, fflin.CircularOrbit(700e3, field="dipole"), fflin.BDot(2e4), periodic),
+        *(estimator, compensator, fflin.MultirateFeedback(model, compensator)),
+        *(fflin.OutputFeedback(sampled, observer), fflin.Allocation(feedback, arm)),
+        *(fflin.TrajectoryFeedback(motion.trajectory(), fflin.tvlqr(along)),),
+        fflin.tune(lin, law, [fflin.Decay(0.1)], starts=1, steps=2),
+        *(feedback.follow(motion.trajectory()), fflin.gramians(springs, duration=1.0)),
+        fflin.relative_equilibria(fflin.load("cubesat", orbit=700e3))[0],
+        fflin.LinearController(-fflin.lqr(lin).K, lin),
+    ]
+    return {type(one).__name__: one for one in objects}
+
+
+def test_laws_and_orbits_have_cards(further):
+    for name, result in further.items():
+        card = result._repr_html_()
+        parsed = Parsed(card)
+        assert parsed.tags <= ALLOWED, name
+        assert len(card.encode()) < LARGEST, name
+        assert name in parsed.text and f"{name}(" not in parsed.text
+        assert len(repr(result)) < LONGEST and "array(" not in repr(result), name
+    text = Parsed(further["MultirateFeedback"]._repr_html_()).text
+    assert "commands every 0.25 s" in text and "measures q_b.x, q_b.y" in text
+    text = Parsed(further["EllipticOrbit"]._repr_html_()).text
+    assert "elliptic orbit 500 x" in text and "51.5662 deg" in text
+
+
+def test_the_norm_of_an_h_infinity_law_is_on_its_card():
+    pytest.importorskip("slycot")
+    lin = fflin.linearize(fflin.load("planar_detumble"))
+    goal = fflin.MaxGain({"tau_b": 0.01, "q_b": 1e-3}, {"q_b": 0.05, "tau_b": 1.0})
+    law = fflin.hinf(lin, goal, measured="q_b", inputs="tau_b")
+    assert f"gamma={law.gamma:.4g}, order=6" in Parsed(law._repr_html_()).text
+
+
 def test_the_repr_of_every_result_is_short(results):
     for name, result in results.items():
         assert len(repr(result)) < LONGEST, name

@@ -3,13 +3,16 @@
 from dataclasses import dataclass
 
 import numpy as np
+import pinocchio as pin
+from scipy.linalg import block_diag
 
 from fflin.analysis.mechanics import floating_inertia
 from fflin.base import html
 from fflin.base.errors import InputError
 from fflin.base.tables import counted, folded, grid
 from fflin.base.validation import Array, FrozenArrays, instance
-from fflin.dynamics.coordinates import ANGULAR, LINEAR, refuse_constraints
+from fflin.dynamics.closure import Closure
+from fflin.dynamics.coordinates import ANGULAR, LINEAR
 from fflin.dynamics.state import StateMap
 from fflin.linear.model import LinearModel
 
@@ -125,8 +128,8 @@ def effective_masses(lin: LinearModel) -> EffectiveMasses:
     Parameters
     ----------
     lin : LinearModel
-        Full model about any operating point. Only the springs and the configuration affect the
-        result: velocity, gravity, dampers and inputs are ignored.
+        Full model about any operating point. Only the springs, the configuration and constraints
+        within the robot affect the result: velocity, gravity, dampers and inputs are ignored.
 
     Returns
     -------
@@ -136,7 +139,8 @@ def effective_masses(lin: LinearModel) -> EffectiveMasses:
     Raises
     ------
     InputError
-        If the model lacks the robot's springs because it is reduced or was loaded from a file.
+        If the model lacks the robot's springs because it is reduced or was loaded from a file, or
+        the robot is held in inertial space.
     ModelError
         If the robot's Pinocchio model (``robot.model``) was modified after the robot was created.
 
@@ -155,20 +159,21 @@ def effective_masses(lin: LinearModel) -> EffectiveMasses:
     instance("lin", lin, LinearModel, "a fflin.LinearModel")
     lin.require_unchanged()
     robot = lin._robot
-    if robot is not None:
-        refuse_constraints(robot, "effective masses")
-    if robot is None or len(lin.M) != 6 + robot.n:
+    if robot is None or len(lin.M) + lin.rank != 6 + robot.n:
         raise InputError(
             "effective masses need the springs of the robot, which a reduced model and a model "
             "from a file do not contain; give the model that fflin.linearize returns"
         )
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
-    chart = state.chart(lin.q)
-    M = state.to_base(chart, state.to_base(chart, lin.M).T)
+    stiffness = robot.springs.stiffness
+    if lin.rank:
+        M, stiffness = _constrained(state, lin.q)
+    else:
+        chart = state.chart(lin.q)
+        M = state.to_base(chart, state.to_base(chart, lin.M).T)
     order = np.arange(len(M))
     order[:6] = np.r_[order[LINEAR], order[ANGULAR]]
     M = M[np.ix_(order, order)]
-    stiffness = robot.springs.stiffness
     springs = 6 + np.flatnonzero(stiffness)
     others = 6 + np.flatnonzero(stiffness == 0.0)
     kept = np.r_[:6, springs]
@@ -189,6 +194,35 @@ def effective_masses(lin: LinearModel) -> EffectiveMasses:
         M[:6, :6],
         lin.robot,
     )
+
+
+def _constrained(state: StateMap, q: Array) -> tuple[Array, Array]:
+    """Return M and the stiffnesses of a robot with constraints, in coordinates without coupling.
+
+    The coordinates after the six of the base are motions of the joints that the constraints permit.
+    They have unit inertia, and K is diagonal in them.
+    """
+    robot = state.robot
+    if robot.anchored:
+        raise InputError(
+            f"effective masses are defined for a base that is free to move, but '{robot.name}' is "
+            "held in inertial space; remove this constraint"
+        )
+    M = state.project(pin.crba(robot.model, robot.create_data(), q).T)
+    rows = Closure(state).tangent(q).rows[:, 6:]
+    scale = 1.0 / np.sqrt(M.diagonal()[6:])
+    _, _, motions = np.linalg.svd(rows * scale)
+    joints = scale[:, None] * motions[len(rows) :].T
+    factor = np.linalg.cholesky(joints.T @ M[6:, 6:] @ joints)
+    joints = np.linalg.solve(factor, joints.T).T
+    springs = np.sqrt(robot.springs.stiffness)[:, None] * joints
+    _, sizes, turned = np.linalg.svd(springs)
+    joints = joints @ turned.T
+    stiffness = np.zeros(joints.shape[1])
+    stiffness[: len(sizes)] = sizes**2
+    stiffness[stiffness <= _ROUNDING * stiffness.max(initial=0.0)] = 0.0
+    basis = block_diag(np.eye(6), joints)
+    return basis.T @ M @ basis, stiffness
 
 
 def _separated(frequencies: Array, L: Array) -> Array:

@@ -17,6 +17,7 @@ from fflin.analysis.ranks import (
     lasting,
     verdict,
 )
+from fflin.base import html
 from fflin.base.errors import InputError, listed
 from fflin.base.validation import Array, FrozenArrays, Values, instance, positive
 from fflin.dynamics.integrators import held_cost
@@ -322,6 +323,9 @@ class Gramians(FrozenArrays):
 
     def __repr__(self) -> str:
         return f"Gramians(nx={len(self.controllability)}, duration={self.duration:g} s)"
+
+    def _repr_html_(self) -> str:
+        return html.result_card(self)
 
 
 def gramians(lin: LinearModel, duration: float | None = None) -> Gramians:

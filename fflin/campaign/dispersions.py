@@ -1,5 +1,6 @@
 """Dispersions: random changes of the robot, sensors, delay and initial state of each run."""
 
+import math
 import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -23,21 +24,30 @@ from fflin.base.validation import Array, Indices, untied
 from fflin.base.validation import by_name as mapping
 from fflin.base.writing import reason
 from fflin.campaign.spreads import SEED, SEEDS, Inverse, inverse_of
-from fflin.control.data_sheet import output_keys
+from fflin.control.data_sheet import Deviations, output_keys
 from fflin.control.policy import Command, Policy, bound
+from fflin.control.sensor_errors import SensorErrors
 from fflin.dynamics.coordinates import PIN_ANGULAR, PIN_LINEAR
+from fflin.dynamics.disturbance import Plate
 from fflin.dynamics.state import StateMap
 from fflin.kernel.forward import ActuatorFaults
 from fflin.kernel.tree import Tree, batch_tree
 from fflin.linear.model import LinearModel
-from fflin.robot.disturbance import UNITS, DisturbanceTerm, terms_of
+from fflin.robot.disturbance import (
+    PLATE,
+    UNITS,
+    DisturbanceTerm,
+    plates_of,
+    terms_of,
+)
 from fflin.robot.equipment.assembly import first_impossible, turned_to
 from fflin.robot.fields import warn_of_degrees
 from fflin.robot.inputs import JointTorque, ReactionWheel, Thruster
 from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.mass_properties import properties, varied
 from fflin.robot.robot import Robot
-from fflin.simulation.lanes import DISTURBANCE, disturbances_of, noise_generator
+from fflin.simulation.extension import DRAG, SUNLIGHT
+from fflin.simulation.lanes import DISTURBANCE, disturbances_of
 from fflin.simulation.plan import Times
 from fflin.simulation.plant import Plant
 
@@ -51,11 +61,23 @@ _ONE_SIGMA = np.array([0.15865525393145707, 0.8413447460685429])
 _AXES = {"com": "xyz", "inertia": "xyz", "misalignment": "12"}
 _OF_BODIES = ("mass", "com", "inertia", "density")
 _OF_INPUTS, _OF_SPRINGS = ("gain", "bias", "fails"), ("stiffness", "damping")
-_OF_SENSORS = ("sensor", "noise")
+_OF_SENSORS = ("sensor", "noise", "drift")
+# Kinds that need a sampled law, and whose number is the value in all runs.
+_RANDOM_ERRORS = ("noise", "drift")
 _DISTURBANCES = tuple(f"{name}.{axis}" for name in UNITS for axis in "xyz")
 # Kind of the relative changes of the amplitudes of periodic disturbances.
 _AMPLITUDE = "amplitude"
-_FACTORS = ("mass", "inertia", "density", "frequency", _AMPLITUDE, *_OF_SPRINGS)
+# Kinds of the relative changes of the forces on flat plates.
+_OF_PLATES = (DRAG, SUNLIGHT)
+_FACTORS = (
+    "mass",
+    "inertia",
+    "density",
+    "frequency",
+    _AMPLITUDE,
+    *_OF_PLATES,
+    *_OF_SPRINGS,
+)
 
 
 class Column(NamedTuple):
@@ -80,6 +102,7 @@ class Dispersions:
         x0: Array,
         seed: int,
         times: Times,
+        declared: Deviations | None = None,
     ) -> None:
         self._plant, self._policy, self._x0, self._seed = plant, policy, x0, seed
         self._times = times
@@ -96,6 +119,7 @@ class Dispersions:
             "frequency": modes,
             DISTURBANCE: _DISTURBANCES,
             _AMPLITUDE: _periodic(robot),
+            **{kind: names for kind, (names, _) in _plates(plant).items()},
         }
         kinds = [*self._known]
         self._known |= {
@@ -121,15 +145,17 @@ class Dispersions:
                 )
             if kind in _OF_SENSORS:
                 head = output_keys([head], sensors)[head]
-            inverse = inverse_of(str(key), plain_spread, fixed=kind == "noise")
+            inverse = inverse_of(str(key), plain_spread, fixed=kind in _RANDOM_ERRORS)
             by_kind.setdefault(kind, {})[head] = inverse, group
         if not by_kind:
             raise InputError(
                 "dispersions is empty; give at least one dispersion, such as {'q_b': 0.05}"
             )
+        if declared is not None:
+            _add_declared(by_kind, declared, sensors)
         self._kinds = {*by_kind}
         self.columns: list[Column] = []
-        if "noise" in by_kind:
+        if self._kinds & {*_RANDOM_ERRORS}:
             self.columns.append(Column(SEED, "seed", [0], 0, SEEDS))
         for kind, spreads in by_kind.items():
             self._add(kind, spreads, " | ".join(kinds))
@@ -164,18 +190,9 @@ class Dispersions:
         """
         robot = self._plant.robot
         names = self._known[kind]
-        if kind in _OF_SENSORS and not names:
-            named = self._policy.inner.kind if self._policy else "None"
-            raise InputError(
-                f"'{next(iter(spreads))}.{kind}' is dispersed, but the policy ({named}) has no "
-                "sensors; use a StateFeedback, OutputFeedback or LinearController"
-            )
-        if kind == _AMPLITUDE and not names:
-            raise InputError(
-                f"'{next(iter(spreads))}.{kind}' is dispersed, but '{robot.name}' has no periodic "
-                "disturbance; give the robot one, with amplitude= and frequency="
-            )
-        if kind in ("noise", "delay") and not self._times.sample:
+        if not names:
+            self._refuse(kind, next(iter(spreads)))
+        if kind in (*_RANDOM_ERRORS, "delay") and not self._times.sample:
             raise InputError(
                 f"{kind} is dispersed, but the policy is continuous, and {kind} applies only to "
                 "a sampled policy; give sample=, a multiple of dt (--sample on the command line)"
@@ -213,6 +230,27 @@ class Dispersions:
             for axis, letter in enumerate(_AXES.get(kind, " ")):
                 name = f"{title}.{letter}".rstrip(". ")
                 self.columns.append(Column(name, kind, targets, axis, inverse))
+
+    def _refuse(self, kind: str, key: str) -> None:
+        """Raise `InputError` for a dispersion of a kind of which there are no quantities."""
+        robot = self._plant.robot
+        what = f"'{key}.{kind}' is dispersed, but"
+        if kind in _OF_SENSORS:
+            named = self._policy.inner.kind if self._policy else "None"
+            raise InputError(
+                f"{what} the policy ({named}) has no sensors; use a StateFeedback, OutputFeedback "
+                "or LinearController"
+            )
+        if kind == _AMPLITUDE:
+            raise InputError(
+                f"{what} '{robot.name}' has no periodic disturbance; give the robot one, with "
+                "amplitude= and frequency="
+            )
+        if kind in _OF_PLATES:
+            raise InputError(
+                f"{what} no flat plate of '{robot.name}' has {kind}; give it one in the table "
+                "[[disturbance.plate]]"
+            )
 
     def _warn_of_degrees(self) -> None:
         """Warn of dispersions of joint positions and rates that look like degrees."""
@@ -455,6 +493,21 @@ class Dispersions:
         factors[:, at] += self._of(_AMPLITUDE, drawn)
         return dict(zip(UNITS, np.split(factors, len(UNITS), axis=1), strict=True))
 
+    def _plate_forces(self, drawn: Array) -> dict[str, Array]:
+        """Return {kind of force: forces (N, k) [N]} of the flat plates, if they are dispersed."""
+        return {
+            kind: forces * self._plate_factors(kind, drawn)
+            for kind, (_, forces) in _plates(self._plant).items()
+            if kind in self._kinds
+        }
+
+    def _plate_factors(self, kind: str, drawn: Array) -> Array:
+        """Return the factors (N, k) of drag or solar pressure on all flat plates."""
+        forces = _plates(self._plant)[kind][1]
+        factors = np.ones((len(drawn), len(forces)))
+        factors[:, forces > 0.0] += self._of(kind, drawn)
+        return factors
+
     def delays(self, drawn: Array) -> Array:
         """Return the total delays (N, k) in integration steps, with the columns of `Times.delays`.
 
@@ -491,15 +544,7 @@ class Dispersions:
             pointed["bodies"] += runs.get("bodies", tree.bodies)
             runs |= pointed
         if self._kinds & {*_OF_SENSORS}:
-            sensors = self._known["sensor"]
-            of_outputs = self._policy is not None and self._policy.senses_outputs
-            names = sensors if of_outputs else plant.state.names
-            fed = [names.index(name) for name in sensors]
-            for key, kind in (("sensed", "sensor"), ("noise", "noise")):
-                runs[key] = np.zeros((count, len(names)))
-                runs[key][:, fed] = self._of(kind, drawn)
-            if "noise" in self._kinds:
-                runs["seed"] = self._of("seed", drawn)[:, 0]
+            runs |= self._sensors_in_lanes(drawn)
         if self._kinds & {DISTURBANCE, _AMPLITUDE}:
             waves = disturbances_of(plant.robot, dispersed=True)
             vectors = np.tile([wave.vector for wave in waves], (count, 1, 1))
@@ -511,9 +556,34 @@ class Dispersions:
             # The last two terms are the dispersed constants, in the order of `_DISTURBANCES`.
             vectors[:, -len(_DISTURBANCES) :] = self._of(DISTURBANCE, drawn)
             runs[DISTURBANCE] = vectors
+        runs |= self._plate_forces(drawn)
         if "delay" in self._kinds:
             runs["delay"] = self.delays(drawn)
         return runs
+
+    def _sensors_in_lanes(self, drawn: Array) -> dict[str, Array]:
+        """Return the arrays of `in_lanes` for the errors of sensors."""
+        sensors, plant = self._known["sensor"], self._plant
+        of_outputs = self._policy is not None and self._policy.senses_outputs
+        names = sensors if of_outputs else plant.state.names
+        fed = [names.index(name) for name in sensors]
+        kinds = {"sensed": "sensor", "noise": "noise"}
+        if "drift" in self._kinds:
+            kinds["drift"] = "drift"
+        arrays = dict[str, Array]()
+        for key, kind in kinds.items():
+            arrays[key] = np.zeros((len(drawn), len(names)))
+            arrays[key][:, fed] = self._of(kind, drawn)
+        if "drift" in arrays:
+            arrays["drift"] *= self._root_of_sample
+        if self._kinds & {*_RANDOM_ERRORS}:
+            arrays["seed"] = self._of("seed", drawn)[:, 0]
+        return arrays
+
+    @property
+    def _root_of_sample(self) -> float:
+        """Square root of the sampling time of the law [s^0.5]."""
+        return math.sqrt(self._times.sample * self._times.dt)
 
     def one(self, drawn: Array) -> tuple[Plant, Policy | None, Array, Array]:
         """Return the plant, the policy, and the initial q and v of a run with drawn values (k,)."""
@@ -538,9 +608,16 @@ class Dispersions:
         if self._kinds & {DISTURBANCE, _AMPLITUDE}:
             factors = {name: x[0] for name, x in self._amplitudes(rows).items()}
             robot = _disturbed(robot, self._of(DISTURBANCE, rows)[0], factors)
+        if self._kinds & {*_OF_PLATES}:
+            plates = [self._plate_factors(kind, rows)[0] for kind in _OF_PLATES]
+            robot = _with_plates(robot, *plates)
         if policy and self._kinds & {*_OF_SENSORS}:
-            errors = (self._of(kind, rows)[0] for kind in (*_OF_SENSORS, "seed"))
-            policy = with_sensor_errors(policy, *errors)
+            bias, noise, drift, (seed,) = (
+                self._of(kind, rows)[0] for kind in (*_OF_SENSORS, "seed")
+            )
+            policy = with_sensor_errors(
+                policy, bias, noise, seed, self._root_of_sample * drift
+            )
         if "misalignment" in self._kinds:
             robot = _misaligned(robot, self._of("misalignment", rows)[0])
             if policy and policy.commanded_robot:
@@ -584,6 +661,36 @@ def _periodic(robot: Robot) -> tuple[str, ...]:
     return tuple(name for name in _DISTURBANCES if name in names)
 
 
+def _plates(plant: Plant) -> dict[str, tuple[tuple[str, ...], Array]]:
+    """Return {kind of force: (names, forces (k,) [N])} of the k flat plates of a robot.
+
+    The names, such as plate_1, are those of the plates on which the force acts.
+    """
+    plates = [Plate(plate, plant.field) for plate in plates_of(plant.robot.disturbance)]
+    forces = {
+        DRAG: np.array([plate.drag for plate in plates]),
+        SUNLIGHT: np.array([plate.sunlight for plate in plates]),
+    }
+    return {
+        kind: (tuple(f"{PLATE}_{at + 1}" for at in np.flatnonzero(values)), values)
+        for kind, values in forces.items()
+    }
+
+
+def _with_plates(robot: Robot, drag: Array, sunlight: Array) -> Robot:
+    """Return a robot whose flat plates have drag and solar pressure multiplied by factors (k,)."""
+    plates = zip(plates_of(robot.disturbance), drag, sunlight, strict=True)
+    scaled = tuple(
+        replace(
+            plate,
+            density=plate.density * float(of_drag),
+            solar_pressure=plate.solar_pressure * float(of_sunlight),
+        )
+        for plate, of_drag, of_sunlight in plates
+    )
+    return replace(robot, disturbance={**robot.disturbance, PLATE: scaled})
+
+
 def _disturbed(robot: Robot, drawn: Array, factors: Mapping[str, Array]) -> Robot:
     """Return a robot with further constant disturbances and other amplitudes.
 
@@ -609,23 +716,38 @@ def _scaled(term: DisturbanceTerm, factors: Array) -> DisturbanceTerm:
 
 
 def with_sensor_errors(
-    policy: Policy, bias: Array, deviation: Array, seed: Array
+    policy: Policy,
+    bias: Array,
+    deviation: Array,
+    seed: float,
+    steps: Array | None = None,
 ) -> Policy:
-    """Add a bias and white noise to the measurements (ny,) of a policy; return the new policy.
+    """Add errors to the measurements (ny,) of a policy; return the new policy.
 
     The measurements are the states or outputs that the policy feeds back. `deviation` (ny,)
-    contains the standard deviations of the noise. `seed` (1,) is the seed of the noise.
+    contains the standard deviations of the noise, and `steps` (ny,) those of the change of the bias
+    from sample to sample.
     """
-    generator = noise_generator(seed[0])
+    if steps is None:
+        steps = np.zeros(len(bias))
     given = policy.measurement_noise
+    return policy.with_sensor_errors(SensorErrors(bias, deviation, steps, seed, given))
 
-    def error(t: float) -> Array:
-        drawn: Array = bias + deviation * generator.standard_normal(len(bias))
-        if given is not None:
-            drawn = drawn + np.asarray(given(t))
-        return drawn
 
-    return policy.with_sensor_errors(error)
+def _add_declared(
+    by_kind: dict[str, dict[str, tuple[Inverse, str]]],
+    declared: Deviations,
+    sensors: tuple[str, ...],
+) -> None:
+    """Add the errors that outputs declare, unless the dispersions contain this error."""
+    for kind in _RANDOM_ERRORS:
+        spreads = by_kind.get(kind, {})
+        given = by_name(f"{kind} to disperse", spreads, sensors)
+        for at, size in enumerate(getattr(declared, kind).tolist()):
+            if size and at not in given:
+                name = sensors[at]
+                inverse = inverse_of(f"{name}.{kind}", size, fixed=True)
+                by_kind.setdefault(kind, {})[name] = inverse, ""
 
 
 def _parameters(axes: Array, mass: Array, com: Array, inertia: Array) -> Array:

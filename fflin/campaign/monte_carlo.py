@@ -43,6 +43,7 @@ _OPTIONS = {option.name for option in fields(SimulationOptions)} - {
     "every",
     "progress",
     "engine",
+    "seed",
 }
 
 
@@ -123,11 +124,16 @@ def monte_carlo(
           `Robot.disturbance`, in its default axes. ``tau_b.amplitude`` and ``F_b.amplitude``:
           relative changes of the amplitudes of the periodic terms of `Robot.disturbance`, one for
           each component, such as ``tau_b.x.amplitude``.
+        - ``plate_1.drag`` and ``plate_1.sunlight``: relative changes of drag and of solar pressure
+          on the flat plates of `Robot.disturbance`, which are numbered from 1.
         - ``NAME.sensor``: constant offset in the measurement of a state that a `StateFeedback`
           reads, or of an output that an `OutputFeedback`, `LinearController` or
           `TrajectoryOutputFeedback` measures. ``NAME.noise``: white noise added to this measurement
           at each sample. If the spread is a number, it is the standard deviation of the noise in
           all runs. From any other spread, a standard deviation is drawn for each run.
+          ``NAME.drift``: standard deviation of the random change of the sensor's bias within 1 s.
+          By default, noise and drift are those that the robot's outputs declare, see `Output`; the
+          option ``noise=0`` leaves them out.
         - ``delay`` [s]: change of the argument `delay` of `simulate`. The total delay is rounded to
           whole steps; a negative total becomes 0.
         - ``JOINT.stiffness`` and ``JOINT.damping``: relative changes from the nominal values.

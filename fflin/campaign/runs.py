@@ -19,12 +19,13 @@ import numpy as np
 from fflin.base.errors import FflinError
 from fflin.base.record import content_digest
 from fflin.base.rotation import conjugate, quaternion_product
-from fflin.base.validation import Array, Indices, Mask
+from fflin.base.validation import Array, Indices, Mask, number
 from fflin.batch.files import MemoryStore
 from fflin.batch.run import Execution, Progress, Rows, run_chunks
 from fflin.campaign.dispersions import Dispersions
 from fflin.campaign.spreads import placed
 from fflin.control.channel import Saturation
+from fflin.control.sensor_errors import declared_errors
 from fflin.dynamics.coordinates import unwound
 from fflin.dynamics.state import StateMap
 from fflin.dynamics.state_rows import attitude_errors, moving_errors, states_of
@@ -33,6 +34,7 @@ from fflin.kernel.compiled import kernel
 from fflin.kernel.tree import LANES, laid_out
 from fflin.robot.robot import Robot
 from fflin.simulation import lanes
+from fflin.simulation.extension import extension_of, is_extended
 from fflin.simulation.motion import Motion
 from fflin.simulation.plan import Plan, SimulationOptions, law_of
 from fflin.simulation.report import SETTLED, THERE, is_late, settled_at
@@ -144,11 +146,13 @@ class CampaignJob:
         histories = settings.pop("histories", 0)
         unlimited = settings.pop("unlimited", False)
         within_chart = settings.pop("within_chart", False)
+        noise = number("noise", settings.pop("noise", 1.0))
         settings |= {
             "robot": robot,
             "policy": policy,
             "linear": False,
             "progress": False,
+            "noise": 0.0,
         }
         self.plan = Plan(SimulationOptions(**settings))
         if unlimited:
@@ -174,11 +178,18 @@ class CampaignJob:
             nu = state.velocities(v)
             self.target = states_of(state, q, nu)
             self.path = [q.ravel(), nu.ravel()]
+        # Errors that the outputs declare are drawn for each run of a campaign.
+        declared = None
+        if given is not None and noise and self.plan.policy:
+            sample = times.sample * times.dt
+            declared = declared_errors(self.plan.policy, state, sample)
+        if declared is not None:
+            declared = declared.scaled(noise)
         given = dict.fromkeys(state.names, 0.0) if given is None else given
         self.given = given
         with placed(given):
             self.dispersions = Dispersions(
-                given, self.plant, self.plan.policy, self.x0, seed, times
+                given, self.plant, self.plan.policy, self.x0, seed, times, declared
             )
         # Steps at which the histories have entries.
         self.steps = np.unique(
@@ -228,6 +239,8 @@ class CampaignJob:
         left: list[object] = [arguments]
         if plan.plant.constrained is not None:
             left.append(lanes.constraints_of(plan))
+        if is_extended(plan):
+            left.append(extension_of(plan))
         while left:  # the arrays and numbers in nested tuples
             value = left.pop()
             if isinstance(value, tuple):

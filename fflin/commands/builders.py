@@ -594,8 +594,8 @@ def loop_of(
         ("offset", "hold", "motion"),
         "without --trajectory FILE or --periodic N, this has no effect",
     )
-    if arguments.bdot is not None:
-        return _detumbling(robot, arguments, settings)
+    if (law := detumbling_law(arguments)) is not None:
+        return law, settings | _detumbling(robot, law, arguments)
     if arguments.free:
         of_law = ("limit", "delay", "reduce", "allocate", "gain", "controller", "mpc")
         names = (*_WEIGHTS, *_POSE, *_TARGETS[:2], "tilt", *of_law)
@@ -626,21 +626,31 @@ def loop_of(
     return policy, settings
 
 
+def detumbling_law(arguments: Namespace) -> fflin.BDot | fflin.RateDamping | None:
+    """Return the law of --bdot or --rate-damping, or None."""
+    if arguments.rate_damping is not None:
+        refuse(arguments, ("bdot",), "--rate-damping is another law for detumbling")
+        return fflin.RateDamping(arguments.rate_damping)
+    if arguments.bdot is not None:
+        return fflin.BDot(arguments.bdot)
+    return None
+
+
 def _detumbling(
-    robot: fflin.Robot, arguments: Namespace, settings: dict[str, Any]
-) -> tuple[fflin.Policy, dict[str, Any]]:
-    """Return the B-dot law of --bdot, and keyword arguments of `simulate`."""
+    robot: fflin.Robot, law: fflin.BDot | fflin.RateDamping, arguments: Namespace
+) -> dict[str, Any]:
+    """Return keyword arguments of `simulate` for a law that detumbles."""
     other_laws = ("free", "mpc", "gain", "controller", "reduce", "allocate")
     names = (*_WEIGHTS, *_POSE, *_TARGETS, *other_laws)
-    refuse(arguments, names, "--bdot replaces the regulator and its options")
-    policy = fflin.BDot(arguments.bdot)
-    policy.form(robot)  # raises an error for a robot without magnetorquers
+    why = "--bdot and --rate-damping replace the regulator and its options"
+    refuse(arguments, names, why)
+    law.form(robot)  # raises an error for a robot without magnetorquers
     q, v = start_of(robot, arguments)
-    settings |= {"q0": q, "v0": v, "frame": arguments.frame}
+    settings = {"q0": q, "v0": v, "frame": arguments.frame}
     assert robot.orbit is not None  # since it has magnetorquers
     if arguments.duration is None:
         settings["duration"] = robot.orbit.period
-    return policy, settings
+    return settings
 
 
 def _start_beside(
@@ -691,8 +701,7 @@ def with_errors(
         sizes[name] = np.zeros(len(policy.sensors))
         for index, value in by_name("measured signal", by_key, policy.sensors).items():
             sizes[name][index] = value
-    seed = np.zeros(1)
-    return with_sensor_errors(policy.fresh(), sizes["bias"], sizes["noise"], seed)
+    return with_sensor_errors(policy.fresh(), sizes["bias"], sizes["noise"], 0.0)
 
 
 def budget_of(

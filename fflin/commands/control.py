@@ -23,6 +23,7 @@ from fflin.commands.builders import (
     check_pictures,
     colors_of,
     designed,
+    detumbling_law,
     limits_of_options,
     load_robot,
     loop_of,
@@ -220,6 +221,8 @@ def simulate(arguments: Namespace) -> Report:
     measuring = with_errors(policy, arguments)
     if measuring is not policy:
         settings.pop("linear", None)  # the linear model has no sensor errors
+    if arguments.no_noise:
+        settings["noise"] = 0.0
     motion = fflin.simulate(
         robot, measuring, every=arguments.every, engine=arguments.engine, **settings
     )
@@ -238,7 +241,7 @@ def simulate(arguments: Namespace) -> Report:
     record["margins"], line = _margins_of(policy, settings)
     if line:
         text += f"\n{folded([line])}"
-    if arguments.bdot is not None and not motion.stopped:
+    if detumbling_law(arguments) is not None and not motion.stopped:
         record["detumbling_time"], line = _detumbling_of(motion)
         text += f"\n{folded([line])}"
     if window is not None and not motion.stopped:
@@ -315,6 +318,8 @@ def montecarlo(arguments: Namespace) -> Report:
     settings.pop("linear", None)  # the runs are not compared with a linear model
     for name in ("runs", "seed", "until", "width", "confidence", "workers", "threads"):
         settings[name] = getattr(arguments, name)
+    if arguments.no_noise:
+        settings["noise"] = 0.0
     settings["histories"] = _ROWS if arguments.plot else 0
     settings["out"] = None if is_table else path
     with going_on(path, "runs") as progress:

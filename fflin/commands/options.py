@@ -33,7 +33,7 @@ _LOOP = {
     "target": f"{_TARGET} {_INPUTS}",
     TRAJECTORY: _PATH,
     CONTROLLER: f"{_WEIGHTS} integral schedule gain controller negative-feedback allocate mpc "
-    "horizon bdot free limits limit delay",
+    "horizon bdot rate-damping free limits limit delay",
     SIMULATION: "duration dt step method frame",
     ROBOT: _SYSTEM,
 }
@@ -114,7 +114,7 @@ OPTIONS: dict[str, dict[str, str]] = {
     "simulate": {
         **_LOOP,
         SIMULATION: f"{_LOOP[SIMULATION]} every engine",
-        "pointing errors": "pointing accuracy budget noise bias",
+        "pointing errors": "pointing accuracy budget noise bias no-noise",
         OUTPUT: f"plot show output-file html {_PICTURES}",
     },
     "export": {"": "FILE", OUTPUT: "output-folder robot limits name real"},
@@ -129,7 +129,7 @@ OPTIONS: dict[str, dict[str, str]] = {
     "montecarlo": {
         **_LOOP,
         "": "ROBOT DISPERSIONS",
-        "runs": "runs seed until width confidence workers threads",
+        "runs": "runs seed until width confidence workers threads no-noise",
         "pointing errors": "pointing accuracy",
         OUTPUT: f"goal worst plot output-file force html {_PICTURES}",
     },
@@ -180,7 +180,8 @@ _SATURATION = (
 
 # {option or ARGUMENT: help}. A key "COMMAND OPTION" applies to this command only.
 ABOUT: dict[str, str] = {
-    "ROBOT": "robot name listed by `fflin robots`, or path of a URDF or robot.toml",
+    "ROBOT": "robot name listed by `fflin robots`, or path of a URDF, an MJCF "
+    "file (.xml) or a robot.toml",
     "joint": "position of a joint [rad|m]. The default is the position in robot.toml or, if there "
     "is none, the neutral position",
     "rpy": "base attitude: roll, pitch, yaw [deg] about fixed axes",
@@ -249,6 +250,8 @@ ABOUT: dict[str, str] = {
     "or with magnetorquers; 0 by default",
     "bdot": "detumble by the B-dot law with this gain [A m^2 s/T]: each magnetorquer has a moment "
     "proportional to the derivative of the magnetic field along its axis",
+    "rate-damping": "detumble from the measured angular velocity with this gain [N m s]: the "
+    "magnetorquers exert the part of -GAIN times the angular velocity across the magnetic field",
     "hold": "inputs between the knots of FILE: linearly interpolated (linear), or constant from "
     "each knot to the next (previous). The default is the setting in FILE or, if there is none, "
     "linear",
@@ -382,6 +385,7 @@ ABOUT: dict[str, str] = {
     "normal variable. NAME is a state, or an output for --controller, a group or a quantity such "
     "as gyroscope",
     "bias": "constant error of a measured signal, named as in --noise",
+    "no-noise": "leave out the noise and the drifting biases that the outputs of the robot declare",
     "json": "print the results as one JSON object",
     # Options of one command.
     "init output-file": "save the robot file (by default the URDF's name with .toml, in the "

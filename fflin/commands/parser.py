@@ -281,7 +281,7 @@ FORMS: dict[str, Form] = {
     "periodic": one(count_of, "N"),
     "motion": {"choices": ("held", "free")},
     "time": one(number, "T"),
-    "bdot": one(number, "GAIN"),
+    **dict.fromkeys(("bdot", "rate-damping"), one(number, "GAIN")),
     "runs": one(count_of, "N", required=True),
     "samples": one(count_of, "N", 100),
     "top": one(count_of, "N", 15),

@@ -1,8 +1,9 @@
-"""Detumbling by magnetorquers: the B-dot law."""
+"""Detumbling by magnetorquers: the B-dot law, and damping of the measured rate."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import pinocchio as pin
@@ -21,7 +22,67 @@ _FRAME: Frame = "lvlh"
 
 
 @dataclass(frozen=True)
-class BDot(Policy):
+class _MagneticLaw(Policy):
+    """Law whose moments are the components of a vector along the axes of the magnetorquers."""
+
+    gain: float
+
+    # Unit of the gain, and whether the law measures the rate of the base.
+    _UNIT: ClassVar[str]
+    _MEASURES_RATE: ClassVar[bool]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "gain", positive("gain", self.gain, self._UNIT))
+
+    @property
+    def axes(self) -> tuple[Frame | None, pin.SE3 | None]:
+        """Frame of the simulated motion, and None, because any reference is accepted."""
+        return _FRAME, None
+
+    def form(self, robot: Robot) -> BDotForm:
+        """Return the gain of the law for a robot."""
+        return BDotForm(self._gains(_actuation(robot)), self._MEASURES_RATE)
+
+    def bind(self, robot: Robot) -> Command:
+        """Return the law as a function of t, q and v."""
+        actuation = _actuation(robot)
+        gains = self._gains(actuation)
+        state = actuation.state
+        assert state.field is not None
+        orbit = state.field
+        field = orbit.magnetic
+        assert field is not None
+        root = robot.model.jointPlacements[ROOT].rotation
+
+        def command(t: float, q: Array, v: Array) -> Array:
+            R = root @ rotation_matrix(q[3:7])
+            b = field.at(t) @ R
+            if self._MEASURES_RATE:
+                orbit.move_to(t)
+                omega = v[PIN_ANGULAR] + orbit.rate @ R
+                vector = np.cross(b, omega) / (b @ b)
+            else:
+                vector = field.rate(t) @ R + np.cross(b, v[PIN_ANGULAR])
+            u: Array = gains @ vector
+            return u
+
+        return command
+
+    def _gains(self, actuation: Actuation) -> Array:
+        """Return the gain (nu, 3) for the measured vector in base axes."""
+        gains = np.zeros((len(actuation.names), 3))
+        for joint, index, axis in actuation.torquers:
+            if joint != ROOT:
+                raise InputError(
+                    f"{actuation.names[index]} is mounted on a link that moves relative to the "
+                    f"base, but {self.kind} requires magnetorquers on the base"
+                )
+            gains[index] = -self.gain * axis
+        return gains
+
+
+@dataclass(frozen=True)
+class BDot(_MagneticLaw):
     r"""B-dot law, which slows down the rotation of a satellite by magnetorquers.
 
     Each magnetorquer with the axis s receives the command :math:`-k\, s^T \dot b`, with the
@@ -53,56 +114,52 @@ class BDot(Policy):
     True
     """
 
-    gain: float
+    _UNIT: ClassVar[str] = "A m^2 s/T"
+    _MEASURES_RATE: ClassVar[bool] = False
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "gain", positive("gain", self.gain, "A m^2 s/T"))
 
-    @property
-    def axes(self) -> tuple[Frame | None, pin.SE3 | None]:
-        """Frame of the simulated motion, and None, because any reference is accepted."""
-        return _FRAME, None
+@dataclass(frozen=True)
+class RateDamping(_MagneticLaw):
+    r"""Damping of the rotation by magnetorquers, from the measured angular velocity.
 
-    def form(self, robot: Robot) -> BDotForm:
-        """Return the gain of the law for a robot."""
-        return BDotForm(self._gains(_actuation(robot)))
+    Each magnetorquer with the axis s receives the command
+    :math:`k\, s^T (\omega \times b) / |b|^2`, with the magnetic flux density b and the angular
+    velocity :math:`\omega` relative to inertial space. Three orthogonal magnetorquers then exert
+    the torque -k times the part of :math:`\omega` across the field. In contrast to `BDot`, the
+    rotation relative to inertial space approaches zero. A magnetometer and a gyroscope on the base
+    measure without errors. All other inputs are zero.
 
-    def bind(self, robot: Robot) -> Command:
-        """Return the law as a function of t, q and v."""
-        actuation = _actuation(robot)
-        gains = self._gains(actuation)
-        state = actuation.state
-        assert state.field is not None
-        field = state.field.magnetic
-        assert field is not None
-        root = robot.model.jointPlacements[ROOT].rotation
+    Parameters
+    ----------
+    gain : float
+        Gain k [N m s], positive. A usual value is :math:`2 n (1 + \sin i) J`, with the mean motion
+        n, the inclination i of the orbit to the magnetic equator, and the smallest principal moment
+        of inertia J.
 
-        def command(t: float, q: Array, v: Array) -> Array:
-            R = root @ rotation_matrix(q[3:7])
-            rate = field.rate(t) @ R + np.cross(field.at(t) @ R, v[PIN_ANGULAR])
-            u: Array = gains @ rate
-            return u
+    Raises
+    ------
+    InputError
+        If the gain is not positive. When the law is used: if the robot has no magnetorquers, or if
+        a magnetorquer is not fixed on the base.
 
-        return command
+    Examples
+    --------
+    >>> robot = fflin.load("cubesat_magnetic")
+    >>> v0 = fflin.velocity(robot, {"omega_b": 0.05})
+    >>> motion = fflin.simulate(robot, fflin.RateDamping(3e-5), v0=v0, duration=600.0, dt=1.0)
+    >>> bool(np.linalg.norm(motion.v[-1, 3:6]) < np.linalg.norm(v0[3:6]))
+    True
+    """
 
-    def _gains(self, actuation: Actuation) -> Array:
-        """Return the gain (nu, 3) for the derivative of the flux density in base axes."""
-        gains = np.zeros((len(actuation.names), 3))
-        for joint, index, axis in actuation.torquers:
-            if joint != ROOT:
-                raise InputError(
-                    f"{actuation.names[index]} is mounted on a link that moves relative to the "
-                    "base, but BDot requires magnetorquers on the base"
-                )
-            gains[index] = -self.gain * axis
-        return gains
+    _UNIT: ClassVar[str] = "N m s"
+    _MEASURES_RATE: ClassVar[bool] = True
 
 
 def _actuation(robot: Robot) -> Actuation:
     """Return the actuation of a robot; raise `InputError` if it has no magnetorquers."""
     if not has_magnetorquers(robot.inputs):
         raise InputError(
-            f"'{robot.name}' has no magnetorquers, which BDot commands; give it inputs such as "
+            f"'{robot.name}' has no magnetorquers for this law; give it inputs such as "
             "Magnetorquer((1, 0, 0), max=0.2)"
         )
     return Actuation(StateMap(robot, frame=_FRAME))

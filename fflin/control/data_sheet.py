@@ -6,13 +6,15 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import NamedTuple, TypeAlias
 
+import numpy as np
+
 from fflin.base.errors import InputError, listed, require_known
 from fflin.base.names import by_name, stands_for_any
-from fflin.base.validation import instance, quantity
+from fflin.base.validation import Array, instance, quantity
 from fflin.control.sensors import sensors_of_model
 from fflin.control.weights import Weight
 from fflin.linear.model import LinearModel
-from fflin.robot.outputs import SensorError
+from fflin.robot.outputs import Output, SensorError
 
 # An intensity or a covariance, or one figure of a data sheet such as {"angle_random_walk": 0.1}.
 Sheet: TypeAlias = "float | Mapping[str, float]"
@@ -148,6 +150,57 @@ def bias_intensities(
     values |= _by_output(lin, noise, keys, intensity)
     at = sorted(lin.output_names.index(name) for name in values)
     return {i: values[lin.output_names[i]] for i in at}
+
+
+class Deviations(NamedTuple):
+    """Errors of measurements (ny,): noise of a sample, and change of the bias within 1 s."""
+
+    noise: Array
+    drift: Array
+
+    def scaled(self, factor: float) -> Deviations:
+        """Return the errors multiplied by a factor."""
+        return Deviations(factor * self.noise, factor * self.drift)
+
+
+def declared_deviations(
+    names: Sequence[str],
+    units: Sequence[str],
+    sensors: Mapping[str, Output],
+    dt: float,
+) -> Deviations:
+    """Return the standard deviations that the fields `noise` and `bias` of outputs declare.
+
+    `sensors` is {name: output}, and dt [s] is the sampling time of the law. A density counts per
+    sample of its sensor.
+    """
+    noise, drift = np.zeros((2, len(names)))
+    for at, (name, unit) in enumerate(zip(names, units, strict=True)):
+        sensor = sensors.get(name)
+        if sensor is None:
+            continue
+        if sensor.noise is not None:
+            what = f"noise of output '{name}'"
+            noise[at] = _of_sample(what, sensor.noise, unit, sensor.sample or dt)
+        if sensor.bias is not None:
+            what = f"bias of output '{name}'"
+            drift[at] = _within_second(what, sensor.bias, unit)
+    return Deviations(noise, drift)
+
+
+def _of_sample(what: str, given: SensorError, unit: str, sample: float) -> float:
+    """Return the standard deviation of a measurement with a sampling time [s]."""
+    if not isinstance(given, Mapping):
+        return quantity(what, given)
+    figure, square = _squared(what, given, unit, _OF_NOISE)
+    return math.sqrt(square if figure.sampled else square / sample)
+
+
+def _within_second(what: str, given: SensorError, unit: str) -> float:
+    """Return the standard deviation of the change of a bias within 1 s."""
+    if not isinstance(given, Mapping):
+        return quantity(what, given)
+    return math.sqrt(_squared(what, given, unit, _OF_BIAS)[1])
 
 
 def output_keys(given: Iterable[str], names: Sequence[str]) -> dict[str, str]:

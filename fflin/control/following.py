@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -48,7 +48,7 @@ class Following(Policy):
     """
 
     law: Policy
-    terms: Sample
+    terms: Sample = field(repr=False)
     trajectory: Trajectory
     noise: Noise | None = None
 

@@ -14,13 +14,19 @@ from fflin.control.closed_loop import ClosedLoop
 from fflin.control.delayed import is_delayed, law_with_memory
 from fflin.control.gain import Gain
 from fflin.control.gain import Margins as GainMargins
+from fflin.control.lags import (
+    designed_lags,
+    lags_of_model,
+    model_with_lags,
+    robot_lags,
+    warn_of_lags,
+)
 from fflin.control.loop_margins import Margins, Place
 from fflin.control.optimal.disk import disk_gain, disk_phase
 from fflin.control.periodic_closed_loop import PeriodicClosedLoop
 from fflin.control.policy import Policy, System, as_policy
 from fflin.control.sensed_laws import sensed_systems
 from fflin.control.sensors import sensors_of_model, timing_of
-from fflin.linear.holding import lags_by_name
 from fflin.linear.model import LinearModel, refuse_frozen
 
 # The report of a simulation contains no margins if the loop has more states than this, or if a
@@ -67,7 +73,9 @@ def margins(
     delay : float, optional
         Delay [s] of all inputs. A delay of `lin`, see `LinearModel.discretize`, is added. By
         default, the delay is that of `lin`. If `lin` has none, it is the delay of the policy's
-        model, as in `simulate`.
+        model, as in `simulate`. Likewise, if `lin` has no lags, the loop has those of its robot; a
+        warning states lags for which the law was not designed. If the robot has none either, the
+        loop has the lags of the policy's model.
     sample : float, optional
         Sampling time [s] with which a continuous law is executed.
     at : {"inputs", "outputs"}, optional
@@ -97,6 +105,10 @@ def margins(
     """
     if not isinstance(at, str) or at not in ("inputs", "outputs"):
         raise InputError(f"at is {at!r}, expected 'inputs' or 'outputs'")
+    model = instance("lin", lin, LinearModel, "a fflin.LinearModel")
+    law = policy if isinstance(policy, Gain) else as_policy(policy)
+    if not lags_of_model(model):
+        warn_of_lags(law, robot_lags(law, model), "the loop")
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         return closed_loop(policy, lin, delay, sample, at).margins()
 
@@ -123,28 +135,28 @@ def delayed_model(
 ) -> tuple[LinearModel, float]:
     """Return the model with which a loop is closed, and the delay [s] in addition to its own.
 
-    If no delay is given and the model has none, the model gets the delay of the policy's model.
+    If no delay is given and the model has none, the model gets the delay of the policy's model. If
+    the model has no lags, it gets those of its robot, or else those of the policy's model.
     """
     instance("lin", lin, LinearModel, "a fflin.LinearModel")
     refuse_frozen(lin, "the analysis of a closed loop")
+    lin = _lagging(policy, lin)
     if delay is not None:
         delay = number("delay", delay)
         if delay < 0.0:
             raise InputError(f"delay is {delay:g} s, expected at least 0")
         return lin, delay
     known = policy if isinstance(policy, Gain) else as_policy(policy).model
-    if lin.added or known is None:
+    if lin.delay.any() or known is None:
         return lin, 0.0
-    if not known.delay.any() and is_delayed(known.state_names):
+    if is_delayed(known.state_names) and not (known.delay.any() or lin.added):
         raise InputError(
             "the gain was designed for delayed inputs, but lin has no delay; give the model "
             "of the gain, lin.discretize(dt, delay=...), or give delay="
         )
-    model = known._lin if isinstance(known, Gain) else known
-    has_lags = model is not None and bool(model.lag.any() or model.output_lag.any())
     source = lin.generator if lin.dt else lin
     if (
-        not (known.delay.any() or has_lags)
+        not known.delay.any()
         or known.input_names != lin.input_names
         or (lin.dt and not math.isclose(lin.dt, known.dt))
     ):
@@ -154,12 +166,29 @@ def delayed_model(
             "the law was designed for delayed inputs, but lin is sampled without a delay and its "
             "continuous model is unknown; give the continuous model, or delay=0"
         )
-    if model is not None and has_lags:
-        source = source.with_lags(*lags_by_name(model))
-    if not known.dt:
-        return source, 0.0
     delays = dict(zip(input_keys(lin), known.delay.tolist(), strict=True))
     return source.discretize(known.dt, delay=delays), 0.0
+
+
+def _lagging(policy: Policy | Gain, lin: LinearModel) -> LinearModel:
+    """Return the model with lags: its own, or those of its robot, or of the policy's model."""
+    if lags_of_model(lin):
+        return lin
+    law = policy if isinstance(policy, Gain) else as_policy(policy)
+    lags = robot_lags(law, lin) or designed_lags(law)
+    if not lags:
+        return lin
+    source = lin.generator if lin.dt else lin
+    if source is None:
+        raise InputError(
+            "the inputs or outputs of the robot have lags, but lin is sampled without them and its "
+            "continuous model is unknown; give the continuous model"
+        )
+    source = model_with_lags(source, lags)
+    if not lin.dt:
+        return source
+    delays = dict(zip(input_keys(lin), lin.delay.tolist(), strict=True))
+    return source.discretize(lin.dt, delay=delays)
 
 
 @in_one_thread

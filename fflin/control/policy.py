@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeAlias
 
 import numpy as np
 
+from fflin.base import html
 from fflin.base.errors import InputError
 from fflin.base.validation import (
     Array,
@@ -148,9 +149,12 @@ class PathForm(NamedTuple):
 
 
 class BDotForm(NamedTuple):
-    """Data of a law that feeds back the derivative of the magnetic flux density in base axes."""
+    """Data of a law that feeds back a vector of the magnetic field in base axes."""
 
-    gain: Array  # (nu, 3) [A m^2 s/T]; the command is its product with the derivative
+    gain: Array  # (nu, 3); the command is its product with the vector
+    # The vector is the derivative of the flux density b, or b x omega / |b|^2 with the inertial
+    # angular velocity omega if the law measures the rate.
+    measures_rate: bool = False
 
 
 Form: TypeAlias = StateForm | OutputForm | PathForm | BDotForm
@@ -217,6 +221,17 @@ class Policy(ABC):
     @abstractmethod
     def bind(self, robot: Robot) -> Command:
         """Return policy(t, q, v) -> u for a robot; each call returns one with its own memory."""
+
+    def _repr_html_(self) -> str:
+        """Return a card with the sampling time, the sensors and the notes of the law."""
+        time = "commands in continuous time"
+        if self.sample_time:
+            time = f"commands every {self.sample_time:g} s"
+        facts = [time]
+        if self.sensors:
+            facts.append(f"measures {', '.join(self.sensors)}")
+        notes = [html.paragraph(note, "note") for note in self.notes]
+        return html.result_card(self, html.paragraph("; ".join(facts)), *notes)
 
     @property
     def kind(self) -> str:

@@ -186,9 +186,11 @@ class SensorLag:
     """
 
     def __init__(self, lags: Array, start: Array) -> None:
+        self.start = start
         self._lagging = lags > 0.0
-        self._rate = np.zeros(len(lags))
-        self._rate[self._lagging] = 1.0 / lags[self._lagging]
+        # 1/T [1/s]; 0 for a sensor without a lag
+        self.rate: Array = np.zeros(len(lags))
+        self.rate[self._lagging] = 1.0 / lags[self._lagging]
         self._values = start.copy()
         self._rows = [self._values]
         self._fresh = True
@@ -213,7 +215,7 @@ class SensorLag:
         `Integrator.step_weights`.
         """
         self._fresh = True
-        self._rows.append(self._rate * (y - self._values))
+        self._rows.append(self.rate * (y - self._values))
         stage = len(self._rows) - 1
         self._values = weights[stage - 1, : stage + 1] @ np.array(self._rows)
         if stage == len(weights):

@@ -31,7 +31,7 @@ from fflin.control.policy import (
 )
 from fflin.control.trajectory_end import SteadyEnd, resting_end, steady_regulator
 from fflin.control.tvlqr import FilterSchedule, GainSchedule
-from fflin.dynamics.coordinates import Frame
+from fflin.dynamics.coordinates import Frame, refuse_constraints
 from fflin.dynamics.outputs import Measuring
 from fflin.dynamics.state import StateMap
 from fflin.dynamics.state_rows import moved_by, moving_error
@@ -135,8 +135,11 @@ class TrajectoryFeedback(Feedback):
         return poles_along(self.schedule)
 
     def form(self, robot: Robot) -> PathForm | OutputForm | None:
-        """Return the trajectory and the gains; None if they repeat, which only Python supports."""
-        if self.trajectory.period:
+        """Return the trajectory and the gains; None for a robot with constraints.
+
+        Only Python supports trajectories of robots with constraints.
+        """
+        if robot.constraints:
             return None
         return PathForm(self)
 
@@ -149,12 +152,20 @@ class TrajectoryFeedback(Feedback):
     def end(self) -> LinearModel:
         """Model at rest in the last configuration; `InputError` if no inputs hold the robot."""
         try:
-            return resting_end(self.trajectory)
+            return resting_end(self.trajectory, independent=self._independent)
         except EquilibriumError as error:
             raise InputError(
                 f"no inputs hold the robot after the end of the trajectory at {self.duration:g} s: "
                 f"{error}; give a duration within the trajectory"
             ) from None
+
+    @property
+    def _independent(self) -> tuple[str, ...] | None:
+        """Independent coordinates of the schedule of a robot with constraints; None without."""
+        if not self.trajectory.robot.constraints:
+            return None
+        names = self.schedule.state_names
+        return names[: len(names) // 2]
 
     def reference(self, t: float) -> tuple[Array, Array, Array]:
         """Return the reference q, v, and u in base axes at time t of the run."""
@@ -273,10 +284,13 @@ class TrajectoryFeedback(Feedback):
     def deviation(self, robot: Robot) -> Deviation:
         """Return f(t, q, v) -> u*, e: the inputs of the trajectory and the error relative to it."""
         state = self.state_map(robot)
+        picked = [state.names.index(name) for name in self.schedule.state_names]
+        reduced = len(picked) < state.nx
 
         def deviation(t: float, q: Array, v: Array) -> tuple[Array, Array]:
             q_star, v_star, u_star = self.commanded(t)
-            return u_star, moving_error(state, q_star, v_star, q, v)
+            e = moving_error(state, q_star, v_star, q, v)
+            return u_star, e[picked] if reduced else e
 
         return deviation
 
@@ -360,6 +374,7 @@ class TrajectoryOutputFeedback(OutputSensing, TrajectoryFeedback):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        refuse_constraints(self.trajectory.robot, "filters along trajectories")
         expected = "a FilterSchedule, as fflin.tvkalman returns it"
         seen = instance("filter", self.filter, FilterSchedule, expected)
         gains = self.schedule
@@ -399,13 +414,14 @@ class TrajectoryOutputFeedback(OutputSensing, TrajectoryFeedback):
         """Names of the outputs."""
         return self.filter.output_names
 
-    def form(self, robot: Robot) -> OutputForm | None:
+    def form(self, robot: Robot) -> OutputForm:
         """Return the matrices for each sample of the trajectory, and for the robot at rest.
 
-        Return None if the trajectory repeats, which only Python supports.
+        If the trajectory repeats, the matrices repeat, too.
         """
         if self.trajectory.period:
-            return None
+            samples = len(self.filter.A)
+            return OutputForm(self.bind(robot), self.terms, samples, cyclic=True)
         return OutputForm(self.bind(robot), self.terms, len(self.filter.A) + 2)
 
     @cached_property

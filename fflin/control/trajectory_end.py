@@ -1,5 +1,6 @@
 """Steady motion at the start or the end of a trajectory, and its regulator."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -40,6 +41,8 @@ class SteadyEnd(NamedTuple):
     def map(self) -> Array:
         """Map (nx, nx) from the errors of the trajectory to the errors of the model (5.4)."""
         names = self.model.state_names
+        if not self.fall.any():
+            return np.eye(len(names))
         attitude, speed = names.index("q_b.x"), names.index("v_b.x")
         T = np.eye(len(names))
         T[speed : speed + 3, attitude : attitude + 3] = -2.0 * skew(self.fall)
@@ -90,9 +93,10 @@ def steady_end(traj: LinearTrajectory, end: int = -1) -> SteadyEnd:
 def rest_or_fall(traj: LinearTrajectory, end: int = -1) -> SteadyEnd:
     """Return the robot at rest at knot `end`; in free fall, at rest relative to falling axes."""
     try:
-        return SteadyEnd(resting_end(traj, end), np.zeros(3))
+        resting = resting_end(traj, end, traj.independent)
+        return SteadyEnd(resting, np.zeros(3))
     except EquilibriumError as error:
-        if _falls(traj, end):
+        if not traj.robot.constraints and _falls(traj, end):
             return _falling_end(traj, end)
         where, given = "start", "P0"
         if end:
@@ -102,18 +106,26 @@ def rest_or_fall(traj: LinearTrajectory, end: int = -1) -> SteadyEnd:
         ) from None
 
 
-def resting_end(traj: Trajectory, end: int = -1) -> LinearModel:
-    """Return the model at rest at knot `end`, in base axes. Only wheels keep their speeds."""
-    return _at_rest(traj.robot, traj.q[end], traj.v[end])
+def resting_end(
+    traj: Trajectory, end: int = -1, independent: Sequence[str] | None = None
+) -> LinearModel:
+    """Return the model at rest at knot `end`, in base axes. Only wheels keep their speeds.
+
+    `independent` names the coordinates of a robot with constraints.
+    """
+    return _at_rest(traj.robot, traj.q[end], traj.v[end], independent)
 
 
-def _at_rest(robot: Robot, q: Array, v: Array) -> LinearModel:
+def _at_rest(
+    robot: Robot, q: Array, v: Array, independent: Sequence[str] | None = None
+) -> LinearModel:
     """Return the model at rest, in base axes. Only wheels keep their speeds in v (nv,)."""
     still, wheels = np.zeros(robot.nv), robot.wheels_at(v)
     spinning = [joint.idx_v for joint in robot.joints if joint.name in wheels]
     still[spinning] = v[spinning]
     held = equilibrium(robot, q, v=still, tilt=False)
-    return Linearizer(robot, moving=True)(held.q, still, held.u)
+    linearizer = Linearizer(robot, moving=True, independent=independent)
+    return linearizer(held.q, still, held.u)
 
 
 def _falls(traj: LinearTrajectory, end: int) -> bool:

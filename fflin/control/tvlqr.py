@@ -167,7 +167,8 @@ class GainSchedule(Schedule):
         """Return the trajectory that the gains were designed for."""
         state = StateMap(robot)
         made = f"the gain schedule was made for '{self.robot}'"
-        require_same(made, state, "state", self.state_names, None)
+        reduced = bool(robot.constraints)
+        require_same(made, state, "state", self.state_names, None, part=reduced)
         require_same(made, state, "input", self.input_names, None)
         if self.period and self.orbit != orbit_text(robot):
             raise InputError(

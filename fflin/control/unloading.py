@@ -38,6 +38,10 @@ def unload_wheels(law: LawT, design: Robot, rate: float) -> LawT:
     other on the robot: the wheels return to s_0 with the rate k, and the attitude is not disturbed.
     The unloading changes no other signal of the given law, so the margins do not change.
 
+    In orbit, the law may feed back the wheel speeds itself, because the links that carry the wheels
+    rotate. Magnetorquers produce the part of the external torque across the field by `Allocation`,
+    and the wheels wait for the rest.
+
     Thrusters that push in one direction only produce the external torque by `Allocation`. Choose k
     such that ``k * momentum`` is below the torque of the thrusters, because saturated thrusters
     disturb the attitude. A constant external torque T leaves the momentum T/k in the wheels.
@@ -176,7 +180,7 @@ def _require_unregulated(law: LinearLaw, speeds: list[str]) -> None:
         )
     matrices = np.vstack((law.system.D, law.system.B))
     fed_back = [name for name in speeds if matrices[:, sensors.index(name)].any()]
-    if fed_back:
+    if fed_back and not law.lin.mean_motion:
         raise InputError(
             f"the law already feeds back {listed(fed_back)}; design it with wheel_speeds=False, "
             "or for the robot with wheels alone"

@@ -89,6 +89,15 @@ def phasors_of(robot: Robot, field: OrbitField | None) -> list[Phasor]:
     return phasors
 
 
+def _unit(vector: Array) -> Array:
+    """Return a vector with the length 1, or a zero vector unchanged."""
+    length = float(np.linalg.norm(vector))
+    if not length:
+        return vector
+    unit: Array = vector / length
+    return unit
+
+
 class Plate:
     """Flat plate with its forces as functions of the directions of flight and of the sun.
 
@@ -97,14 +106,37 @@ class Plate:
     """
 
     def __init__(self, plate: FlatPlate, field: OrbitField | None) -> None:
-        self._plate = plate
+        self.plate = plate
         self._field = field
-        self._normal = np.array(plate.normal) / np.linalg.norm(plate.normal)
-        self._position = np.array(plate.position)
-        self._sun = np.array(plate.sun)
+        self.normal = _unit(np.array(plate.normal))
+        self.position = np.array(plate.position)
+        # Unit vector to the sun in inertial axes; zero without solar pressure.
+        self.sun = _unit(np.array(plate.sun))
         self._velocity = np.array(plate.velocity)
         # Whether the velocity is given in inertial axes. By default, it is the orbital velocity.
-        self._is_inertial = bool(self._velocity.any())
+        self.flow_is_inertial = bool(self._velocity.any())
+        # Solar pressure times area [N].
+        self.sunlight = 0.0
+        if any(plate.sun):
+            self.sunlight = plate.solar_pressure * plate.area
+
+    def _velocity_now(self) -> Array:
+        """Return the velocity [m/s] in inertial axes, or in the axes of the orbital frame."""
+        if self.flow_is_inertial or self._field is None:
+            return self._velocity
+        return self._field.velocity
+
+    @property
+    def flow(self) -> Array:
+        """Unit vector along the velocity; zero without a velocity."""
+        return _unit(self._velocity_now())
+
+    @property
+    def drag(self) -> float:
+        """Drag [N] if the plate is normal to the velocity; 0 without drag."""
+        plate = self.plate
+        square = float(self._velocity_now() @ self._velocity_now())
+        return 0.5 * plate.density * square * plate.drag_coefficient * plate.area
 
     def _in_world(self, vector: Array, t: float) -> Array:
         """Return an inertial vector in the axes of the world at time t [s]."""
@@ -118,36 +150,31 @@ class Plate:
 
         See (11.7) and (11.8).
         """
-        plate = self._plate
+        plate = self.plate
         force = np.zeros(3)
         if plate.density:
-            velocity = self._velocity
-            if self._is_inertial:
-                velocity = self._in_world(velocity, t)
-            elif self._field is not None:
-                velocity = self._field.velocity
-            speed = float(np.linalg.norm(velocity))
-            direction = (velocity / speed) @ R
+            flow = self.flow
+            if self.flow_is_inertial:
+                flow = self._in_world(flow, t)
+            direction = flow @ R
             cosine, _ = self._facing(direction)
-            pressure = 0.5 * plate.density * speed**2
-            force -= pressure * plate.drag_coefficient * plate.area * cosine * direction
-        if any(plate.sun):
-            sun = self._in_world(self._sun, t)
-            direction = (sun / np.linalg.norm(sun)) @ R
+            force -= self.drag * cosine * direction
+        if self.sunlight:
+            direction = self._in_world(self.sun, t) @ R
             cosine, normal = self._facing(direction)
             along_normal = 2.0 * (plate.specular * cosine + plate.diffuse / 3.0)
             per_pressure = (1.0 - plate.specular) * direction + along_normal * normal
-            force -= plate.solar_pressure * plate.area * cosine * per_pressure
-        return np.concatenate((force, np.cross(self._position, force)))
+            force -= self.sunlight * cosine * per_pressure
+        return np.concatenate((force, np.cross(self.position, force)))
 
     def _facing(self, direction: Array) -> tuple[float, Array]:
         """Return the cosine of the angle of incidence, at least 0, and the normal of the face."""
-        cosine = float(self._normal @ direction)
+        cosine = float(self.normal @ direction)
         if cosine >= 0.0:
-            return cosine, self._normal
-        if self._plate.two_sided:
-            return -cosine, -self._normal
-        return 0.0, self._normal
+            return cosine, self.normal
+        if self.plate.two_sided:
+            return -cosine, -self.normal
+        return 0.0, self.normal
 
 
 class BaseDisturbance:

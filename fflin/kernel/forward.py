@@ -17,10 +17,12 @@ from collections import namedtuple
 from fflin.kernel import bodies
 from fflin.kernel import vectors as vec
 from fflin.kernel.bodies import spatial_inertia_times, stored_momentum
+from fflin.kernel.extension import add_plates
 from fflin.kernel.orbit import (
     RATE_CHANGE,
     STRENGTH,
     add_gradient,
+    changing_field,
     flux_at,
     from_inertial_axes,
     kinetic_energy,
@@ -191,7 +193,7 @@ def push(work, tree, pushing):
 
 
 @called
-def disturb(work, robot, orbit, point, t):
+def disturb(work, robot, orbit, extension, point, t):
     """Add the disturbances at time t [s] to the generalised force that `push` has written."""
     disturbance = robot.disturbance
     for index in range(len(disturbance.at)):
@@ -203,14 +205,18 @@ def disturb(work, robot, orbit, point, t):
         if disturbance.held[index]:
             force = vec.across(vec.axes_of(point.q), force)
         vec.add3(work, robot.tree.offsets.c + disturbance.at[index], force)
+    if extension is not None:
+        axes, to = vec.axes_of(point.q), robot.tree.offsets.c
+        add_plates(work, extension.plates, orbit, axes, to)
 
 
 @called
-def accelerate(work, robot, orbit, point, t, rates, to):
+def accelerate(work, robot, orbit, extension, point, t, rates, to):
     """Write d(nu)/dt at time t [s] into `rates` from the index `to` on.
 
     `orbit` is None without an orbit. In orbit, nu is relative to the orbital frame, and the first
-    entry of `point.wrench` is the power [W] of inputs, disturbances and dampers.
+    entry of `point.wrench` is the power [W] of inputs, disturbances and dampers. `extension` is an
+    `Extension` with flat plates, or None.
 
     First, the equation of motion (3.1) is solved for the accelerations c: M c is the force of the
     inputs, minus the bias, minus the force of springs and dampers. `configure` must be called
@@ -227,10 +233,12 @@ def accelerate(work, robot, orbit, point, t, rates, to):
     else:
         bodies.write_columns(work, tree, None)
     push(work, tree, point.pushing)
-    disturb(work, robot, orbit, point, t)
+    disturb(work, robot, orbit, extension, point, t)
     vec.copy(work, force, point.wrench, 0, 6)
     if orbit is not None:
         store(point.wrench, 0, _power(work, tree, nu))
+        if len(orbit.ellipse) > 0:
+            vec.add(point.wrench, 0, _field_power(work, robot, orbit, point))
         add_gradient(work, tree, outwards_at(orbit, point.q), orbit.now[STRENGTH])
     bodies.move_bodies(work, tree, nu, omega_b)
     bodies.load_bodies(work, tree)
@@ -266,6 +274,18 @@ def _power(work, tree, nu):
         rate = load(nu, 6 + joint)
         total = total - load(tree.damping, joint) * rate * rate
     return total
+
+
+@called
+def _field_power(work, robot, orbit, point):
+    """Return the power [W] that changes the Jacobi integral in an elliptic orbit (17.3)."""
+    q, z = point.q, normal_at(orbit, point.q)
+    zero = vec.minus(z, z)
+    angular, linear = _momentum_error(work, robot, point.nu, (zero, zero))
+    position = vec.across(vec.axes_of(q), vec.get3(q, 0))
+    angular = vec.plus(angular, vec.cross(position, linear))
+    power = orbit.now[RATE_CHANGE] * vec.dot(z, angular)
+    return power - 0.5 * changing_field(work, robot.tree, orbit, q)
 
 
 def _turn_with_orbit(orbit, point, rates, to):

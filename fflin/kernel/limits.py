@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 from fflin.kernel.compiled import numba_is_there, without_numba
 from fflin.kernel.tree import batch_tree
-from fflin.robot.disturbance import PLATE
 from fflin.robot.inputs import has_magnetorquers
 from fflin.robot.joints import ROOT
 from fflin.robot.orbit import is_elliptic
@@ -35,7 +34,7 @@ class Task:
     events, callback, disturbance : bool
         Whether the simulation has these.
     lagging : bool
-        Whether an input or a measured output has a lag.
+        Whether an output has a lag that a law in an `Allocation` measures.
     python_policy : str
         Kind of the policy if it has no data for the compiled loop, or an empty text.
     own_sample_time : bool
@@ -98,10 +97,6 @@ def _has_constraints_in_orbit(robot: Robot) -> bool:
     return bool(robot.constraints) and robot.orbit is not None
 
 
-def _has_plates(robot: Robot) -> bool:
-    return PLATE in robot.disturbance
-
-
 LIMITS = (
     Limit(lambda task: not numba_is_there() and without_numba(), "{}"),
     Limit(lambda task: task.outputs, "the outputs are not the state"),
@@ -109,11 +104,12 @@ LIMITS = (
     Limit(lambda task: task.callback, "callbacks are called in Python"),
     Limit(lambda task: task.disturbance, "disturbances are computed in Python"),
     Limit(
-        lambda task: task.lagging, "lags of inputs and outputs are computed in Python"
+        lambda task: task.lagging,
+        "lags of outputs are not computed for a law in an Allocation",
     ),
     Limit(
-        lambda task: task.first(_is_in_elliptic_orbit),
-        "'{}' is in an elliptic orbit, whose field is computed in Python",
+        lambda task: "" if task.simulated else task.first(_is_in_elliptic_orbit),
+        "sweeps of '{}' in its elliptic orbit are computed in Python",
     ),
     Limit(lambda task: task.python_policy, "a {} is computed in Python"),
     Limit(
@@ -135,10 +131,6 @@ LIMITS = (
     Limit(
         lambda task: task.first(_has_constraints_in_orbit),
         "the constraints of '{}' are simulated in orbit in Python",
-    ),
-    Limit(
-        lambda task: task.simulated and task.first(_has_plates),
-        "the flat plates of '{}' are computed in Python",
     ),
     Limit(
         lambda task: task.own_sample_time,

@@ -14,6 +14,7 @@ from fflin.kernel import forward
 from fflin.kernel import vectors as vec
 from fflin.kernel.allocation import allocate, write_difference
 from fflin.kernel.constraints import CONSTRAINTS
+from fflin.kernel.extension import EXTENSION, lag_inputs
 from fflin.kernel.forward import MECHANICS, MOMENTUM_REFERENCE, POINT
 from fflin.kernel.orbit import ORBIT
 from fflin.kernel.policies import (
@@ -23,6 +24,7 @@ from fflin.kernel.policies import (
     command,
     correct,
     error,
+    observe,
     read_state,
 )
 from fflin.kernel.tree import FLAG, FLAGS, INDICES, LANED, REAL, REALS, WHOLE, Struct
@@ -277,20 +279,17 @@ CONSTRAINED = Struct(ConstrainedArguments, usual=ARGUMENTS, constraints=CONSTRAI
 CONSTRAINED_OF_ONE = CONSTRAINED.with_one_lane()
 
 
-def _combine(shares, row, rates, out):
-    """Write the sum of the rows of `rates`, with the weights in a row of `shares`.
+class ExtendedArguments(namedtuple("ExtendedArguments", "usual constraints extension")):
+    """Arguments of `advance_extended`: the arguments of `advance_constrained`, and the extension.
 
-    The first row of `rates` is the value of nu, or of the state z of a filter, at the start of the
-    step. The other rows are the time derivatives of nu, or of z, at the stages.
+    Without constraints, `constraints` is empty and is not read.
     """
-    size = len(out)
-    count = len(rates) // size
-    for index in range(size):
-        total = load(shares, row * count) * load(rates, index)
-        for stage in range(1, count):
-            part = load(rates, stage * size + index)
-            total = total + load(shares, row * count + stage) * part
-        store(out, index, total)
+
+
+EXTENDED = Struct(
+    ExtendedArguments, usual=ARGUMENTS, constraints=CONSTRAINTS, extension=EXTENSION
+)
+EXTENDED_OF_ONE = EXTENDED.with_one_lane()
 
 
 def goes_on(stop: StopConditions, origin: Entries, q: Entries, rates: Entries) -> bool:
@@ -315,19 +314,19 @@ def _move(robot, method, point, stage):
     rates, along = method.rates, method.along
     if stage == 1:
         vec.copy(point.q, 0, method.second, 0, len(point.q))
-    _combine(method.shift, stage, rates, along)
-    _combine(method.speed, stage, rates, point.nu)
+    vec.combine(method.shift, stage, rates, along)
+    vec.combine(method.speed, stage, rates, point.nu)
     begin = method.first if method.origin[stage] == 0 else method.second
     vec.displace(robot.tree, begin, along, point.q)
     if stage == len(method.origin) - 1:
-        _combine(method.shift, stage + 1, rates, along)
+        vec.combine(method.shift, stage + 1, rates, along)
         vec.displace(robot.tree, point.q, along, point.q)
 
 
-def _ask(work, robot, orbit, law, channel, point, t, step, stage):
+def _ask(work, robot, orbit, law, extension, channel, point, t, step, stage):
     """Write the command of the policy to `point.u`, and correct the memory of the policy."""
     count = step // max(channel.sample, 1)
-    command(work, robot, orbit, law, point, t, count, stage)
+    command(work, robot, orbit, law, extension, point, t, count, stage)
     allocate(law.allocation, orbit, point, law.u, t)
     if len(law.filter.E) > 0:
         limit(channel, point.u)
@@ -337,7 +336,7 @@ def _ask(work, robot, orbit, law, channel, point, t, step, stage):
 
 def advance(words, clock, last, every, rows, work):
     """Advance eight runs; `words` are the 64-bit words of `ARGUMENTS`, see `_advance`."""
-    _advance(ARGUMENTS(words), None, None, clock, last, every, rows, work)
+    _advance(ARGUMENTS(words), None, None, None, clock, last, every, rows, work)
 
 
 def advance_one(words, clock, last, every, rows, work):
@@ -345,48 +344,95 @@ def advance_one(words, clock, last, every, rows, work):
 
     A single run would be slower in eight equal lanes.
     """
-    _advance(ARGUMENTS_OF_ONE(words), None, None, clock, last, every, rows, work)
+    arguments = ARGUMENTS_OF_ONE(words)
+    _advance(arguments, None, None, None, clock, last, every, rows, work)
 
 
-# Only robots with constraints use the next two functions, and only robots in orbit use the two
-# functions after them, so that other robots do not wait until they are compiled.
+# Only robots with constraints use the next two functions, only robots in orbit the two functions
+# after them, and only robots with lags or flat plates the last six, so that other robots do not
+# wait until they are compiled.
 
 
 def advance_constrained(words, clock, last, every, rows, work):
     """Advance eight runs; `words` are the words of `CONSTRAINED`, see `_advance`."""
     arguments = CONSTRAINED(words)
-    usual = arguments.usual
-    _advance(usual, None, arguments.constraints, clock, last, every, rows, work)
+    usual, held = arguments.usual, arguments.constraints
+    _advance(usual, None, held, None, clock, last, every, rows, work)
 
 
 def advance_one_constrained(words, clock, last, every, rows, work):
     """Advance one run; `words` are the words of `CONSTRAINED_OF_ONE`, see `_advance`."""
     arguments = CONSTRAINED_OF_ONE(words)
-    usual = arguments.usual
-    _advance(usual, None, arguments.constraints, clock, last, every, rows, work)
+    usual, held = arguments.usual, arguments.constraints
+    _advance(usual, None, held, None, clock, last, every, rows, work)
 
 
 def advance_in_orbit(words, clock, last, every, rows, work):
     """Advance eight runs of a robot in orbit; the arguments are the arguments of `advance`."""
     arguments = ARGUMENTS(words)
-    _advance(arguments, arguments.orbit, None, clock, last, every, rows, work)
+    _advance(arguments, arguments.orbit, None, None, clock, last, every, rows, work)
 
 
 def advance_one_in_orbit(words, clock, last, every, rows, work):
     """Advance one run of a robot in orbit; the arguments are the arguments of `advance_one`."""
     arguments = ARGUMENTS_OF_ONE(words)
-    _advance(arguments, arguments.orbit, None, clock, last, every, rows, work)
+    _advance(arguments, arguments.orbit, None, None, clock, last, every, rows, work)
 
 
-def _advance(arguments, orbit, constraints, clock, last, every, rows, work):
+def advance_extended(words, clock, last, every, rows, work):
+    """Advance eight runs with an extension; `words` are the words of `EXTENDED`, see `_advance`."""
+    arguments = EXTENDED(words)
+    usual, extension = arguments.usual, arguments.extension
+    _advance(usual, None, None, extension, clock, last, every, rows, work)
+
+
+def advance_one_extended(words, clock, last, every, rows, work):
+    """Advance one run with an extension; `words` are the words of `EXTENDED_OF_ONE`."""
+    arguments = EXTENDED_OF_ONE(words)
+    usual, extension = arguments.usual, arguments.extension
+    _advance(usual, None, None, extension, clock, last, every, rows, work)
+
+
+def advance_extended_constrained(words, clock, last, every, rows, work):
+    """Advance eight runs of a robot with constraints and an extension; see `advance_extended`."""
+    arguments = EXTENDED(words)
+    usual, extension = arguments.usual, arguments.extension
+    held = arguments.constraints
+    _advance(usual, None, held, extension, clock, last, every, rows, work)
+
+
+def advance_one_extended_constrained(words, clock, last, every, rows, work):
+    """Advance one run of a robot with constraints and an extension; see `advance_one_extended`."""
+    arguments = EXTENDED_OF_ONE(words)
+    usual, extension = arguments.usual, arguments.extension
+    held = arguments.constraints
+    _advance(usual, None, held, extension, clock, last, every, rows, work)
+
+
+def advance_extended_in_orbit(words, clock, last, every, rows, work):
+    """Advance eight runs of a robot in orbit with an extension; see `advance_extended`."""
+    arguments = EXTENDED(words)
+    usual, extension = arguments.usual, arguments.extension
+    _advance(usual, usual.orbit, None, extension, clock, last, every, rows, work)
+
+
+def advance_one_extended_in_orbit(words, clock, last, every, rows, work):
+    """Advance one run of a robot in orbit with an extension; see `advance_one_extended`."""
+    arguments = EXTENDED_OF_ONE(words)
+    usual, extension = arguments.usual, arguments.extension
+    _advance(usual, usual.orbit, None, extension, clock, last, every, rows, work)
+
+
+def _advance(arguments, orbit, constraints, extension, clock, last, every, rows, work):
     """Advance all runs to the step `last`, or until one of the runs meets a stop condition.
 
     The function updates the point, the momentum reference, the state of the policy and the state of
     the channel. clock (1,) is the number of finished steps. Before step 0, the initial momentum and
     centre of mass are written into the momentum reference.
 
-    `orbit` is None without an orbit, and `constraints` is None for a robot without constraints. The
-    code for them is then not compiled.
+    `orbit` is None without an orbit, `constraints` is None for a robot without constraints, and
+    `extension` is None for a robot without lags and flat plates. The code for them is then not
+    compiled.
 
     If `every` is not 0, the function writes a row into `rows` at every step that is a multiple of
     `every`. A row consists of q, nu, u, the reference momentum (6,), the reference centre of mass
@@ -411,13 +457,13 @@ def _advance(arguments, orbit, constraints, clock, last, every, rows, work):
         for stage in range(len(method.origin)):
             t = step * h + method.nodes[stage]
             if law.kind != NOTHING and (channel.sample == 0 or stage == 0):
-                _command(work, arguments, orbit, t, step, stage)
-            forward.apply_faults(
-                robot.faults, robot.triads, step * h, h, point.u, point.pushing
-            )
-            forward.turn_held(robot, point)
+                _command(work, arguments, orbit, extension, t, step, stage)
+            _drive(robot, extension, method, point, step * h, stage)
             to = (1 + stage) * len(point.nu)
-            forward.accelerate(work, robot, orbit, point, t, method.rates, to)
+            forward.accelerate(
+                work, robot, orbit, extension, point, t, method.rates, to
+            )
+            _observe(work, arguments, extension, step, stage)
             if constraints is not None:
                 _constrain(work, robot, constraints, method, point, stage)
             if stage == 0:
@@ -429,7 +475,7 @@ def _advance(arguments, orbit, constraints, clock, last, every, rows, work):
                 forward.add_wrench(work, robot, orbit, kept, point, weight, moment)
             _move(robot, method, point, stage)
             if len(law.filter.rates) > len(law.filter.z):
-                _combine(method.speed, stage, law.filter.rates, law.filter.z)
+                vec.combine(method.speed, stage, law.filter.rates, law.filter.z)
             forward.configure(work, robot, point.q)
         forward.end_step(kept, h)
         if constraints is not None:
@@ -439,6 +485,30 @@ def _advance(arguments, orbit, constraints, clock, last, every, rows, work):
         clock[0] = step + 1
         if not _continues(arguments, constraints):
             break
+
+
+def _drive(robot, extension, method, point, t, stage):
+    """Write the inputs that act at a stage, after lags and faults, to `point.pushing`.
+
+    t [s] is the start of the step.
+    """
+    faults, h = robot.faults, method.h
+    if extension is None:
+        forward.apply_faults(faults, robot.triads, t, h, point.u, point.pushing)
+    else:
+        lag = extension.actuators
+        lag_inputs(lag, method.speed, point.u, stage)
+        forward.apply_faults(faults, robot.triads, t, h, lag.acting, point.pushing)
+    forward.turn_held(robot, point)
+
+
+def _observe(work, arguments, extension, step, stage):
+    """Advance the sensors with a lag by a stage."""
+    if extension is not None:
+        law, point, speed = arguments.law, arguments.point, arguments.method.speed
+        count = step // max(arguments.channel.sample, 1)
+        lag = extension.sensors
+        observe(work, arguments.robot, law, lag, speed, point, count, stage)
 
 
 def _record(kept, point, constraints, t, rows, at):
@@ -456,12 +526,12 @@ def _record(kept, point, constraints, t, rows, at):
     return at
 
 
-def _command(work, arguments, orbit, t, step, stage):
+def _command(work, arguments, orbit, extension, t, step, stage):
     """Write the inputs that the actuator channel lets through at a stage to `point.u`."""
     channel, point = arguments.channel, arguments.point
     if is_asked(channel, step):
         robot, law = arguments.robot, arguments.law
-        _ask(work, robot, orbit, law, channel, point, t, step, stage)
+        _ask(work, robot, orbit, law, extension, channel, point, t, step, stage)
     transmit(channel, step, point.nu, point.u)
 
 

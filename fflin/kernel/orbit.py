@@ -11,27 +11,40 @@ A circular orbit has a constant k = n^2 and theta' = n. Only `write_now` knows h
 time.
 """
 
+import math
 from collections import namedtuple
 
 from fflin.kernel import vectors as vec
 from fflin.kernel.bodies import add_column, at_parent, joint_axis, stored_momentum
 from fflin.kernel.tree import FIELD, INERTIA, PLACE, REALS, Struct
-from fflin.kernel.vectors import load
+from fflin.kernel.vectors import called, load
 
 # Offsets in `Orbit.now`.
-STRENGTH, RATE, RATE_CHANGE, ANGLE, FLUX, FLUX_CHANGE, END = 0, 1, 2, 3, 4, 7, 10
+STRENGTH, RATE, RATE_CHANGE, ANGLE, FLUX, FLUX_CHANGE = 0, 1, 2, 3, 4, 7
+STRENGTH_CHANGE, END = 10, 11
+
+# Offsets in `Orbit.ellipse`.
+ECCENTRICITY, MEAN_ANOMALY, START = 0, 1, 2
+
+# Largest number of steps for Kepler's equation, as in `robot.orbit.eccentric_anomaly`.
+_KEPLER_STEPS = 80
 
 
-class Orbit(namedtuple("Orbit", "outwards normal mean_motion latitude dipole now")):
+class Orbit(
+    namedtuple("Orbit", "outwards normal mean_motion ellipse latitude dipole now")
+):
     """Orbit of the simulated robot.
 
     - `outwards`, `normal` (3,): the unit vectors r and z in the axes of the orbital frame.
     - `mean_motion` (1,) [rad/s].
+    - `ellipse` (3,): eccentricity, and mean and true anomaly [rad] at t = 0; empty in a circular
+      orbit.
     - `latitude` (1,): argument of latitude [rad] at t = 0. `dipole` (3,) [T]: the amplitudes of
       `dynamics.magnetic.MagneticField`; zero without a magnetic field.
-    - `now` (10,): k [1/s^2], theta' [rad/s], theta'' [rad/s^2], the angle [rad] by which the
+    - `now` (11,): k [1/s^2], theta' [rad/s], theta'' [rad/s^2], the angle [rad] by which the
       orbital frame has rotated since t = 0, the magnetic flux density (3,) [T] in the axes of the
-      orbital frame, and the derivative (3,) of these three numbers. `write_now` writes all values.
+      orbital frame, the derivative (3,) of these three numbers, and the derivative of k [1/s^3].
+      `write_now` writes all values.
     """
 
 
@@ -45,6 +58,9 @@ def write_now(orbit, t):
     orbit.now[RATE] = n
     orbit.now[RATE_CHANGE] = 0.0
     orbit.now[ANGLE] = n * t
+    orbit.now[STRENGTH_CHANGE] = 0.0
+    if len(orbit.ellipse) > 0:
+        _write_ellipse(orbit, t)
     r, z = vec.get3(orbit.outwards, 0), vec.get3(orbit.normal, 0)
     along = vec.cross(z, r)
     cosine, sine = vec.cosine_and_sine(orbit.latitude[0] + n * t)
@@ -54,6 +70,48 @@ def write_now(orbit, t):
     change = vec.times(r, n * radial * cosine)
     change = vec.minus(change, vec.times(along, n * level * sine))
     vec.put3(orbit.now, FLUX_CHANGE, change)
+
+
+@called
+def _write_ellipse(orbit, t):
+    """Write the values of an elliptic orbit at time t [s], as `EllipticOrbit.at` computes them."""
+    n = orbit.mean_motion[0]
+    e = orbit.ellipse[ECCENTRICITY]
+    mean = orbit.ellipse[MEAN_ANOMALY] + n * t
+    whole_turns = 2.0 * math.pi * round(mean / (2.0 * math.pi))
+    E = _eccentric_anomaly(mean - whole_turns, e)
+    ratio = 1.0 - e * math.cos(E)
+    climb = n * e * math.sin(E) / (ratio * ratio)
+    rate = n * math.sqrt(1.0 - e * e) / (ratio * ratio)
+    gradient = n * n / (ratio * ratio * ratio)
+    sine = math.sqrt(1.0 + e) * math.sin(0.5 * E)
+    cosine = math.sqrt(1.0 - e) * math.cos(0.5 * E)
+    theta = 2.0 * math.atan2(sine, cosine) + whole_turns
+    orbit.now[STRENGTH] = gradient
+    orbit.now[RATE] = rate
+    orbit.now[RATE_CHANGE] = -2.0 * climb * rate
+    orbit.now[ANGLE] = theta - orbit.ellipse[START]
+    orbit.now[STRENGTH_CHANGE] = -3.0 * climb * gradient
+
+
+def _eccentric_anomaly(mean, e):
+    """Solve Kepler's equation; see `robot.orbit.eccentric_anomaly`."""
+    low = mean - e
+    high = mean + e
+    E = mean + e * math.sin(mean)
+    for _ in range(_KEPLER_STEPS):
+        residual = E - e * math.sin(E) - mean
+        if residual > 0.0:
+            high = min(high, E)
+        else:
+            low = max(low, E)
+        following = E - residual / (1.0 - e * math.cos(E))
+        if following < low or following > high:
+            following = 0.5 * (low + high)
+        if abs(following - E) <= 1e-16 * (1.0 + abs(E)):
+            return following
+        E = following
+    return E
 
 
 def outwards_at(orbit, q):
@@ -101,11 +159,16 @@ def pull_on(orbit, q, x):
 
     Here x is relative to the origin of the orbital frame, and in base axes.
     """
+    turning = vec.times(vec.cross(normal_at(orbit, q), x), orbit.now[RATE_CHANGE])
+    return vec.minus(_conservative_pull(orbit, q, x), turning)
+
+
+def _conservative_pull(orbit, q, x):
+    """Return the part of `pull_on` that has a potential: without the change of the frame's rate."""
     now, z = orbit.now, normal_at(orbit, q)
     fall = tide(outwards_at(orbit, q), now[STRENGTH], x)
     across_normal = vec.minus(x, vec.times(z, vec.dot(z, x)))
-    fall = vec.plus(fall, vec.times(across_normal, now[RATE] * now[RATE]))
-    return vec.minus(fall, vec.times(vec.cross(z, x), now[RATE_CHANGE]))
+    return vec.plus(fall, vec.times(across_normal, now[RATE] * now[RATE]))
 
 
 def _inertia_times(work, at, w):
@@ -229,6 +292,35 @@ def kinetic_energy(work, tree, nu):
     return total
 
 
+def changing_field(work, tree, orbit, q):
+    """Return the integral of x^T G x over the mass, where G is dK/dt without its skew part.
+
+    K is the matrix of (17.1), and x is the position in the orbital frame; see (17.3).
+    """
+    now, r, z = orbit.now, outwards_at(orbit, q), normal_at(orbit, q)
+    inertia = tree.offsets.subtree_inertias
+    m, h = load(work, inertia), vec.get3(work, inertia + 1)
+    position = vec.across(vec.axes_of(q), vec.get3(q, 0))
+    turning = 2.0 * now[RATE] * now[RATE_CHANGE]
+    pulled = tide(r, now[STRENGTH_CHANGE], position)
+    across_normal = vec.minus(position, vec.times(z, vec.dot(z, position)))
+    pulled = vec.plus(pulled, vec.times(across_normal, turning))
+    first = vec.plus(vec.times(position, m), vec.times(h, 2.0))
+    total = vec.dot(pulled, first)
+    along_r, along_z, trace = _second_moments(work, inertia, r, z)
+    total = total + now[STRENGTH_CHANGE] * (3.0 * along_r - trace)
+    return total + turning * (trace - along_z)
+
+
+def _second_moments(work, inertia, r, z):
+    """Return the integrals of (r y)^2, (z y)^2 and y^2 over the mass, y from the base's origin."""
+    (xx, _, _), (yy, _, zz) = vec.get6(work, inertia + 4)
+    trace = 0.5 * (xx + yy + zz)
+    along_r = trace - vec.dot(r, _inertia_times(work, inertia, r))
+    along_z = trace - vec.dot(z, _inertia_times(work, inertia, z))
+    return along_r, along_z, trace
+
+
 def orbital_potential(work, tree, orbit, q):
     """Return the potential energy [J] in the orbital frame, without springs (14.3)."""
     now, r, z = orbit.now, outwards_at(orbit, q), normal_at(orbit, q)
@@ -236,13 +328,10 @@ def orbital_potential(work, tree, orbit, q):
     m, h = load(work, inertia), vec.get3(work, inertia + 1)
     position = vec.across(vec.axes_of(q), vec.get3(q, 0))
     first = vec.plus(vec.times(position, 0.5 * m), h)
-    total = vec.dot(pull_on(orbit, q, position), first)
+    total = vec.dot(_conservative_pull(orbit, q, position), first)
     # The integral of y^T K y over the mass, with y from the base's origin. It is the sum of the
     # products of K with the second moments P = tr(I) / 2 E - I.
-    (xx, _, _), (yy, _, zz) = vec.get6(work, inertia + 4)
-    trace = 0.5 * (xx + yy + zz)
-    along_r = trace - vec.dot(r, _inertia_times(work, inertia, r))
-    along_z = trace - vec.dot(z, _inertia_times(work, inertia, z))
+    along_r, along_z, trace = _second_moments(work, inertia, r, z)
     second = now[STRENGTH] * (3.0 * along_r - trace)
     second = second + now[RATE] * now[RATE] * (trace - along_z)
     total = -(total + 0.5 * second)

@@ -10,8 +10,9 @@ import numpy as np
 from fflin.kernel import vectors as vec
 from fflin.kernel.allocation import ALLOCATION
 from fflin.kernel.bodies import move_bodies
+from fflin.kernel.extension import lag_sensors, lagged
 from fflin.kernel.forward import COMMON_POINT, joint_position
-from fflin.kernel.orbit import flux_rate_at, spin_at, write_now
+from fflin.kernel.orbit import flux_at, flux_rate_at, spin_at, write_now
 from fflin.kernel.tree import (
     FLAG,
     FLAGS,
@@ -24,7 +25,7 @@ from fflin.kernel.tree import (
     WHOLE,
     Struct,
 )
-from fflin.kernel.vectors import angle, called, chosen, load, store, whole
+from fflin.kernel.vectors import angle, called, chosen, floor, load, store, whole
 
 # a time nearer to a knot than this fraction of the interval counts as the knot
 _NEAR = 1e-9
@@ -33,7 +34,8 @@ _NEAR = 1e-9
 class Path(
     namedtuple(
         "Path",
-        "t q u shift speed hold ahead ends held over last starts K order along e point",
+        "t q u smooth shift speed hold ahead ends held over last period slack starts K order along "
+        "e point",
     )
 ):
     """A trajectory and its feedback gains, both as piecewise polynomials.
@@ -42,8 +44,9 @@ class Path(
     - `shift`, `speed`: coefficients (4, 6 + n) of cubic polynomials for each interval between two
       knots. The cubics of `shift` give the displacement from the interval's first knot. The cubics
       of `speed` give nu. The variable of both cubics is the elapsed fraction of the interval.
-    - `hold`: if true, u is constant between knots, else linear. u is evaluated `ahead` [s] after
-      the current time.
+    - `hold`: if true, u is constant between knots, else linear. If `smooth` is not empty, u is a
+      cubic polynomial instead, with coefficients (4, nu) for each interval. u is evaluated `ahead`
+      [s] after the current time.
     - `held`: for each torque or force in world axes, the index of the first of the three inputs.
     - `K`: coefficients (m, `order`, nu, nx) of the gain. The gain is a polynomial in time on each
       of m intervals, which begin at the times `starts` (m,) [s]. The variable of each polynomial is
@@ -51,12 +54,14 @@ class Path(
       trajectory, the gain is constant.
     - `ends`: True if the trajectory ends before the run. In this case, `q`, `u`, `speed` and `K`
       have one further row, which applies after the time `over` [s] of the run.
+    - `period` [s]: time after which trajectory and gains repeat, or 0. A time less than `slack` [s]
+      before the end of a period counts as the start of the next one, for the gain.
     - Work space: `along` (6 + n,) for a displacement, `e` (nx,) for the error, and `point` for the
       followed point.
     """
 
 
-_OF_PATH = {FLAG: "hold ends", REAL: "ahead over last"}
+_OF_PATH = {FLAG: "hold ends", REAL: "ahead over last period slack"}
 PATH = Struct(
     Path, REALS, _OF_PATH, held=INDICES, order=WHOLE, e=LANED, point=COMMON_POINT
 )
@@ -87,6 +92,13 @@ def _placed(knots, time):
         k = k + 1
         s = 0.0
     return k, 0.0 if s < _NEAR else min(s, 1.0)
+
+
+def _in_period(path, since):
+    """Return the time since the start of the trajectory, within a period if there is one."""
+    if path.period > 0.0:
+        return since - path.period * floor(since / path.period)
+    return since
 
 
 def error(robot, path, point):
@@ -129,10 +141,11 @@ def track(robot, path, point, u, t):
     last = len(path.t) - 2
     knots = path.t
     count = len(path.point.u)
-    time = knots[0] + max(t, 0.0)
+    time = knots[0] + _in_period(path, max(t, 0.0))
     after = path.ends and t > path.over
     k, s = _placed(knots, time)
-    at, share = _placed(knots, min(time + path.ahead, knots[last + 1]))
+    middle = knots[0] + _in_period(path, max(t, 0.0) + path.ahead)
+    at, share = _placed(knots, min(middle, knots[last + 1]))
     if after:
         k = last + 2
         at = last + 2
@@ -143,6 +156,8 @@ def track(robot, path, point, u, t):
         if share > 0.0 and not path.hold:
             value += share * (path.u[(at + 1) * count + index] - value)
         followed.u[index] = value
+    if len(path.smooth) > 0:
+        _cubic(path.smooth, at, share, followed.u)
     if after:
         vec.copy(
             path.speed,
@@ -166,7 +181,10 @@ def track(robot, path, point, u, t):
     error(robot, path, point)
     starts = path.starts
     width = len(path.e)
-    since = path.starts[0] + min(max(t, 0.0), path.last)
+    since = _in_period(path, max(t, 0.0))
+    if path.period > 0.0 and path.period - since <= path.slack:
+        since = 0.0
+    since = path.starts[0] + min(since, path.last)
     k = _latest(starts, since)
     since = 0.0 if after else since - starts[k]
     k = len(starts) if after else k
@@ -182,7 +200,7 @@ def track(robot, path, point, u, t):
         store(u, row, total)
 
 
-NOTHING, LINEAR, TRACK, B_DOT = range(4)
+NOTHING, LINEAR, TRACK, B_DOT, DAMPING = range(5)
 
 
 class Law(
@@ -194,8 +212,10 @@ class Law(
 ):
     """A policy. In compiled code, `x`, `y`, `added` and `u` have one column per lane.
 
-    - `kind`: NOTHING, LINEAR, TRACK or B_DOT. B_DOT is for robots in orbit, and computes u from the
-      derivative of the magnetic flux density in base axes, with the gain `filter.D` (nu, 3).
+    - `kind`: NOTHING, LINEAR, TRACK, B_DOT or DAMPING. B_DOT and DAMPING are for robots in orbit,
+      and compute u from a vector in base axes, with the gain `filter.D` (nu, 3). For B_DOT, the
+      vector is the derivative of the magnetic flux density b. For DAMPING, it is b x w / |b|^2 with
+      the inertial angular velocity w.
       NOTHING computes no command. LINEAR computes u from y, with
       `grid` if the grid has joints, otherwise with `filter`. TRACK computes u = u* - K e along
       `path`.
@@ -284,7 +304,7 @@ def read_state(robot, law, point, row):
     vec.copy(nu, 6, x, 12 + n, n)
 
 
-def _row(law, count):
+def row_at(law, count):
     """Return the row of the arrays with one row per sample at the sample `count`."""
     rows = len(law.origin) // 7
     if law.cyclic:
@@ -301,36 +321,14 @@ def _times(matrix, row, x):
     return total
 
 
-def command(work, robot, orbit, law, point, t, count, stage):
-    """Write the command of a policy into `law.u`.
+def measure(work, robot, law, point, row):
+    """Write the state and the rates of the gyroscopes into `law.x`.
 
-    t [s] is the time of the run, and `stage` the index of the stage in the step. `count` is the
-    index of the sample, or the index of the step if commands are continuous. `orbit` is None
-    without an orbit.
+    `row` is the argument of `read_state`. The motion of the bodies must be in `work`.
     """
-    if law.kind == TRACK:
-        track(robot, law.path, point, law.u, t)
-        return
-    if orbit is not None and law.kind == B_DOT:
-        write_now(orbit, t)
-        flux_rate = flux_rate_at(orbit, point.q, point.nu)
-        for index in range(len(law.u)):
-            gain = vec.get3(law.filter.D, 3 * index)
-            store(law.u, index, vec.dot(gain, flux_rate))
-        return
-    row = _row(law, count)
     read_state(robot, law, point, row)
-    # Compute the outputs y, with the noise of the sample.
-    outputs = len(law.measured)
     gyros = law.gyros
-    tree = robot.tree
-    offsets = tree.offsets
-    if len(gyros) > 0:
-        omega_b = vec.get3(point.nu, 0)
-        if orbit is not None:
-            write_now(orbit, t)
-            omega_b = vec.plus(omega_b, spin_at(orbit, point.q))
-        move_bodies(work, tree, point.nu, omega_b)
+    offsets = robot.tree.offsets
     for index in range(len(gyros)):
         rate = vec.get3(work, offsets.motion + gyros[index] * MOTION)
         axes = vec.get_columns(work, offsets.places + gyros[index] * PLACE)
@@ -338,13 +336,56 @@ def command(work, robot, orbit, law, point, t, count, stage):
             vec.get_columns(law.gyro_axes, 9 * index), vec.across(axes, rate)
         )
         vec.put3(law.x, 2 * len(point.nu) + 3 * index, rate)
+
+
+def observe(work, robot, law, lag, speed, point, count, stage):
+    """Advance the sensors with a lag by a stage; see `extension.lag_sensors`.
+
+    `count` and `stage` are the arguments of `command`. The motion of the bodies must be in `work`.
+    """
+    if len(lag.values) > 0:
+        measure(work, robot, law, point, row_at(law, count))
+        lag_sensors(lag, speed, law.x, law.measured, stage)
+
+
+def command(work, robot, orbit, law, extension, point, t, count, stage):
+    """Write the command of a policy into `law.u`.
+
+    t [s] is the time of the run, and `stage` the index of the stage in the step. `count` is the
+    index of the sample, or the index of the step if commands are continuous. `orbit` is None
+    without an orbit, and `extension` is an `Extension` with lags of sensors, or None.
+    """
+    if law.kind == TRACK:
+        track(robot, law.path, point, law.u, t)
+        return
+    if orbit is not None and law.kind >= B_DOT:
+        write_now(orbit, t)
+        measured = flux_rate_at(orbit, point.q, point.nu)
+        if law.kind == DAMPING:
+            b = flux_at(orbit, point.q)
+            rate = vec.plus(vec.get3(point.nu, 0), spin_at(orbit, point.q))
+            measured = vec.times(vec.cross(b, rate), 1.0 / vec.dot(b, b))
+        for index in range(len(law.u)):
+            gain = vec.get3(law.filter.D, 3 * index)
+            store(law.u, index, vec.dot(gain, measured))
+        return
+    row = row_at(law, count)
+    # Compute the outputs y, with the noise of the sample.
+    outputs = len(law.measured)
+    tree = robot.tree
+    if len(law.gyros) > 0:
+        omega_b = vec.get3(point.nu, 0)
+        if orbit is not None:
+            write_now(orbit, t)
+            omega_b = vec.plus(omega_b, spin_at(orbit, point.q))
+        move_bodies(work, tree, point.nu, omega_b)
+    measure(work, robot, law, point, row)
     added = count % max(len(law.added) // max(outputs, 1), 1) * outputs
     for index in range(outputs):
-        store(
-            law.y,
-            index,
-            load(law.x, law.measured[index]) + load(law.added, added + index),
-        )
+        value = load(law.x, law.measured[index])
+        if extension is not None:
+            value = lagged(extension.sensors, index, value)
+        store(law.y, index, value + load(law.added, added + index))
     if len(law.grid.joint) > 0:
         _feed_back_between(robot, law, point)
     else:
@@ -443,7 +484,7 @@ def correct(law, count, stage):
     """
     controller = law.filter
     size = len(controller.z)
-    row = _row(law, count)
+    row = row_at(law, count)
     along = len(controller.rates) > size
     for index in range(size):
         change = _times(controller.E, row * size + index, law.u)

@@ -313,6 +313,22 @@ def axes_of(q):
     return columns_of(attitude(q))
 
 
+def combine(shares, row, rates, out):
+    """Write the sum of the rows of `rates`, with the weights in a row of `shares`.
+
+    The first row of `rates` is the value of nu, or of the state z of a filter, at the start of the
+    step. The other rows are the time derivatives of nu, or of z, at the stages.
+    """
+    size = len(out)
+    count = len(rates) // size
+    for index in range(size):
+        total = load(shares, row * count) * load(rates, index)
+        for stage in range(1, count):
+            part = load(rates, stage * size + index)
+            total = total + load(shares, row * count + stage) * part
+        store(out, index, total)
+
+
 def displace(tree, q, along, out):
     """Displace q by the tangent vector `along`, and write the result into `out`.
 

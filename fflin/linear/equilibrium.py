@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import permutations, product
 from typing import NamedTuple
@@ -24,10 +25,13 @@ from fflin.dynamics.coordinates import (
     frame_of,
     refuse_constraints,
     refuse_elliptic,
+    refuse_orbit,
 )
 from fflin.dynamics.disturbance import BaseDisturbance
 from fflin.dynamics.orbital import OrbitField, mean_motion
 from fflin.dynamics.state import Actuation, StateMap
+from fflin.linear.constrained_equilibrium import ConstrainedBalance
+from fflin.linear.least_norm import EPS, TOLERANCE, least_norm
 from fflin.linear.linearization import Linearizer
 from fflin.linear.model import LinearModel
 from fflin.robot.joints import ROOT
@@ -119,6 +123,7 @@ def equilibrium(
     reference: pin.SE3 | None = None,
     tilt: bool = True,
     disturbed: bool = False,
+    forces: Mapping[str, float] | None = None,
 ) -> Equilibrium:
     r"""Compute the spring deflections and the minimum-norm inputs that balance all forces.
 
@@ -178,6 +183,10 @@ def equilibrium(
         its flat plates at t = 0. Such inputs show what the actuators must hold. By default, the
         inputs are the inputs of a control law, which does not know the disturbance; a linear model
         does not contain it either. Inertial axes are those at t = 0.
+    forces : mapping, optional
+        Forces [N] and torques [N m] that constraints must exert, such as
+        ``{"grasp.force.x": 5.0}``, with the names and axes of `ConstraintForce`. The other
+        forces in a loop follow from the inputs of minimum norm.
 
     Returns
     -------
@@ -202,6 +211,10 @@ def equilibrium(
 
     Notes
     -----
+    For a robot with constraints, the forces are balanced in the independent coordinates, which name
+    the residual. The robot must be at rest, and must not be in orbit. Joints do not deflect: if
+    springs act on joints without a motor, q must be a configuration at which they are balanced.
+
     The bounds of thrusters turn the minimisation into a least-distance problem, which non-negative
     least squares solve exactly (Lawson and Hanson, Solving Least Squares Problems, 1974,
     chapter 23).
@@ -215,13 +228,36 @@ def equilibrium(
     True
     """
     state = StateMap(robot, frame=frame, reference=reference)
-    refuse_constraints(robot, "equilibria")
     refuse_elliptic(robot, "equilibria", _PERIODIC)
     tilt = truth("tilt", tilt)
+    if forces and not robot.constraints:
+        raise InputError(
+            f"forces is given, but '{robot.name}' has no constraints that exert forces; leave out "
+            "forces"
+        )
     pushed = BaseDisturbance(robot, state.field, constant=True)
     if not truth("disturbed", disturbed):
         pushed.clear()
     given = robot.neutral() if q is None else robot.checked_configuration(q)
+    if robot.constraints:
+        refuse_orbit(robot, "equilibria of robots with constraints")
+        _require_rest(robot, v)
+        disturbance = pushed.wrench(0.0, given)
+        held = ConstrainedBalance(robot, given, disturbance, forces or {})
+        if not held.holds:
+            raise _unbalanced(robot, held.left, held.residual, held.names)
+        u = _in_frame(state, held.lin.q, held.u, reference)
+        still = np.zeros(robot.n), np.zeros(3)
+        return Equilibrium(
+            held.lin.q,
+            u,
+            *still,
+            held.residual,
+            held.lin.input_names,
+            held.lin.input_units,
+            tuple(held.names),
+            tuple(held.names.values()),
+        )
     # put the reference at the base, so that forces and inputs are in base axes
     if robot.orbit:
         base_pose = robot.model.jointPlacements[ROOT] * pin.XYZQUATToSE3(given[:7])
@@ -235,17 +271,12 @@ def equilibrium(
     balance = _with_other_points(problem, balance, given)
     if not balance.holds:
         balance = first
-    if not balance.holds:
-        raise _unbalanced(robot, balance)
     pushes = forces_of(robot)
+    if not balance.holds:
+        raise _unbalanced(robot, balance.left, balance.residual, pushes)
     at = balance.lin.q
-    u = balance.u
+    u = _in_frame(state, at, balance.u, reference)
     actuation = Actuation(state)
-    if reference is not None or robot.orbit:
-        base = robot.model.jointPlacements[ROOT] * pin.XYZQUATToSE3(at[:7])
-        R = state.reference.rotation.T @ base.rotation
-        for columns in actuation.held:
-            u[columns] = R @ u[columns]
     rotation = np.zeros(3)
     if (at[3:7] != given[3:7]).any():
         before, after = pin.Quaternion(given[3:7]), pin.Quaternion(at[3:7])
@@ -309,11 +340,38 @@ def _with_other_points(problem: _Problem, balance: _Balance, given: Array) -> _B
     return balance
 
 
-def _unbalanced(robot: Robot, balance: _Balance) -> EquilibriumError:
-    """Return the error that lists the residual forces of a balance, the largest first."""
-    sizes, named = np.abs(balance.left), list(forces_of(robot).items())
+def _in_frame(state: StateMap, q: Array, u: Array, reference: pin.SE3 | None) -> Array:
+    """Return inputs u (nu,) in base axes in the axes of the inputs of `linearize`."""
+    robot = state.robot
+    if reference is None and not robot.orbit:
+        return u
+    base = robot.model.jointPlacements[ROOT] * pin.XYZQUATToSE3(q[:7])
+    R = state.reference.rotation.T @ base.rotation
+    turned = u.copy()
+    for columns in Actuation(state).held:
+        turned[columns] = R @ u[columns]
+    return turned
+
+
+def _require_rest(robot: Robot, v: Array | None) -> None:
+    """Raise `InputError` if a robot with constraints moves."""
+    if v is not None and np.any(robot.checked_velocity(v)):
+        raise InputError(
+            f"'{robot.name}' has constraints, so that equilibria are computed only at rest; leave "
+            "out v"
+        )
+
+
+def _unbalanced(
+    robot: Robot, left: Array, residual: Array, names: Mapping[str, str]
+) -> EquilibriumError:
+    """Return the error that lists the residual forces, the largest first.
+
+    `left` contains the residual in comparable units, and `names` the names with their units.
+    """
+    sizes, named = np.abs(left), list(names.items())
     forces = [
-        f"{named[i][0]} {balance.residual[i]:.3g} {named[i][1]}"
+        f"{named[i][0]} {residual[i]:.3g} {named[i][1]}"
         for i in np.argsort(-sizes)  # the largest scaled force first
         if sizes[i] > 1e-6 * sizes.max()
     ]
@@ -472,7 +530,7 @@ class _Balance:
         balance what they can, so only the part of a change that they cannot balance counts.
         """
         basis, sizes, _ = np.linalg.svd(self._pushing)
-        rank = int((sizes > _EPS * len(basis) * sizes.max(initial=0.0)).sum())
+        rank = int((sizes > EPS * len(basis) * sizes.max(initial=0.0)).sum())
         beyond = basis[:, rank:].T
         # A (nv, 3) is the derivative of the accelerations with respect to q_b, half the rotation.
         effect = 0.5 * beyond @ self._by_tilt
@@ -535,48 +593,6 @@ def _require_steady(lin: LinearModel, drift: Array) -> None:
     )
 
 
-_EPS = float(np.finfo(float).eps)
-
-# Largest magnitude that counts as zero. It is relative for residual forces, stiffnesses and
-# thrusts, and absolute for the rates of q_b [1/s] and r_b [m/s].
-TOLERANCE = 1e-9
-
-
-def least_norm(
-    C: Array, d: Array, one_sided: Indices | list[int]
-) -> tuple[Array, Array]:
-    """Return the minimum-norm u that minimises ``|C u - d|``, and the residual ``C u - d``.
-
-    The constraint is ``u[one_sided] >= 0``.
-    """
-    u = _pseudo_solve(C, d)
-    if (u[one_sided] < 0.0).any():
-        from fflin.kernel.allocation import nearest
-
-        least, most = np.full((2, len(u)), [[-np.inf], [np.inf]])
-        least[one_sided] = 0.0
-        bounded = nearest(C, d, least, most)
-        # Solve again without bounds, and without the one-sided inputs that are zero. The second
-        # solution has smaller rounding errors than the bounded solution.
-        pushing = (least < 0.0) | (
-            bounded > TOLERANCE * np.abs(bounded).max(initial=0.0)
-        )
-        u = np.zeros(len(u))
-        u[pushing] = _pseudo_solve(C[:, pushing], d)
-        if (u[one_sided] < 0.0).any():
-            u = bounded
-    return u, C @ u - d
-
-
-def _pseudo_solve(C: Array, d: Array) -> Array:
-    """Return the minimum-norm u that minimises ``|C u - d|``."""
-    u: Array = np.linalg.lstsq(C, d, rcond=None)[0]
-    u += np.linalg.lstsq(C, d - C @ u, rcond=None)[0]
-    # Set inputs below the rounding error of the largest input to zero, because they are only noise.
-    u[np.abs(u) <= 16.0 * _EPS * float(np.abs(u).max(initial=0.0))] = 0.0
-    return u
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class RelativeEquilibrium(FrozenArrays):
     """Relative equilibrium: an attitude at rest in the orbital frame, with fixed joints.
@@ -622,6 +638,9 @@ class RelativeEquilibrium(FrozenArrays):
     def __repr__(self) -> str:
         moments = ", ".join(f"{moment:.5g}" for moment in self.moments)
         return f"RelativeEquilibrium({self.stability}, moments=({moments}) kg m^2)"
+
+    def _repr_html_(self) -> str:
+        return html.result_card(self)
 
 
 class RelativeEquilibria(html.Reported, tuple[RelativeEquilibrium, ...]):

@@ -49,6 +49,7 @@ def require_fit(
     reduced model, which lacks some states of the robot, is accepted.
     """
     made = f"the model was made for '{lin.robot}'"
+    _require_same_constraints(made, lin, robot)
     names = lin.robot_states
     require_same(
         made, state, "state", names, lin.state_units[: len(names)], part=not whole
@@ -57,6 +58,23 @@ def require_fit(
     require_configuration_size(made, len(lin.q), robot)
     if sensed:
         require_same(made, state, "output", lin.output_names, lin.output_units)
+
+
+def _require_same_constraints(made: str, lin: LinearModel, robot: Robot) -> None:
+    """Raise `InputError` if only one of a model and a robot has constraints."""
+    count = len(lin.robot_states)
+    if lin.dependent and not robot.constraints:
+        raise InputError(
+            f"{made} with constraints and has {count} independent states, but the given robot "
+            f"'{robot.name}' has no constraints; give the robot with its constraints, or make the "
+            "model again for the free robot"
+        )
+    if robot.constraints and not lin.dependent:
+        raise InputError(
+            f"{made} without constraints, but those of the given robot '{robot.name}' leave fewer "
+            f"independent states than the {count} of the model; make the model again for the given "
+            "robot"
+        )
 
 
 def signals_of(state: StateMap, kind: str) -> Signals:

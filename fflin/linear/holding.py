@@ -11,7 +11,8 @@ from fflin.base.errors import FflinError
 from fflin.base.names import group_of, input_keys
 from fflin.base.validation import Array, Vector
 from fflin.dynamics.coordinates import frame_of
-from fflin.linear.equilibrium import TOLERANCE, equilibrium
+from fflin.linear.equilibrium import equilibrium
+from fflin.linear.least_norm import TOLERANCE
 from fflin.linear.linearization import linearize
 from fflin.linear.model import LinearModel
 
@@ -50,7 +51,7 @@ def held(lin: LinearModel, *, tilt: bool = True) -> LinearModel:
     if is_held(lin) or lin.moving or robot is None or lin.u0.any():
         return lin
     source = (lin.generator or lin).undelayed
-    if len(source.A) != 2 * robot.nv:
+    if len(source.A) + len(source.dependent) != 2 * robot.nv:
         return lin
     frame = frame_of(robot, source.frame)
     reference = None
@@ -60,7 +61,13 @@ def held(lin: LinearModel, *, tilt: bool = True) -> LinearModel:
         robot, source.q, v=source.v, frame=frame, reference=reference, tilt=tilt
     )
     model = linearize(
-        robot, balanced.q, source.v, balanced.u, frame=frame, reference=reference
+        robot,
+        balanced.q,
+        source.v,
+        balanced.u,
+        frame=frame,
+        reference=reference,
+        independent=source.independent,
     )
     if lin.lag.any() or lin.output_lag.any():
         model = model.with_lags(*lags_by_name(lin))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -14,7 +14,6 @@ import numpy as np
 from fflin.base.errors import InputError
 from fflin.base.process import in_one_thread
 from fflin.base.validation import Array, ArrayLike, Complex
-from fflin.dynamics.coordinates import refuse_constraints
 from fflin.dynamics.integrators import GAUSS, HEAVY, LIGHT, held_exponential
 from fflin.linear.check import Check, check_all
 from fflin.linear.fit import require_same
@@ -84,7 +83,9 @@ class LinearTrajectory(Trajectory):
     def __post_init__(self) -> None:
         super().__post_init__()
         made = "the linear trajectory was made for another robot"
-        require_same(made, self._aba.state, "state", self.state_names, None)
+        reduced = bool(self.robot.constraints)
+        state = self._aba.state
+        require_same(made, state, "state", self.state_names, None, part=reduced)
 
     @property
     def input_units(self) -> tuple[str, ...]:
@@ -98,7 +99,8 @@ class LinearTrajectory(Trajectory):
         """Return the linear model at the knot with the given index."""
         k = range(len(self))[index]
         t = float(self.t[k])
-        lin = self._linearizer(self.q[k], self.v[k], self.u_base[k], t=t)
+        q, v = self._linearizer.on_constraints(self.q[k], self.v[k])
+        lin = self._linearizer(q, v, self.u_base[k], t=t)
         matrices = {name: getattr(self, name)[k] for name in "ABCD"}
         if self.dt:
             time = lin.t
@@ -119,9 +121,16 @@ class LinearTrajectory(Trajectory):
             remarks = [*remarks, str(self.robot.orbit)]
         return remarks
 
+    @property
+    def independent(self) -> tuple[str, ...] | None:
+        """Independent coordinates of a robot with constraints, as for `linearize`; None without."""
+        if not self.robot.constraints:
+            return None
+        return self.state_names[: len(self.state_names) // 2]
+
     @cached_property
     def _linearizer(self) -> Linearizer:
-        return Linearizer(self.robot, moving=True)
+        return Linearizer(self.robot, moving=True, independent=self.independent)
 
     def matrices(self, t: float) -> tuple[Array, Array]:
         """Return A (nx, nx) and B (nx, nu) about the motion at time t [s], also between knots."""
@@ -219,7 +228,7 @@ class LinearTrajectory(Trajectory):
         """
         refuse_sampled(self.dt, "discretize")
         maps = np.array([transition for _, transition in transitions(self, dt)])
-        nx, models = len(self.state_names), along(self.resampled(dt))
+        nx, models = len(self.state_names), along(self.resampled(dt), self.independent)
         return replace(models, A=maps[:, :nx, :nx], B=maps[:, :nx, nx:], dt=float(dt))
 
     def to(self, tool: str, *, dt: float | None = None) -> ToolTrajectory:
@@ -260,6 +269,7 @@ def linearize_trajectory(
     u: ArrayLike | None = None,
     *,
     strict: bool = False,
+    independent: Sequence[str] | None = None,
     **options: object,
 ) -> LinearTrajectory:
     """Linearise a robot along a motion.
@@ -275,6 +285,9 @@ def linearize_trajectory(
     strict : bool
         Whether to raise an error, instead of a warning, if the knots violate the robot's dynamics
         with a residual above 1e-2.
+    independent : sequence of str, optional
+        Coordinates of the models of a robot with constraints, see `Linearizer`. By default, they
+        are chosen at the first knot. All models have the same coordinates.
     **options
         The options `hold` and `frame` of `Trajectory`.
 
@@ -287,6 +300,9 @@ def linearize_trajectory(
     InputError
         If the arrays are not valid for `Trajectory`, or `strict` is true and the residual of the
         motion exceeds 1e-2.
+    ConstraintError
+        If the independent coordinates do not determine the motion at some time, which the message
+        names, or the rank of the constraints changes there.
 
     Warns
     -----
@@ -303,7 +319,6 @@ def linearize_trajectory(
     >>> along.A.shape, along.check().ok
     ((11, 18, 18), True)
     """
-    refuse_constraints(robot, "linear models along trajectories")
     if isinstance(t, Trajectory):
         if options or not q is v is u is None:
             raise InputError(
@@ -315,17 +330,20 @@ def linearize_trajectory(
         given: dict[str, Any] = {"t": t, "q": q, "v": v, "u": u, **options}
         motion = Trajectory(robot, **given)
     motion.require(strict=strict)
-    return along(motion)
+    return along(motion, independent)
 
 
-def along(motion: Trajectory) -> LinearTrajectory:
+def along(
+    motion: Trajectory, independent: Sequence[str] | None = None
+) -> LinearTrajectory:
     """Return the error dynamics of a trajectory, linearised about all knots."""
-    linearizer = Linearizer(motion.robot, moving=True)
+    linearizer = Linearizer(motion.robot, moving=True, independent=independent)
     fields: dict[str, Any] = linearizer.along(
         motion.q, motion.v, motion.u_base, motion.t
     )
+    names = linearizer.prepared.common | linearizer.constrained_names
     for key in ("state_names", "input_names", "output_names"):
-        fields[key] = linearizer.prepared.common[key]
+        fields[key] = names[key]
     made = LinearTrajectory._of(motion, **fields, dt=0.0)
     for name in ("interval_errors", "cubics"):
         if name in vars(motion):  # keep cached results of the same motion

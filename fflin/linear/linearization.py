@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
+from itertools import pairwise
 from threading import Lock
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base import __version__
-from fflin.base.errors import InputError
+from fflin.base.errors import ConstraintError, InputError, listed, located
 from fflin.base.validation import Array, frozen, number, truth, vector
 from fflin.dynamics.closure import Closure
 from fflin.dynamics.coordinates import Chart, Frame, ReferenceChart
@@ -479,6 +480,8 @@ class Linearizer:
         lower = self._lower
         count = len(q)
         times = np.zeros(count) if t is None else t
+        if self._closure is not None:
+            return self._along_constrained(q, v, u, times)
         state, actuation, sensing = ready.map, ready.actuation, ready.sensing
         chart, nu = ReferenceChart(count), state.velocities(v)
         x0 = state.compose(chart, chart.q_b, state.joint_positions(q), nu)
@@ -527,6 +530,50 @@ class Linearizer:
         for arrays in zip(A, B, C, D, f0, y, strict=True):
             _require_finite(*arrays)
         return {"A": A, "B": B, "C": C, "D": D, "y": y}
+
+    def on_constraints(self, q: Array, v: Array) -> tuple[Array, Array]:
+        """Return q and v on the constraints, at a point of an interpolated motion."""
+        closure = self._closure
+        if closure is None:
+            return q, v
+        closure.constraints.settle(q)
+        q = closure.nearest(q)
+        kept = closure.kept(closure.tangent(q), q, closure.state.velocities(v))
+        return q, closure.state.spread(kept)
+
+    def _along_constrained(
+        self, q: Array, v: Array, u: Array, times: Array
+    ) -> dict[str, Array]:
+        """Return the arrays of `along` in the independent states, about the nearest points."""
+        models = []
+        for index, t in enumerate(times.tolist()):
+            with located(f"at t = {t:g} s"), self._lock:
+                point = self.on_constraints(q[index], v[index])
+                with np.errstate(over="ignore", invalid="ignore"):
+                    models.append(self._anywhere(*point, u[index], t))
+        self._require_same_side(models, times)
+        arrays = {key: np.array([getattr(x, key) for x in models]) for key in "ABCD"}
+        return {**arrays, "y": np.array([model.y0 for model in models])}
+
+    def _require_same_side(self, models: Sequence[LinearModel], times: Array) -> None:
+        """Raise `ConstraintError` if the independent coordinates stop moving between two points.
+
+        There, the basis of the velocities that belongs to the coordinates becomes infinite, and
+        changes its orientation.
+        """
+        bases = []
+        for model in models:
+            assert model._all_states is not None
+            nv, d = len(model._all_states) // 2, len(model.A) // 2
+            bases.append(model._all_states[nv:, d:])
+        for index, (before, after) in enumerate(pairwise(bases)):
+            if np.linalg.slogdet(before.T @ after)[0] > 0.0:
+                continue
+            raise ConstraintError(
+                f"the coordinates {listed(self.independent)} do not determine the motion between "
+                f"t = {times[index]:g} s and {times[index + 1]:g} s; give other coordinates with "
+                "independent=, or split the trajectory there"
+            )
 
 
 def _require_finite(*arrays: Array) -> None:

@@ -400,6 +400,19 @@ class Trajectory(Design):
         values = np.vstack((self.u[:-1], self.u[:1]))
         return CubicSpline(self.t, values, bc_type="periodic")
 
+    @property
+    def smooth_pieces(self) -> Array:
+        """Coefficients (N - 1, 4, nu) of smooth inputs, for powers of the elapsed fraction.
+
+        They are empty if the inputs are not smooth.
+        """
+        if self.hold != "smooth":
+            return np.zeros((0, 4, self.u.shape[1]))
+        lengths = np.diff(self.t)[:, None, None]
+        powers = np.arange(4)[:, None]
+        pieces: Array = self._splines.c[::-1].swapaxes(0, 1) * lengths**powers
+        return pieces
+
     def accelerations(self) -> Array:
         """Return the accelerations (N, nv) just after each knot, in Pinocchio's order."""
         return self._aba.accelerations(self.q, self.v, self.u_base, self.t)

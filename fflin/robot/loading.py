@@ -33,12 +33,13 @@ from fflin.robot.fields import FIELDS
 from fflin.robot.inputs import KINDS, Input
 from fflin.robot.joints import ROOT, Follower, joint_of, require_room
 from fflin.robot.mass_properties import given_body, massless_note
+from fflin.robot.mjcf import describe_mjcf, is_mjcf
 from fflin.robot.outputs import KINDS as OUTPUTS
 from fflin.robot.outputs import Output
 from fflin.robot.robot import Robot
 from fflin.robot.robot_data import LinkMass
-from fflin.robot.urdf.description import Mimic, is_impossible
-from fflin.robot.urdf.reader import SIZE_LIMIT, describe, ignored
+from fflin.robot.urdf.description import JointElement, Mimic, is_impossible
+from fflin.robot.urdf.reader import SIZE_LIMIT, Urdf, describe, ignored
 from fflin.robot.welding import Lock, locked_model, requested, welded
 
 T = TypeVar("T")
@@ -83,9 +84,9 @@ def load(
     Parameters
     ----------
     robot : str or Path
-        Name of a bundled robot or of a robot in example-robot-data, or path of a URDF or robot
-        file. A robot file is a TOML file that names a URDF and sets fields of the robot; see the
-        guide. No mesh is loaded.
+        Name of a bundled robot or of a robot in example-robot-data, or path of a URDF, an MJCF file
+        of MuJoCo (``.xml``) or a robot file. A robot file is a TOML file that names a URDF or MJCF
+        file and sets fields of the robot; see the guide. No mesh is loaded.
     lock : mapping or iterable of str, optional
         Joints to weld, as names or as {joint: value [rad|m]}. A joint given only by its name, or
         with the value None, is welded at its neutral position. A name may be a pattern such as
@@ -146,32 +147,19 @@ def load(
             arguments = _xacro_arguments(file_fields.pop("xacro", None)) | arguments
         later = locks
         locks = {name: locks.pop(name, value) for name, value in file_locks.items()}
-    urdf = describe(
-        read_file(robot_file.path, "URDF", SIZE_LIMIT), robot_file.path, arguments
-    )
+    content = read_file(robot_file.path, "URDF", SIZE_LIMIT)
     location = document.located("lock") if document else nullcontext()
-    with location:
-        loaded = _robot(urdf.model, robot_file.name, locks, urdf.mimics)
     dirs = (*dirs, *robot_file.package_dirs)
-    # Register the mesh files now, so that no output file can overwrite them. The meshes are read
-    # only later, when the robot is drawn.
-    remember(
-        *filter(None, (find_mesh(uri, robot_file.path, dirs) for uri in urdf.meshes))
-    )
-    loaded = replace(
-        loaded,
-        urdf=robot_file.path,
-        urdf_sha256=urdf.sha256,
-        notes=urdf.notes,
-        package_dirs=dirs,
-        xacro=arguments,
-        links={
-            name: LinkMass(link.mass, link.inertia, link.com.placement)
-            for name, link in urdf.links.items()
-            if link.mass
-        },
-        file_joints=tuple(urdf.joints),
-    )
+    joints: Mapping[str, JointElement] = {}
+    if is_mjcf(content, robot_file.path):
+        with location:
+            loaded = _from_mjcf(content, robot_file, locks)
+    else:
+        urdf = describe(content, robot_file.path, arguments)
+        joints = urdf.joints
+        with location:
+            loaded = _robot(urdf.model, robot_file.name, locks, urdf.mimics)
+        loaded = _of_urdf(loaded, urdf, robot_file.path, dirs, arguments)
     for key, value in file_fields.items():
         assert document is not None
         tables = _TABLES.get(key, (key,))
@@ -184,7 +172,7 @@ def load(
     # mimics such a joint.
     gone = {name.rpartition("=")[0] for name in loaded.locked}
     notes = [*loaded.notes]
-    for field, names, text in ignored(urdf.joints, robot_file.path.stem):
+    for field, names, text in ignored(joints, robot_file.path.stem):
         named_joints = {*getattr(loaded, field, ()), *gone}
         named_joints |= {
             x.joint.name for x in loaded.followers if x.leader.name in named_joints
@@ -198,6 +186,46 @@ def load(
         # an error.
         notes.append(massless_note(loaded, loaded.idle_coordinates))
     return replace(loaded, notes=tuple(notes))
+
+
+def _of_urdf(
+    robot: Robot,
+    urdf: Urdf,
+    path: Path,
+    dirs: tuple[Path, ...],
+    arguments: Mapping[str, str],
+) -> Robot:
+    """Add the fields that describe the URDF at a path to a robot."""
+    # Register the mesh files now, so that no output file can overwrite them. The meshes are read
+    # only later, when the robot is drawn.
+    remember(*filter(None, (find_mesh(uri, path, dirs) for uri in urdf.meshes)))
+    return replace(
+        robot,
+        urdf=path,
+        urdf_sha256=urdf.sha256,
+        notes=urdf.notes,
+        package_dirs=dirs,
+        xacro=arguments,
+        links={
+            name: LinkMass(link.mass, link.inertia, link.com.placement)
+            for name, link in urdf.links.items()
+            if link.mass
+        },
+        file_joints=tuple(urdf.joints),
+    )
+
+
+def _from_mjcf(content: bytes, robot_file: RobotFile, locks: Lock) -> Robot:
+    """Make a robot from an MJCF file, with its constraints, springs, gravity and motors."""
+    mjcf = describe_mjcf(content, robot_file.path)
+    _check_model(mjcf.model, robot_file.name)
+    _normalise_placements(mjcf.model)
+    robot = _robot(mjcf.model, robot_file.name, {}, {})
+    robot = robot.replace(**mjcf.fields)
+    robot = replace(robot, notes=mjcf.notes)
+    if locks:
+        robot = welded(robot, locks)
+    return robot
 
 
 def from_model(

@@ -10,6 +10,7 @@ from dataclasses import KW_ONLY, asdict, dataclass, fields
 from functools import lru_cache
 from typing import Any, ClassVar, NamedTuple, TypeAlias, TypeVar
 
+from fflin.base import html
 from fflin.base.errors import FflinWarning, InputError, require_known
 from fflin.base.validation import (
     ONE_ROTATION,
@@ -193,11 +194,35 @@ class CircularOrbit:
         """Return the orbit from the JSON text of `to_json`, with bit-for-bit equal values."""
         return _restored(cls, text, "mean_motion")
 
+    def _repr_html_(self) -> str:
+        field = self.field if isinstance(self.field, str) else "function"
+        rows = {
+            "argument of latitude at t = 0": f"{_degrees(self.argument_of_latitude)}",
+            "magnetic field": "none" if self.field is None else field,
+        }
+        return _card(self, rows)
+
     def __str__(self) -> str:
         return (
             f"circular orbit {self.altitude / 1e3:.6g} km over {self.body}, mean motion "
             f"{self.mean_motion:.6g} rad/s, period {self.period / 60.0:.5g} min"
         )
+
+
+def _degrees(angle: float) -> str:
+    return f"{math.degrees(angle):.6g} deg"
+
+
+def _card(orbit: CircularOrbit | EllipticOrbit, rows: Mapping[str, str]) -> str:
+    """Return a card for notebooks; `rows` are facts that only this type of orbit has."""
+    facts = {
+        "period": f"{orbit.period / 60.0:.6g} min",
+        "mean motion": f"{orbit.mean_motion:.6g} rad/s",
+        "inclination": _degrees(orbit.inclination),
+        **rows,
+    }
+    table = html.table([["", ""], *([*fact] for fact in facts.items())], "ll")
+    return html.card(type(orbit).__name__, str(orbit).partition(", ")[0], table)
 
 
 def _central_body(
@@ -372,12 +397,17 @@ class EllipticOrbit:
         """Time of one revolution [s]."""
         return 2.0 * math.pi / self.mean_motion
 
+    @property
+    def mean_anomaly(self) -> float:
+        """Mean anomaly [rad] at t = 0."""
+        return _mean_anomaly(self.anomaly, self.eccentricity)
+
     def at(self, t: float) -> OrbitState:
         """Return the rotation and the gravity gradient of the orbital frame at time t [s]."""
         t = number("t", t)
         e = self.eccentricity
         n = self.mean_motion
-        mean = _mean_anomaly(self.anomaly, e) + n * t
+        mean = self.mean_anomaly + n * t
         revolutions = round(mean / (2.0 * math.pi))
         E = eccentric_anomaly(mean - 2.0 * math.pi * revolutions, e)
         # r / a, and (dr/dt) / r
@@ -403,6 +433,14 @@ class EllipticOrbit:
     def from_json(cls, text: str) -> EllipticOrbit:
         """Return the orbit from the JSON text of `to_json`, with bit-for-bit equal values."""
         return _restored(cls, text, "apogee")
+
+    def _repr_html_(self) -> str:
+        rows = {
+            "eccentricity": f"{self.eccentricity:.6g}",
+            "argument of perigee": _degrees(self.argument_of_perigee),
+            "true anomaly at t = 0": _degrees(self.anomaly),
+        }
+        return _card(self, rows)
 
     def __str__(self) -> str:
         return (

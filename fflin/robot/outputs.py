@@ -31,7 +31,8 @@ class Output:
     - `bias`: standard deviation of the change of the bias within 1 s, in the unit of the output, or
       a figure of a data sheet, such as ``{"bias_instability": 1.0}``.
 
-    Simulations contain `sample`, `delay` and `lag`. `kalman` uses `sample`, `delay`, `noise` and
+    Simulations contain `sample`, `delay` and `lag`. Sampled laws that measure outputs also receive
+    the noise and the bias, see `noise` of `simulate`. `kalman` uses `sample`, `delay`, `noise` and
     `bias`. `LinearModel.with_lags` adds the lags to a model.
     """
 

@@ -20,22 +20,24 @@ from fflin.base.validation import Array, Indices, Mask, shaped, vector
 from fflin.control.channel import channel_of
 from fflin.control.loops import Loop, Sample, measured_at
 from fflin.control.policy import BDotForm, Form, OutputForm, PathForm, Policy, StateForm
+from fflin.control.sensor_errors import drift_generator, noise_generator
 from fflin.control.tracking import AT_THE_END, TrajectoryFeedback
 from fflin.dynamics.disturbance import Wave, waves_of
 from fflin.dynamics.orbital import OrbitField, mean_motion
 from fflin.dynamics.state import StateMap
 from fflin.kernel import allocation, forward, loop, orbit, policies
 from fflin.kernel.compiled import compiles, is_kept, kernel
-from fflin.kernel.constraints import LEAST_FRACTION, Constraints
+from fflin.kernel.constraints import CONSTRAINTS, LEAST_FRACTION, Constraints
 from fflin.kernel.limits import Task, reason_against
 from fflin.kernel.tree import LANES, batch_tree, empty, laid_out, work_space
 from fflin.robot.disturbance import BASE, INERTIAL, UNITS, DisturbanceTerm
 from fflin.robot.fields import input_limits, limits_of
 from fflin.robot.inputs import BaseTorque
 from fflin.robot.joints import ROOT, find_frame
-from fflin.robot.orbit import CircularOrbit
+from fflin.robot.orbit import EllipticOrbit
 from fflin.robot.outputs import Gyroscope
 from fflin.robot.robot import Robot
+from fflin.simulation.extension import DRAG, SUNLIGHT, extension_of, is_extended
 from fflin.simulation.plan import Plan, Times
 from fflin.simulation.plant import Plant
 from fflin.simulation.run import (
@@ -80,6 +82,8 @@ def engine_of(engine: object, plan: Plan, *, many: bool = False) -> str:
 def loop_name(plan: Plan, *, lanes: int) -> str:
     """Return the name of the kernel function that simulates a number of runs of a plan."""
     name = "advance_one" if lanes == 1 else "advance"
+    if is_extended(plan):
+        name += "_extended"
     if plan.plant.constrained is not None:
         return f"{name}_constrained"
     return f"{name}_in_orbit" if plan.plant.field else name
@@ -124,7 +128,6 @@ def task_of(plan: Plan) -> Task:
         events=bool(plan.events),
         callback=bool(plan.options.callback),
         disturbance=bool(plant.disturbance),
-        lagging=bool(plant.lags.any()),
     )
     if plan.policy is None:
         return task
@@ -142,7 +145,7 @@ def task_of(plan: Plan) -> Task:
     measurements = ""
     if not form.loop.measures_state:
         measurements = _measurement_error(plant.state)
-    if isinstance(form.loop, Loop) and form.loop.lag:
+    if design is not None and isinstance(form.loop, Loop) and form.loop.lag:
         task = replace(task, lagging=True)
     return replace(
         task,
@@ -159,11 +162,6 @@ def _measurement_error(state: StateMap) -> str:
     except InputError as error:
         return str(error)
     return ""
-
-
-def noise_generator(seed: float) -> np.random.Generator:
-    """Return the random generator for the sensor noise of a run with the given seed."""
-    return np.random.Generator(np.random.Philox(np.random.SeedSequence(int(seed))))
 
 
 def noises(plan: Plan, size: int, step: int, last: int) -> tuple[Indices, Array]:
@@ -252,7 +250,24 @@ class LaneLoop:
         # `_fresh` contains a pair for each array with lanes: the array, and the column of initial
         # values that is copied to all lanes.
         self.constraints: Constraints | None = None
-        if plan.plant.constrained is None:
+        plates: dict[str, Array] = {}
+        if is_extended(plan):
+            extended = loop.EXTENDED_OF_ONE if lanes == 1 else loop.EXTENDED
+            held = empty(CONSTRAINTS)
+            if plan.plant.constrained is not None:
+                held = constraints_of(plan)
+            whole = loop.ExtendedArguments(parts, held, extension_of(plan))
+            whole, self._words, self._fresh = laid_out(whole, extended)
+            self.parts = whole.usual
+            # The words contain addresses of the arrays of `whole`, which must therefore exist.
+            self._extended = whole
+            if plan.plant.constrained is not None:
+                self.constraints = whole.constraints
+            plates = {
+                DRAG: whole.extension.plates.drag,
+                SUNLIGHT: whole.extension.plates.sunlight,
+            }
+        elif plan.plant.constrained is None:
             arguments = loop.ARGUMENTS_OF_ONE if lanes == 1 else loop.ARGUMENTS
             self.parts, self._words, self._fresh = laid_out(parts, arguments)
         else:
@@ -286,6 +301,7 @@ class LaneLoop:
             **robot.tree._asdict(),
             **robot.faults._asdict(),
             DISTURBANCE: robot.disturbance.vector,
+            **plates,
         }
 
     def _space(self, size: int) -> Array:
@@ -407,8 +423,13 @@ class LaneLoop:
         deviation = runs.get("noise", zero)[of_lane].T
         errors[:] = bias
         generators = list[np.random.Generator]()
+        drifting = list[np.random.Generator]()
         if "seed" in runs:
             generators = [noise_generator(seed) for seed in runs["seed"][of_lane]]
+        if "drift" in runs:
+            drifting = [drift_generator(seed) for seed in runs["seed"][of_lane]]
+        steps = runs.get("drift", zero)[of_lane]
+        drift = np.zeros((self.lanes, size))
         drawn_until = 0
 
         def write_noise(step: int, last: int) -> None:
@@ -423,6 +444,11 @@ class LaneLoop:
             for lane, generator in enumerate(generators):
                 normal = generator.standard_normal(noise.shape)
                 errors[rows, :, lane] += deviation[:, lane] * normal
+            for lane, generator in enumerate(drifting):
+                changes = steps[lane] * generator.standard_normal(noise.shape)
+                path = np.cumsum(np.vstack((drift[lane], changes)), axis=0)
+                errors[rows, :, lane] += path[:-1]
+                drift[lane] = path[-1]
 
         return write_noise
 
@@ -652,14 +678,22 @@ def orbit_of(plant: Plant) -> orbit.Orbit:
     """Return the kernel's parameters of the orbit of a plant; empty without an orbit."""
     none: orbit.Orbit = empty(orbit.ORBIT)
     field = plant.field
-    circle = plant.robot.orbit
-    if field is None or not isinstance(circle, CircularOrbit):
+    path = plant.robot.orbit
+    if field is None or path is None:
         return none
+    ellipse = np.zeros(0)
+    latitude = 0.0
+    if isinstance(path, EllipticOrbit):
+        start = path.mean_anomaly, path.at(0.0).angle
+        ellipse = np.array([path.eccentricity, *start])
+    else:
+        latitude = path.argument_of_latitude
     return none._replace(
         outwards=field.axes[:, 0],
         normal=field.axes[:, 2],
         mean_motion=[mean_motion(plant.robot)],
-        latitude=[circle.argument_of_latitude],
+        ellipse=ellipse,
+        latitude=[latitude],
         dipole=_dipole_of(field),
         now=np.zeros(orbit.END),
     )
@@ -717,7 +751,8 @@ def _law(plan: Plan, mechanics: forward.Mechanics, noisy: bool) -> policies.Law:
         law = _linear(law, form, state)
     elif isinstance(form, BDotForm):
         direct = law.filter._replace(D=form.gain.ravel())
-        law = law._replace(kind=policies.B_DOT, filter=direct)
+        kind = policies.DAMPING if form.measures_rate else policies.B_DOT
+        law = law._replace(kind=kind, filter=direct)
     size = len(law.measured)
     slots = SLOTS if noisy or plan.noise else 1
     return law._replace(y=np.zeros(size), added=np.zeros(slots * size))
@@ -833,6 +868,7 @@ def _path(
     u = list(motion.u)
     held = [part.start for part in motion.actuation.held]
     ends = plan.times.steps * plan.times.dt > policy.duration * AT_THE_END
+    ends = ends and not motion.period
     pieces = schedule.K if schedule.dt else schedule.pieces
     pieces = pieces.reshape(len(schedule.starts), -1, len(u[0]) * state.nx)
     if ends:
@@ -848,6 +884,7 @@ def _path(
         t=motion.t,
         q=np.concatenate(q),
         u=np.concatenate(u),
+        smooth=motion.smooth_pieces.ravel(),
         shift=shift,
         speed=speed,
         hold=motion.hold == "previous",
@@ -855,6 +892,8 @@ def _path(
         ends=bool(ends),
         held=held,
         over=policy.over,
+        period=motion.period,
+        slack=1e-9 * schedule.dt,
         last=float(schedule.t[-1] - schedule.t[0]),
         starts=schedule.starts,
         K=pieces.ravel(),

@@ -37,6 +37,8 @@ from fflin.control.channel import (
     saturation,
     warn_beyond,
 )
+from fflin.control.data_sheet import Deviations
+from fflin.control.lags import lag_difference, lags_of_robot
 from fflin.control.policies import Feedback
 from fflin.control.policy import (
     Policy,
@@ -45,6 +47,7 @@ from fflin.control.policy import (
     defined_by_user,
     initial_inputs,
 )
+from fflin.control.sensor_errors import SensorErrors, declared_errors
 from fflin.control.tracking import prepared
 from fflin.dynamics import points
 from fflin.dynamics.coordinates import ORBITAL, Frame
@@ -111,6 +114,8 @@ class SimulationOptions:
     every: int | None = None
     progress: bool | None = None
     engine: str | None = None
+    noise: float = 1.0
+    seed: int = 0
 
 
 class Times(NamedTuple):
@@ -175,9 +180,13 @@ class Plan:
         limits += _signals(plant, self.q, self.v, dt, duration)
         pace = Pace(limits, self.method, duration, _longest_step(plant, policy))
         late = delays_of(policy, plant, options.delay)
-        self.times = times = times_of(options, duration, sample, pace, late)
+        self.times = times = _with_lag_note(
+            times_of(options, duration, sample, pace, late), policy, plant
+        )
         if policy and times.sample:
             policy = policy.held_for(times.sample * times.dt)
+        # Errors that the outputs of the robot declare, or None.
+        self.errors, policy = _with_errors(policy, state, times, options)
         self.policy = policy
         # `reference` is a function of time that returns q, v and u of the motion that the policy
         # follows, or None.
@@ -280,6 +289,26 @@ class Plan:
         return channelled(
             law, speeds, self.limits, self.initial, times.sample, times.delays, correct
         )
+
+
+def _with_errors(
+    policy: Policy | None, state: StateMap, times: Times, options: SimulationOptions
+) -> tuple[Deviations | None, Policy | None]:
+    """Return the errors that the outputs of a robot declare, and the law that receives them."""
+    factor = number("noise", options.noise)
+    if factor < 0.0:
+        raise InputError(f"noise is {factor:g}, expected a factor of at least 0")
+    seed = whole("seed", options.seed, 0)
+    if policy is None or not factor:
+        return None, policy
+    sample = times.sample * times.dt
+    errors = declared_errors(policy, state, sample)
+    if errors is None:
+        return None, policy
+    errors = errors.scaled(factor)
+    steps = math.sqrt(sample) * errors.drift
+    function = SensorErrors(np.zeros(len(steps)), errors.noise, steps, seed)
+    return errors, policy.with_sensor_errors(function)
 
 
 def _signals(
@@ -561,6 +590,15 @@ def step_of(
         steps = int(np.ceil(duration / dt))
         dt = duration / steps
     return dt, steps, mode
+
+
+def _with_lag_note(times: Times, policy: Policy | None, plant: Plant) -> Times:
+    """Return the times with a note on lags for which the law was not designed, if there are any."""
+    if policy is None or policy.model is None or policy.commanded_robot is not None:
+        return times
+    lags = lags_of_robot(plant.robot, plant.state, outputs=policy.senses_outputs)
+    note = lag_difference(policy, lags, "the motion")
+    return times._replace(notes=(*times.notes, note)) if note else times
 
 
 def times_of(

@@ -19,6 +19,7 @@ from fflin.base.rotation import conjugate
 from fflin.base.validation import Array, ArrayLike, instance
 from fflin.control.loops import PredictedLaw
 from fflin.control.policy import BoundLaw, Command, Policy, Predictor
+from fflin.control.sensor_errors import note_on_errors
 from fflin.control.tvlqr import GainSchedule
 from fflin.dynamics.coordinates import Frame
 from fflin.dynamics.integrators import held_exponential
@@ -83,6 +84,8 @@ def simulate(
     every: int | None = None,
     progress: bool | None = None,
     engine: str | None = None,
+    noise: float = 1.0,
+    seed: int = 0,
 ) -> Motion:
     r"""Simulate the nonlinear robot under a policy.
 
@@ -192,6 +195,12 @@ def simulate(
         steps uses "compiled" by default if this engine has already been compiled. The compiled
         engine needs numba. It does not support functions written in Python, such as policies,
         events, callbacks and disturbances. The results of both engines agree to machine precision.
+    noise : float
+        Factor of the noise and of the drifting biases that the outputs of the robot declare, see
+        `Output`; 0 leaves them out. They act on sampled laws that measure outputs and have no
+        `noise` of their own. A bias is zero at the start, and drifts as a random walk.
+    seed : int
+        Seed of this noise.
 
     Returns
     -------
@@ -258,6 +267,8 @@ def simulate(
             every=every,
             progress=progress,
             engine=engine,
+            noise=noise,
+            seed=seed,
         )
     )
     foresees = predictor(plan)
@@ -334,6 +345,9 @@ def motion_of(plan: Plan, run: Recording, foresees: Predictor | None = None) -> 
         run.t, run.q, run.v
     )
     notes = plan.policy.notes if plan.policy else ()
+    if plan.policy and plan.errors:
+        errors = note_on_errors(plan.policy.sensors, plan.errors, plan.options.seed)
+        notes = (*notes, errors)
     if plan.law and isinstance(plan.law.policy, BoundLaw):
         notes += plan.law.policy.notes
     loop_notes: tuple[str, ...] = ()

@@ -31,7 +31,8 @@ class Ends:
     """Inputs and outputs of a goal as indices of signals, with their sizes.
 
     `sources` and `sinks` contain pairs of a kind and an index. The kinds of sources are "input" and
-    "sensor"; the kinds of sinks are "command", "output" (also for states) and "error".
+    "sensor"; the kinds of sinks are "command", "output" (also for states) and "error". `watched`
+    contains frequencies [rad/s] of peaks that the grid of a search missed.
     """
 
     sources: tuple[tuple[str, int], ...]
@@ -42,6 +43,7 @@ class Ends:
         default_factory=lambda: Weight(np.array([1.0]), np.array([1.0]))
     )
     band: tuple[float, float] = (0.0, math.inf)
+    watched: list[float] = field(default_factory=list)
 
 
 def ends_of(

@@ -22,7 +22,7 @@ _GRID, _BEYOND = 48, 30.0
 _NEAR, _PEAKS = 0.7, 6
 
 # Each refinement divides the interval about a peak by _PARTS / 2. A parabola then gives the peak.
-_PARTS, _REFINEMENTS = 8, 6
+_PARTS, _REFINEMENTS = 8, 4
 
 # Poles whose values are above _NEAR of the largest are reported, at most _POLES.
 _POLES = 6
@@ -95,7 +95,8 @@ def grid_of(loop: ClosedLoop, ends: Ends) -> Array:
     sizes = sizes[sizes > 0.0]
     resonant = poles[np.abs(poles.real) < 0.3 * np.abs(poles)]
     low, high = (plant.warped(end) for end in ends.band)
-    corners = [plant.warped(corner) for corner in ends.weight.corners]
+    places = (*ends.weight.corners, *ends.watched)
+    corners = [plant.warped(corner) for corner in places]
     parts = [sizes, np.abs(poles.imag), np.array(corners)]
     for width in (-1.0, 1.0):
         parts.append(np.abs(resonant) + width * resonant.real)
@@ -165,9 +166,10 @@ def _peaks(
     highest = int(gains.argmax())
     if gains[highest] < floor:
         return [_gain_piece(ends, channel, loop, factors, float(grid[highest]))]
+    grid, gains = _halved(loop, system, ends, grid, gains)
     padded = np.concatenate(([-1.0], gains, [-1.0]))
     is_peak = (gains >= padded[:-2]) & (gains >= padded[2:])
-    chosen = np.flatnonzero(is_peak & (gains >= _NEAR * gains[highest]))
+    chosen = np.flatnonzero(is_peak & (gains >= _NEAR * gains.max()))
     chosen = chosen[np.argsort(-gains[chosen], kind="stable")][:_PEAKS]
     peaks: dict[float, None] = {}
     last = len(grid) - 1
@@ -198,6 +200,22 @@ def _peaks(
             peaks[w] = None
     pieces = [_gain_piece(ends, channel, loop, factors, w) for w in peaks]
     return sorted(pieces, key=lambda piece: -piece.value)
+
+
+def _halved(
+    loop: ClosedLoop,
+    system: tuple[Array, Array, Array, Array],
+    ends: Ends,
+    grid: Array,
+    gains: Array,
+) -> tuple[Array, Array]:
+    """Return a grid with the middles of all intervals near a high gain, and its gains."""
+    near = np.maximum(gains[:-1], gains[1:]) >= _NEAR * gains.max()
+    near &= np.isfinite(grid[1:])
+    middles = 0.5 * (grid[:-1][near] + grid[1:][near])
+    places = np.flatnonzero(near) + 1
+    inner = gains_at(loop, system, ends, middles)
+    return np.insert(grid, places, middles), np.insert(gains, places, inner)
 
 
 def _vertices(

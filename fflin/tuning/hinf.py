@@ -14,13 +14,14 @@ import numpy as np
 
 from fflin.base.errors import InputError, optional_package
 from fflin.base.process import in_one_thread
-from fflin.base.validation import Array, instance
+from fflin.base.validation import Array, instance, positive, whole
 from fflin.control.linear_controller import LinearController
 from fflin.linear.model import LinearModel
 from fflin.tuning.channels import Ends, channel_of, ends_of
 from fflin.tuning.goals import Goal, MaxGain
-from fflin.tuning.law import Law, law_of
+from fflin.tuning.law import law_of
 from fflin.tuning.plant import Plant, plant_of, signals_of
+from fflin.tuning.reduction import truncations
 from fflin.tuning.structures import Names, indices, input_indices
 from fflin.tuning.tuned import matrices_of
 from fflin.tuning.verification import largest_in_band
@@ -30,6 +31,9 @@ _ACCURACY, _SIZES = 1e-3, (0.0, 1e-6, 1e-4)
 
 # Largest relative excess of the norm of the closed loop over the level of its design.
 _EXCESS = 0.01
+
+# A reduced controller may have a norm larger by this factor if the goals do not hold.
+_KEPT = 1.05
 
 # Largest level that is tried, and how many levels in a row may fail until the search ends.
 _LARGEST, _FAILURES = 1e12, 3
@@ -50,6 +54,16 @@ class Generalised(NamedTuple):
     D12: Array
     D21: Array
     D22: Array
+
+
+class _Design(NamedTuple):
+    """Controller for a generalised plant, its norm, and its signals among those of the model."""
+
+    law: tuple[Array, Array, Array, Array]
+    gamma: float
+    plant: Generalised
+    selected: Array
+    placed: Array
 
 
 class HInfinity(LinearController):
@@ -75,10 +89,82 @@ class HInfinity(LinearController):
     gamma: float
     order: int
 
-    def __init__(self, law: Law, lin: LinearModel, gamma: float) -> None:
+    def __init__(self, design: _Design, lin: LinearModel) -> None:
+        A, B, C, D = design.law
+        selected, placed = design.selected, design.placed
+        law = law_of((A, B @ selected, placed @ C, placed @ D @ selected), [])
         super().__init__(matrices_of(law, lin.dt), lin)
-        self.gamma = gamma
-        self.order = len(law.A)
+        self.gamma = design.gamma
+        self.order = len(A)
+        self._design = design
+
+    def reduced(
+        self, order: int | None = None, *, below: float | None = None
+    ) -> HInfinity:
+        """Return a controller of lower order that keeps the goals.
+
+        The states that affect the outputs of the goals least are left out, by balanced truncation
+        in the closed loop. The loop of each lower order is verified as in `hinf`.
+
+        Parameters
+        ----------
+        order : int, optional
+            Number of states. By default, the lowest order whose norm is at most `below`.
+        below : float, optional
+            Largest norm of the loop; by default 1, so that all goals hold, or 1.05 `gamma` if they
+            do not hold with all states.
+
+        Returns
+        -------
+        HInfinity
+            Controller of the lower order, with the norm of its loop; this controller if no lower
+            order keeps the norm.
+
+        Raises
+        ------
+        InputError
+            If the loop with a controller of the given order is unstable or its norm is above
+            `below`.
+
+        Examples
+        --------
+        >>> lin = fflin.linearize(fflin.load("planar_detumble"))
+        >>> goal = fflin.MaxGain({"tau_b": 0.01, "q_b": 1e-3}, {"q_b": 0.05, "tau_b": 1.0})
+        >>> policy = fflin.hinf(lin, goal, measured="q_b", inputs="tau_b")
+        >>> policy.reduced().gamma <= 1.0
+        True
+        """
+        level = 1.0 if self.gamma <= 1.0 else _KEPT * self.gamma
+        if below is not None:
+            level = positive("below", below)
+        elif order is not None:
+            level = math.inf
+        if order is not None:
+            whole("order", order, 0, max(self.order - 1, 0))
+        design = self._design
+        loop = _closed(design.plant, design.law)
+        for law in truncations(design.law, loop):
+            if order is not None and len(law[0]) != order:
+                continue
+            norm = _norm(design.plant, law)
+            if norm is not None and norm <= level:
+                lower = design._replace(law=law, gamma=norm)
+                return HInfinity(lower, self.lin)
+        if order is None:
+            return self
+        limit = f" or has a norm above {level:.4g}" if math.isfinite(level) else ""
+        raise InputError(
+            f"the loop with the controller of order {order} is unstable{limit}; give a higher "
+            "order, or tune a fflin.StateSpaceLaw of this order"
+        )
+
+    def __repr__(self) -> str:
+        time = f"dt={self.dt:g} s" if self.dt else "continuous"
+        (nu, ny) = self.system.D.shape
+        return (
+            f"HInfinity('{self.lin.robot}', gamma={self.gamma:.4g}, order={self.order}, ny={ny}, "
+            f"nu={nu}, {time})"
+        )
 
 
 @in_one_thread
@@ -179,9 +265,7 @@ def hinf(
     law, gamma = synthesis(plant)
     ny, nu = len(signals.outputs), len(signals.inputs)
     selected, placed = np.eye(ny)[list(rows)], np.eye(nu)[:, list(columns)]
-    A, B, C, D = law
-    whole = (A, B @ selected, placed @ C, placed @ D @ selected)
-    return HInfinity(law_of(whole, []), lin, gamma)
+    return HInfinity(_Design(law, gamma, plant, selected, placed), lin)
 
 
 def _plant(lin: LinearModel, ends: Sequence[Ends], rows: Sequence[int]) -> Plant:
@@ -389,15 +473,20 @@ def _controller(
     )
     if not all(np.isfinite(matrix).all() for matrix in law):
         return None
+    norm = _norm(plant, law)
+    if norm is None or norm > level * (1.0 + _EXCESS):
+        return None
+    return law, norm
+
+
+def _norm(plant: Generalised, law: tuple[Array, Array, Array, Array]) -> float | None:
+    """Return the norm of the closed loop; None if it is unstable."""
     loop = _closed(plant, law)
     poles = np.linalg.eigvals(loop[0])
     fastest = np.abs(poles).max(initial=0.0)
     if poles.real.max(initial=-np.inf) >= -_AXIS * fastest:
         return None
-    norm = largest_in_band(loop, 0.0, np.inf)[0]
-    if norm > level * (1.0 + _EXCESS):
-        return None
-    return law, norm
+    return largest_in_band(loop, 0.0, np.inf)[0]
 
 
 def _slycot() -> Any:

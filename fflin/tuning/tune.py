@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fflin.base.errors import InputError
+from fflin.base.errors import InputError, MissingPackageError
 from fflin.base.process import Progress, in_one_thread
 from fflin.base.validation import Array, ArrayLike, count, instance, whole
 from fflin.linear.model import Delay
@@ -17,6 +17,7 @@ from fflin.tuning.channels import ends_of
 from fflin.tuning.criteria import Piece
 from fflin.tuning.curves import GoalLoops
 from fflin.tuning.goals import Goal
+from fflin.tuning.hinf import hinf
 from fflin.tuning.law import Law
 from fflin.tuning.plant import Plant, Signals, plant_of, signals_of
 from fflin.tuning.points import Point, Points, points_of
@@ -25,7 +26,7 @@ from fflin.tuning.search import Minimum, Term, minimise
 from fflin.tuning.starts import searched, stabilised
 from fflin.tuning.structures import Structure, Structured
 from fflin.tuning.tuned import GoalValue, Tuned, is_active
-from fflin.tuning.verification import second_value
+from fflin.tuning.verification import peak_above, second_value
 
 # Steps of the search for the least factor by which all goals would hold.
 _RELAXING = 150
@@ -220,15 +221,14 @@ class _Task:
         self, problem: Problem, minimum: Minimum, steps: int, bar: Progress
     ) -> tuple[Problem, Minimum]:
         """Add the worst models until none is worse, and return the last problem and result."""
-        if not self.points.candidates:
-            return problem, minimum
-        few = self.points.candidates[: self.points.corners + _FEW]
+        candidates = self.points.candidates
+        few = candidates[: self.points.corners + _FEW]
         for number in range(_ROUNDS):
             bar(number + 1, _ROUNDS, "worst models")
-            added = self._worse(problem, minimum.x, few)
+            added, values = self._worse(problem, minimum.x, few)
             if not added:
-                added = self._worse(problem, minimum.x, self.points.candidates)
-            if not added:
+                added, values = self._worse(problem, minimum.x, candidates)
+            if not added and not self._watch_missed(problem, minimum.x, values):
                 break
             self.chosen += added
             problem = self.problem()
@@ -242,28 +242,63 @@ class _Task:
             minimum = more.after(minimum)
         return problem, minimum
 
-    def _worse(
-        self, problem: Problem, x: Array, candidates: Sequence[Point]
-    ) -> list[Point]:
-        """Return the worst model of each goal among candidates, if it is worse than all chosen."""
-        known = [worst.value for worst in self.worst(problem, x, self.chosen)]
+    def _watch_missed(self, problem: Problem, x: Array, known: list[float]) -> bool:
+        """Return whether a gain exceeds its limit, or its largest known value, at any model.
+
+        The frequencies of such gains are then watched, and the worst models are added to the
+        search.
+        """
+        soft = self._soft_level(known)
+        levels = []
+        for value, measure in zip(known, self.measures, strict=True):
+            limit = 1.0 if measure.goal.hard else min(soft, 1.0)
+            levels.append(_WORSE * max(value, limit))
+        law = problem.law(x)
+        missed: dict[int, tuple[float, Point]] = {}
+        for point in (*self.points.fixed, *self.points.candidates):
+            case = self.case(point)
+            for index, loop in enumerate(case.loops(law) or []):
+                measure, scaling = self.measures[index], problem.scaling(x, index)
+                goal, ends, channel = measure.goal, measure.ends, case.channels[index]
+                peak = peak_above(goal, ends, channel, loop, scaling, levels[index])
+                if peak is None or ends is None:
+                    continue
+                gain, frequency = peak
+                ends.watched.append(frequency)
+                if index not in missed or gain > missed[index][0]:
+                    missed[index] = gain, point
+        for _, point in missed.values():
+            if point not in self.chosen:
+                self.chosen.append(point)
+        return bool(missed)
+
+    def _soft_level(self, values: Sequence[float]) -> float:
+        """Return the largest value of the soft goals, or of all goals if all are hard."""
         soft = [
             value
-            for value, measure in zip(known, self.measures, strict=True)
+            for value, measure in zip(values, self.measures, strict=True)
             if not measure.goal.hard
         ]
-        level = max(soft, default=0.0)
-        added = []
+        return max(soft, default=max(values))
+
+    def _worse(
+        self, problem: Problem, x: Array, candidates: Sequence[Point]
+    ) -> tuple[list[Point], list[float]]:
+        """Return the worst model of each goal among candidates, if it is worse than all chosen.
+
+        The second result contains the largest values of the goals over all of these models.
+        """
+        known = [worst.value for worst in self.worst(problem, x, self.chosen)]
+        level = self._soft_level(known)
+        added: list[Point] = []
         others = [point for point in candidates if point not in self.chosen]
-        if not others:
-            return []
-        for worst, measure in zip(
-            self.worst(problem, x, others), self.measures, strict=True
-        ):
-            limit = 1.0 if measure.goal.hard else level
+        largest = list(known)
+        for index, worst in enumerate(self.worst(problem, x, others)):
+            limit = 1.0 if self.measures[index].goal.hard else level
             if worst.value > limit * _WORSE and worst.point not in added:
                 added.append(worst.point)
-        return added
+            largest[index] = max(largest[index], worst.value)
+        return added, largest
 
     def worst(
         self, problem: Problem, x: Array, points: Sequence[Point]
@@ -298,12 +333,7 @@ class _Task:
         distinct = list({id(point): point for point in every}.values())
         worst = self.worst(problem, minimum.x, distinct)
         law = problem.law(minimum.x)
-        soft = [
-            w.value
-            for w, m in zip(worst, self.measures, strict=True)
-            if not m.goal.hard
-        ]
-        level = max(soft, default=max(w.value for w in worst))
+        level = self._soft_level([found.value for found in worst])
         goals = []
         for index, (found, measure) in enumerate(
             zip(worst, self.measures, strict=True)
@@ -326,6 +356,7 @@ class _Task:
                     where,
                     dict(found.point.parameters),
                     active,
+                    self._least(measure.goal),
                 )
             )
         values = problem.values(minimum.x)[0].tolist()
@@ -369,6 +400,16 @@ class _Task:
             scaling = problem.scaling(x, index)
             results.append(GoalLoops(measure.goal, measure.ends, loops, scaling))
         return tuple(results)
+
+    def _least(self, goal: Goal) -> float:
+        """Return the norm of full order of a goal that `hinf` accepts, or NaN."""
+        measured, commanded = self.structured.used
+        outputs = [self.signals.outputs[index] for index in measured]
+        inputs = [self.signals.inputs[index] for index in commanded]
+        try:
+            return hinf(self.lin, goal, measured=outputs, inputs=inputs).gamma
+        except (InputError, MissingPackageError):
+            return math.nan
 
     def _contradiction(
         self, problem: Problem, minimum: Minimum

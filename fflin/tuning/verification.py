@@ -13,7 +13,7 @@ from fflin.control.optimal.disk import Loop, largest_scaled_gain
 from fflin.control.optimal.largest_gain import gain_crossings
 from fflin.tuning.channels import Channel, Ends
 from fflin.tuning.closed_loop import ClosedLoop
-from fflin.tuning.criteria import weights_at
+from fflin.tuning.criteria import scaled, weights_at
 from fflin.tuning.goals import Goal, Margin, MaxGain, RollOff, Track, Variance
 from fflin.tuning.weights import Weight
 
@@ -25,6 +25,9 @@ _SWEEP = 4000
 
 # Instants of a step response in each instant of the search.
 _FINER, _STEPS = 4, 500
+
+# Goals whose value is a largest gain over frequency.
+_GAINS = (MaxGain, RollOff, Margin)
 
 System = tuple[Array, Array, Array, Array]
 
@@ -59,6 +62,35 @@ def second_value(
     if loop.plant.dt and not constant:
         return _swept(loop, system, ends, low, high)
     return largest_in_band(weighted(system, ends.weight), low, high)[0]
+
+
+def peak_above(
+    goal: Goal,
+    ends: Ends | None,
+    channel: Channel | None,
+    loop: ClosedLoop,
+    scaling: Array,
+    level: float,
+) -> tuple[float, float] | None:
+    """Return the largest gain of a goal and its frequency [rad/s] if it exceeds a level.
+
+    The eigenvalues of one Hamiltonian matrix contain all frequencies at which a gain equals the
+    level. The result is None if the gain is below, or if the goal is not a gain.
+    """
+    if channel is None or ends is None or not isinstance(goal, _GAINS):
+        return None
+    plant = loop.plant
+    if plant.dt and len(ends.weight.denominator) > 1:
+        return None
+    factors = np.exp(scaling) if isinstance(goal, Margin) else None
+    system = weighted(scaled(loop.system(channel), factors), ends.weight)
+    low, high = (plant.warped(end) for end in ends.band)
+    crossings, on_axis = gain_crossings(*system, level)
+    found = np.abs(crossings.imag[on_axis])
+    if not ((found > low) & (found < high)).any():
+        return None
+    largest, frequency = largest_in_band(system, low, high)
+    return (largest, plant.time(frequency)) if largest > level else None
 
 
 def weighted(system: System, weight: Weight) -> System:

@@ -19,6 +19,9 @@ from fflin.uncertainty.lft import LFT
 # Number of frequencies at which the quick estimates of gains are computed.
 _FREQUENCIES = 6
 
+# Entries of a law below this fraction of the largest entry of their matrix are rounding errors.
+_ROUNDING = 1e-9
+
 # Kinds of gains: (S - T)/2 at the inputs, and from the inputs to the outputs.
 DISK, OUTPUTS = "disk", "outputs"
 
@@ -41,7 +44,8 @@ def sampled_law(gain: object) -> SampledLaw | None:
         system = law_with_memory(gain.K, gain.A, gain.B, gain.dt, *names)
         if gain.integrals:
             system = gain.integral_law()
-        return SampledLaw(system, gain.delay, regulated_states(gain), False)
+        system, regulated = acting_part(system, regulated_states(gain))
+        return SampledLaw(system, gain.delay, regulated, False)
     if not isinstance(gain, Policy):
         return None
     law = gain.linear_law()
@@ -49,7 +53,32 @@ def sampled_law(gain: object) -> SampledLaw | None:
         return None
     delays = gain.input_delays
     late = np.array([delays.get(name, 0.0) for name in law.outputs])
-    return SampledLaw(law, late, gain.fed_back, gain.senses_outputs)
+    regulated = gain.fed_back
+    if not gain.senses_outputs:
+        law, regulated = acting_part(law, regulated)
+    return SampledLaw(law, late, regulated, gain.senses_outputs)
+
+
+def acting_part(
+    law: System, regulated: tuple[str, ...]
+) -> tuple[System, tuple[str, ...]]:
+    """Return a law of states without its memory that does not act on the commands.
+
+    The memory of a model with lags also contains the values of lagging sensors, which no command of
+    a state feedback depends on. The second result are the names in `regulated` without the states
+    that only this memory measures.
+    """
+    A, B, C, D, *_ = law
+    least = _ROUNDING * max(np.abs(C).max(initial=0.0), np.abs(D).max(initial=0.0))
+    kept: Mask = np.abs(C).max(axis=0, initial=0.0) > least
+    least = _ROUNDING * np.abs(A).max(initial=0.0)
+    while (acting := ~kept & (np.abs(A[kept]) > least).any(axis=0)).any():
+        kept |= acting
+    part = law._replace(A=A[np.ix_(kept, kept)], B=B[kept], C=C[:, kept])
+    measured = np.any(B, axis=0) | np.any(D, axis=0)
+    used = np.any(part.B, axis=0) | np.any(D, axis=0)
+    idle = {name for name, x in zip(law.inputs, measured & ~used, strict=True) if x}
+    return part, tuple(name for name in regulated if name not in idle)
 
 
 class SampledLoops:

@@ -18,15 +18,19 @@ from fflin.base.tables import folded
 from fflin.base.validation import Array, Mask, shaped
 from fflin.control.compensator import Compensator
 from fflin.control.gain import Gain, gain_matrix, regulated_states
+from fflin.control.lags import has_lag_states
 from fflin.control.optimal.disk import Loop, largest_scaled_gain
 from fflin.control.optimal.largest_gain import ACCURACY, gain_crossings, largest_gain
 from fflin.control.policy import Policy
+from fflin.dynamics.state import selection
+from fflin.uncertainty.lagging import with_lags_of_loop
 from fflin.uncertainty.lft import LFT
 from fflin.uncertainty.sampled_loops import (
     DISK,
     OUTPUTS,
     SampledLaw,
     SampledLoops,
+    acting_part,
     measured_signals,
     sampled_law,
 )
@@ -144,26 +148,11 @@ class Worst(html.Reported):
 
 
 @in_one_thread
-def _refuse_lags(gain: object) -> None:
-    """Raise `InputError` if a gain or policy was designed for a model with lags."""
-    lagging = False
-    if isinstance(gain, Gain):
-        lagging = any(name.startswith(LAG) for name in gain.state_names)
-    if isinstance(gain, Policy) and gain.model is not None:
-        lagging = bool(gain.model.lag.any() or gain.model.output_lag.any())
-    if lagging:
-        raise InputError(
-            "the search for worst loops does not support lags, but the law was designed for a "
-            "model with lags; give a law of a model without with_lags, or check this law by "
-            "fflin.margins at samples of the robot"
-        )
-
-
 def searched(
     model: Uncertain, lft: LFT, gain: object, samples: int, seed: int
 ) -> Worst:
     """Search for the worst closed loops; see `Uncertain.worst`."""
-    _refuse_lags(gain)
+    lft = with_lags_of_loop(lft, model.robot, gain)
     sampled = sampled_law(gain)
     loops: Loops | SampledLoops
     if sampled is None:
@@ -288,17 +277,22 @@ def _around(lft: LFT, gain: object) -> tuple[LFT, Array, Sequence[str]]:
                 f"gain is a {gain.kind}, expected a linear law about a point: a Gain, a "
                 "StateFeedback or a continuous LinearController"
             )
-    if law is None or not isinstance(gain, Policy) or gain.feedback_gain is not None:
+    elif isinstance(gain, Gain) and has_lag_states(gain.state_names):
+        law = gain.integral_law()
+    states = tuple(name for name in lft.state_names if not name.startswith(LAG))
+    if law is None or (isinstance(gain, Policy) and gain.feedback_gain is not None):
         if isinstance(gain, Gain) and gain.integrals:
-            lft = _with_integrals(lft, gain)
-        K = shaped("gain", gain_matrix(gain), lft.B2.T.shape, " (nu, nx)")
+            lft = _with_integrals(lft, gain, states)
+            states = gain.state_names
+        K = shaped("gain", gain_matrix(gain), (len(lft.B2.T), len(states)), " (nu, nx)")
         regulated = regulated_states(gain)
         if isinstance(gain, Policy):
             regulated = gain.fed_back
-        return lft, K, regulated
-    signals = lft.state_names
-    measured: Array = np.eye(len(lft.A))
-    if gain.senses_outputs:
+        return lft, K @ selection(states, lft.state_names), regulated
+    signals = states
+    measured = selection(states, lft.state_names)
+    senses_outputs = isinstance(gain, Policy) and gain.senses_outputs
+    if senses_outputs:
         signals = lft.output_names
         measured = lft.C2
     names = law.inputs, law.outputs
@@ -307,8 +301,11 @@ def _around(lft: LFT, gain: object) -> tuple[LFT, Array, Sequence[str]]:
             "the inputs and outputs of the law are not those of the robot; give the law of this "
             "robot"
         )
+    regulated = gain.fed_back if isinstance(gain, Policy) else regulated_states(gain)
+    if not senses_outputs:
+        law, regulated = acting_part(law, regulated)
     used: Mask = np.any(law.B, axis=0) | np.any(law.D, axis=0)
-    if gain.senses_outputs and (lft.D21[used].any() or lft.D22[used].any()):
+    if senses_outputs and (lft.D21[used].any() or lft.D22[used].any()):
         raise InputError(
             "the law measures outputs that depend on inputs or on uncertain parameters, such as "
             "accelerations; give a law of outputs that depend on states only"
@@ -316,7 +313,7 @@ def _around(lft: LFT, gain: object) -> tuple[LFT, Array, Sequence[str]]:
     C = np.where(used[:, None], measured, 0.0)
     K = -np.block([[law.D @ C, law.C], [law.B @ C, law.A]])
     (nx, nu), nz, nw = lft.B2.shape, len(law.A), lft.B1.shape[1]
-    states = tuple(f"controller.{index}" for index in range(nz))
+    added = tuple(f"controller.{index}" for index in range(nz))
     larger = replace(
         lft,
         A=np.block([[lft.A, np.zeros((nx, nz))], [np.zeros((nz, nx + nz))]]),
@@ -326,10 +323,10 @@ def _around(lft: LFT, gain: object) -> tuple[LFT, Array, Sequence[str]]:
         D12=np.hstack((lft.D12, np.zeros((nw, nz)))),
         C2=np.hstack((lft.C2, np.zeros((len(lft.C2), nz)))),
         D22=np.hstack((lft.D22, np.zeros((len(lft.C2), nz)))),
-        state_names=(*lft.state_names, *states),
-        input_names=(*lft.input_names, *(f"rate of {name}" for name in states)),
+        state_names=(*lft.state_names, *added),
+        input_names=(*lft.input_names, *(f"rate of {name}" for name in added)),
     )
-    return larger, K, (*gain.fed_back, *states)
+    return larger, K, (*regulated, *added)
 
 
 def judged_states(lft: LFT, K: Array, regulated: Sequence[str]) -> Mask:
@@ -355,23 +352,27 @@ def judged_states(lft: LFT, K: Array, regulated: Sequence[str]) -> Mask:
     return kept
 
 
-def _with_integrals(lft: LFT, gain: Gain) -> LFT:
-    """Return the LFT with the integrals of a gain as further states."""
-    if gain.model_states != lft.state_names or gain.dt:
+def _with_integrals(lft: LFT, gain: Gain, states: tuple[str, ...]) -> LFT:
+    """Return the LFT with the integrals of a gain as further states.
+
+    `states` are the states of the robot.
+    """
+    if gain.model_states != states or gain.dt:
         raise InputError(
             f"the gain was designed for a model of '{gain.robot}' with other states or in discrete "
             "time; give a continuous gain of the model of the same robot"
         )
     k = len(gain.integrals)
     nx = len(lft.A)
+    H = gain.H @ selection(states, lft.state_names)
     return replace(
         lft,
-        A=np.block([[lft.A, np.zeros((nx, k))], [gain.H, np.zeros((k, k))]]),
+        A=np.block([[lft.A, np.zeros((nx, k))], [H, np.zeros((k, k))]]),
         B1=np.vstack((lft.B1, np.zeros((k, lft.B1.shape[1])))),
         B2=np.vstack((lft.B2, np.zeros((k, lft.B2.shape[1])))),
         C1=np.hstack((lft.C1, np.zeros((len(lft.C1), k)))),
         C2=np.hstack((lft.C2, np.zeros((len(lft.C2), k)))),
-        state_names=gain.state_names,
+        state_names=(*lft.state_names, *gain.integrals),
     )
 
 

@@ -111,6 +111,30 @@ def test_the_law_removes_energy(cubesat):
     assert power == pytest.approx(-2e4 * np.sum(np.cross(w, b) ** 2), rel=0.02)
 
 
+def test_damping_exerts_the_torque_across_the_field(cubesat):
+    """The torque is -k times the part of the inertial angular velocity across the field."""
+    law = fflin.RateDamping(3e-5).bind(cubesat)
+    field = OrbitField(cubesat, "lvlh")
+    q = fflin.configuration(cubesat, rpy=(30, 20, 50))
+    R = pin.XYZQUATToSE3(q[:7]).rotation
+    w = np.array([0.3, -0.2, 0.4])
+    t = 700.0
+    b = R.T @ field.magnetic.at(t)
+    inertial = w + R.T @ field.rate
+    along = b * (b @ inertial) / (b @ b)
+    u = law(t, q, np.concatenate((np.zeros(3), w)))
+    torque = np.cross(u, b)
+    assert torque == pytest.approx(-3e-5 * (inertial - along), rel=1e-12, abs=1e-18)
+
+
+@pytest.mark.exhaustive
+def test_damping_stops_the_rotation_relative_to_inertial_space(cubesat):
+    v0 = np.concatenate((np.zeros(3), np.full(3, 0.05)))
+    options = {"duration": 4.0 * ORBIT.period, "dt": 10.0, "limits": "urdf"}
+    motion = fflin.simulate(cubesat, fflin.RateDamping(3e-5), v0=v0, **options)
+    assert fflin.detumbling_time(motion, factor=1.0) < 4.0 * ORBIT.period
+
+
 @pytest.mark.exhaustive
 def test_a_cubesat_detumbles_within_a_few_orbits(cubesat):
     spin = np.radians(5.0) / math.sqrt(3.0) * np.ones(3)
@@ -124,11 +148,12 @@ def test_a_cubesat_detumbles_within_a_few_orbits(cubesat):
 
 
 @pytest.mark.compiled
-def test_a_compiled_campaign_detumbles_as_the_python_engine_does(cubesat):
+@pytest.mark.parametrize("law", [fflin.BDot(2e4), fflin.RateDamping(3e-5)])
+def test_a_compiled_campaign_detumbles_as_the_python_engine_does(cubesat, law):
     spread = {"q_b": 0.1, "omega_b": 0.02, "base.mass": 0.05}
     options = {"runs": 3, "duration": 100.0, "dt": 1.0, "seed": 4}
     one, other = (
-        fflin.monte_carlo(cubesat, fflin.BDot(2e4), spread, engine=engine, **options)
+        fflin.monte_carlo(cubesat, law, spread, engine=engine, **options)
         for engine in ("compiled", "python")
     )
     for name in ("q", "v", "u"):
@@ -151,6 +176,7 @@ def test_errors(cubesat):
     refused("moon", lambda: fflin.CircularOrbit(5e5, body="moon", field="dipole"))
     refused("radians", lambda: fflin.CircularOrbit(5e5, inclination=98.0))
     refused("gain", lambda: fflin.BDot(-1.0))
+    refused("N m s", lambda: fflin.RateDamping(0.0))
     plain = fflin.load("cubesat", orbit=ORBIT)
     refused("no magnetorquers", lambda: fflin.BDot(1.0).bind(plain))
     free = fflin.simulate(fflin.load("cubesat"), duration=0.1)

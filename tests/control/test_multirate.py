@@ -193,7 +193,7 @@ def test_the_simulated_loop_equals_one_with_queues():
     robot, lin, law = designed()
     policy = fflin.MultirateFeedback(lin, law)
     q0 = fflin.configuration(robot, rpy=(1e-3, 0, -2e-3))
-    motion = fflin.simulate(robot, policy, q0=q0, duration=5.0, dt=0.05)
+    motion = fflin.simulate(robot, policy, q0=q0, duration=5.0, dt=0.05, noise=0.0)
     e = motion.x[0] - lin.x0
     z = np.zeros(law.A.shape[1])
     queue = deque([np.zeros(3)] * 4)
@@ -256,7 +256,7 @@ def test_an_ordinary_law_feels_the_sensors():
     law = fflin.lqg(fflin.lqr(model), fflin.kalman(model, 1e-8, 1e-8))
     policy = fflin.OutputFeedback(model, law)
     q0 = fflin.configuration(robot, rpy=(1e-3, 0, 0))
-    late = fflin.simulate(robot, policy, q0=q0, duration=10.0, dt=0.05)
+    late = fflin.simulate(robot, policy, q0=q0, duration=10.0, dt=0.05, noise=0.0)
     soon = fflin.simulate(plain, policy, q0=q0, duration=10.0, dt=0.05)
     assert np.abs(late.x - soon.x)[:, :3].max() > 1e-7
     assert np.abs(late.x - late.prediction)[:, :3].max() < 1e-9
@@ -319,7 +319,7 @@ def test_the_C_code_equals_python(tmp_path):
     code = fflin.CLaw(fflin.write_c(policy, tmp_path / "law", limits=5e-5))
     q0 = fflin.configuration(robot, rpy=(3, 0, -2))
     options = {"q0": q0, "duration": 20.0, "dt": 0.05}
-    expected = fflin.simulate(robot, policy, limits=5e-5, **options)
+    expected = fflin.simulate(robot, policy, limits=5e-5, noise=0.0, **options)
     result = fflin.simulate(robot, code, **options)
     size = np.abs(expected.u).max()
     assert size == pytest.approx(5e-5)

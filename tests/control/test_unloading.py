@@ -218,6 +218,54 @@ def test_thrusters_unload_wheels_during_a_slew_in_both_engines():
     assert compiled.u == pytest.approx(python.u, abs=1e-9)
 
 
+def magnetic_satellite():
+    """The cubesat with three magnetorquers and three wheels, its law, and the unloading design."""
+    orbit = fflin.CircularOrbit(500e3, inclination=1.7, field="dipole")
+    rods = [fflin.Magnetorquer(axis, max=0.2) for axis in np.eye(3)]
+    inputs = fflin.load_inputs("cubesat")
+    wheels = [item for item in inputs if isinstance(item, fflin.ReactionWheel)]
+    robot = fflin.load("cubesat", orbit=orbit, inputs=[*rods, *wheels])
+    lin = fflin.linearize(robot.replace(inputs=wheels)).discretize(1.0)
+    law = fflin.StateFeedback(lin, fflin.lqr(lin))
+    return robot, law, robot.replace(inputs=[fflin.BaseTorque(), *wheels])
+
+
+def test_magnetorquers_realise_the_torque_across_the_field_and_wheels_the_rest():
+    """The allocated inputs cause the nearest accelerations of all bodies, within their limits."""
+    robot, law, design = magnetic_satellite()
+    unloading = fflin.unload_wheels(law, design, 1e-3)
+    v = fflin.velocity(robot, {"wheel_x": 300.0, "wheel_y": -200.0, "wheel_z": 150.0})
+    q = fflin.configuration(robot, rpy=(0.1, -0.1, 0.1))
+    t = 700.0
+    commanded = unloading.bind(design)(t, q, v)
+    u = fflin.Allocation(unloading, design).bind(robot)(t, q, v)
+    lin = fflin.linearize(robot, q, v, t=t)
+    wanted = fflin.linearize(design, q, v)
+    rates = slice(len(lin.M), None)
+    M = lin.M
+    columns, target = lin.B[rates], wanted.B[rates] @ commanded
+    # The gradient of (columns u - target)' M (columns u - target) vanishes.
+    gradient = columns.T @ M @ (columns @ u - target)
+    size = np.abs(columns.T @ M) @ np.abs(target)
+    assert (np.abs(gradient) < 1e-6 * size.max()).all()
+    assert np.abs(u[:3]).max() < 0.2
+    forces = M @ columns
+    moment = forces[:3, :3] @ u[:3]
+    b = np.cross(forces[:3, 0], forces[:3, 1])  # along the field
+    assert abs(moment @ b) < 1e-9 * np.linalg.norm(moment) * np.linalg.norm(b)
+
+
+@pytest.mark.exhaustive
+def test_magnetorquers_unload_wheels_while_the_attitude_stays():
+    robot, law, design = magnetic_satellite()
+    policy = fflin.Allocation(fflin.unload_wheels(law, design, 1e-3), design)
+    v0 = fflin.velocity(robot, {"wheel_x": 300.0, "wheel_y": -200.0, "wheel_z": 150.0})
+    options = {"duration": 8000.0, "dt": 1.0, "limits": "urdf"}
+    motion = fflin.simulate(robot, policy, v0=v0, **options)
+    assert motion.attitude_error.max() < 0.5
+    assert np.abs(motion.v[-1, 6:]).max() < 30.0
+
+
 def test_laws_and_robots_that_cannot_unload_are_refused():
     alone, design, flown = cubesat()
     law = state_law(alone)

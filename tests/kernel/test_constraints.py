@@ -56,7 +56,7 @@ def test_both_engines_solve_the_equations_of_motion_with_multipliers(kind, to):
     np.testing.assert_allclose(wrench - push, (J.T @ forces)[:6], atol=tolerance)
     mechanics, held, point, work = in_kernel(plant, q, v, u)
     rates = np.zeros(len(point.nu))
-    forward.accelerate(work, mechanics, None, point, 0.0, rates, 0)
+    forward.accelerate(work, mechanics, None, None, point, 0.0, rates, 0)
     before = point.wrench.copy()
     constraints.constrain(work, mechanics, held, point, rates, 0)
     np.testing.assert_allclose(

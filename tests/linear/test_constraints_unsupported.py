@@ -25,8 +25,6 @@ CALLS = {
     "capture of a payload": lambda robot, _: fflin.capture(
         fflin.load("planar_detumble"), "hand", robot
     ),
-    "effective_masses": lambda _, lin: fflin.effective_masses(lin),
-    "equilibrium": lambda robot, _: fflin.equilibrium(robot),
     "from_tool": lambda robot, lin: fflin.from_tool(robot, "drake", lin.q),
     "generalized_jacobian": lambda robot, _: fflin.generalized_jacobian(
         robot, frame="tool_left"
@@ -34,9 +32,6 @@ CALLS = {
     "jam": lambda robot, _: fflin.jam(robot, "left_1"),
     "linearize_orbit": lambda robot, _: fflin.linearize_orbit(
         robot.replace(orbit=500e3)
-    ),
-    "linearize_trajectory": lambda robot, lin: fflin.linearize_trajectory(
-        robot, [0.0, 1.0], [lin.q] * 2, [lin.v] * 2, [lin.u0] * 2
     ),
     "plan": lambda robot, _: fflin.plan(robot, {}, duration=10.0),
     "relative_equilibria": lambda robot, _: fflin.relative_equilibria(robot),

@@ -207,17 +207,10 @@ def test_a_disturbance_that_a_lagging_accelerometer_feels_is_refused():
         fflin.kalman(lin, 1e-8, 1e-8, disturbance_noise={"F_b": 1e-8})
 
 
-def test_worst_loops_and_sensitivities_refuse_lags():
-    """The robots of these functions have no lags, so their figures would be too good."""
+def test_sensitivities_refuse_lags():
     robot = fflin.load("cubesat", inputs=[fflin.BaseTorque(lag=0.5)])
     lin = fflin.linearize(robot).with_lags()
     sampled = lin.discretize(0.25)
-    gain = fflin.lqr(sampled)
-    uncertain = fflin.uncertain(robot, {"base.mass": 0.2})
-    continuous = fflin.StateFeedback(lin, fflin.lqr(lin))
-    for law in (gain, fflin.StateFeedback(sampled, gain), continuous):
-        with pytest.raises(fflin.InputError, match="worst loops does not support lags"):
-            uncertain.worst(law)
     for model in (lin, sampled, fflin.linearize(robot).discretize(0.25, delay=0.1)):
         with pytest.raises(
             fflin.InputError, match="sensitivity needs a model with the"

@@ -7,7 +7,6 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from fflin.kernel import limits
 from tests.support.orbits import N, in_ellipse
 from tests.support.robots import free_body
 
@@ -82,7 +81,7 @@ def test_inertial_disturbances_turn_with_the_true_anomaly():
 STRONG = {"tau_b": 0.05, "F_b": 5e-4}
 
 
-def test_a_periodic_schedule_repeats(monkeypatch):
+def test_a_periodic_schedule_repeats():
     robot = in_ellipse(free_body(BODY), 0.3)
     along = fflin.linearize_orbit(robot, steps=16)
     h = along.period / 16
@@ -103,9 +102,6 @@ def test_a_periodic_schedule_repeats(monkeypatch):
     policy = fflin.TrajectoryFeedback(schedule.trajectory(robot), schedule)
     with pytest.raises(fflin.InputError, match="use the same orbit"):
         fflin.simulate(free_body(BODY), policy, duration=1.0)
-    monkeypatch.setattr(limits, "numba_is_there", lambda: True)
-    with pytest.raises(fflin.InputError, match="in Python"):
-        fflin.simulate(robot, policy, duration=5 * h, dt=h, engine="compiled")
 
 
 @pytest.mark.exhaustive

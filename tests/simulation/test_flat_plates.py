@@ -138,6 +138,12 @@ specular = 0.1
     assert text == "0.03 m^2, normal (0, 0, 1), solar pressure"
 
 
+def test_a_dispersed_force_that_no_plate_has_is_refused():
+    robot = BODY.replace(disturbance={"plate": [PLATE | {"sun": SUN}]})
+    with pytest.raises(fflin.InputError, match="no flat plate of 'body' has drag"):
+        fflin.monte_carlo(robot, None, {"plate_1.drag": 0.1}, runs=2, duration=1.0)
+
+
 GOOD = {"area": 0.1, "normal": (0, 0, 1), "sun": (0, 0, 1)}
 
 

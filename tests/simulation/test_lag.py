@@ -91,12 +91,18 @@ def test_constant_inputs_act_from_the_start():
     assert np.abs(motion.x).max() < 1e-9
 
 
-def test_the_compiled_engine_refuses_a_lag(monkeypatch):
+def test_the_compiled_engine_refuses_a_sensor_with_a_lag_in_an_allocation(monkeypatch):
     monkeypatch.setattr(limits, "numba_is_there", lambda: True)
-    robot, lin = pushed_base()
-    law = fflin.StateFeedback(lin, fflin.lqr(lin))
-    with pytest.raises(fflin.InputError, match="lags of inputs and outputs are"):
-        fflin.simulate(robot, law, duration=1.0, engine="compiled")
+    design = fflin.load(
+        "cubesat", inputs=[fflin.BaseTorque()], outputs=[fflin.BasePose(lag=0.3)]
+    )
+    lin = fflin.linearize(design).discretize(0.1)
+    estimator = fflin.kalman(lin, 1e-6, 1e-6)
+    law = fflin.OutputFeedback(lin, fflin.lqg(fflin.lqr(lin), estimator))
+    robot = fflin.load("cubesat")
+    shared = fflin.Allocation(law, design)
+    with pytest.raises(fflin.InputError, match="lags of outputs are not computed"):
+        fflin.simulate(robot, shared, duration=1.0, engine="compiled")
 
 
 def test_kalman_and_lqg_contain_the_lag():

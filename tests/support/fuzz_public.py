@@ -128,6 +128,7 @@ def light(folder):
             **{"inclination": 1.0, "argument_of_latitude": 0.1, "field": "dipole"},
         },
         "BDot": {"gain": 1.0},
+        "RateDamping": {"gain": 1.0},
         "detumbling_time": {"motion": motion, "factor": 4.0},
         "Magnetorquer": {
             **{"axis": vector, "frame": "base", "name": "m", "max": 1.0, "min": None}

@@ -11,8 +11,9 @@ import fflin
 from fflin.tuning import hinf
 from fflin.tuning.hinf import Generalised, synthesis
 from fflin.tuning.search import simplex_program
-from fflin.tuning.verification import largest_in_band
-from tests.support.tuning import least_gain
+from fflin.tuning.verification import largest_in_band, peak_above, second_value
+from tests.support.compleib import AC6
+from tests.support.tuning import least_gain, problem_of
 
 needs_slycot = pytest.mark.skipif(find_spec("slycot") is None, reason="needs slycot")
 
@@ -249,6 +250,22 @@ def test_the_largest_gain_in_a_band_is_that_at_its_end():
     gain, frequency = largest_in_band(system, 2.0, math.inf)
     assert gain == pytest.approx(1.0 / math.sqrt(5.0), rel=1e-12) and frequency == 2.0
     assert largest_in_band(system, 0.0, math.inf)[0] == pytest.approx(1.0)
+
+
+def test_a_gain_above_a_level_is_found_at_its_frequency():
+    problem = problem_of(AC6)
+    measure, case = problem.measures[0], problem.cases[0]
+    channel, loop = case.channels[0], case.loops(problem.law(problem.start()))[0]
+    goal, ends = measure.goal, measure.ends
+    largest = second_value(goal, ends, channel, loop)
+    none = np.zeros(0)
+    assert peak_above(goal, ends, channel, loop, none, 1.0001 * largest) is None
+    gain, frequency = peak_above(goal, ends, channel, loop, none, 0.5 * largest)
+    assert gain == pytest.approx(largest, rel=1e-6)
+    A, B, C, D = loop.system(channel)
+    inner = 1j * frequency * np.eye(len(A)) - A
+    response = D + C @ np.linalg.solve(inner, B)
+    assert np.linalg.norm(response, 2) == pytest.approx(gain, rel=1e-9)
 
 
 def test_the_quadratic_program_satisfies_its_conditions():
