@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fflin.base.errors import InputError
+from fflin.base.errors import InputError, MissingPackageError
 from fflin.base.process import Progress, in_one_thread
 from fflin.base.validation import Array, ArrayLike, count, instance, whole
 from fflin.linear.model import Delay
@@ -17,6 +17,7 @@ from fflin.tuning.channels import ends_of
 from fflin.tuning.criteria import Piece
 from fflin.tuning.curves import GoalLoops
 from fflin.tuning.goals import Goal
+from fflin.tuning.hinf import hinf
 from fflin.tuning.law import Law
 from fflin.tuning.plant import Plant, Signals, plant_of, signals_of
 from fflin.tuning.points import Point, Points, points_of
@@ -355,6 +356,7 @@ class _Task:
                     where,
                     dict(found.point.parameters),
                     active,
+                    self._least(measure.goal),
                 )
             )
         values = problem.values(minimum.x)[0].tolist()
@@ -398,6 +400,16 @@ class _Task:
             scaling = problem.scaling(x, index)
             results.append(GoalLoops(measure.goal, measure.ends, loops, scaling))
         return tuple(results)
+
+    def _least(self, goal: Goal) -> float:
+        """Return the norm of full order of a goal that `hinf` accepts, or NaN."""
+        measured, commanded = self.structured.used
+        outputs = [self.signals.outputs[index] for index in measured]
+        inputs = [self.signals.inputs[index] for index in commanded]
+        try:
+            return hinf(self.lin, goal, measured=outputs, inputs=inputs).gamma
+        except (InputError, MissingPackageError):
+            return math.nan
 
     def _contradiction(
         self, problem: Problem, minimum: Minimum

@@ -46,6 +46,9 @@ class GoalValue:
     active : bool
         Whether this goal limits the others: its value is the largest, or that of a hard goal that
         just holds.
+    least : float
+        Least value of all linear controllers for the nominal model, from `hinf`, within 1 %. NaN if
+        `hinf` does not accept the goal, or slycot is not installed.
 
     Examples
     --------
@@ -63,6 +66,7 @@ class GoalValue:
     frequency: float
     parameters: Mapping[str, float]
     active: bool
+    least: float = math.nan
 
     @property
     def worst(self) -> float:
@@ -254,6 +258,10 @@ class Tuned(LinearController):
         parts = [folded([self._verdict()]), goals, folded([legend])]
         if lines := self._model_lines():
             parts.append(folded(lines))
+        for goal in self.goals:
+            if math.isfinite(goal.least):
+                least = f"the least value of all linear controllers is {goal.least:.4g}"
+                parts.append(folded([f"{goal.label}: {least}"]))
         return "\n\n".join((*parts, parameters, folded([search])))
 
     def record(self) -> dict[str, object]:
@@ -273,6 +281,7 @@ class Tuned(LinearController):
                 "check": goal.check,
                 "met": goal.met,
                 "active": goal.active,
+                "least": goal.least,
                 "frequency": goal.frequency,
                 "parameters": goal.parameters,
             }

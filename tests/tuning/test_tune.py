@@ -315,6 +315,10 @@ def test_hinf_is_no_worse_than_tune(optimal):
     law = fflin.PD("q_b", "tau_b", shared=True)
     tuned = fflin.tune(optimal.lin, law, FULL, starts=1, steps=15)
     assert optimal.gamma <= 1.01 * tuned.goals[0].value
+    assert tuned.goals[0].least == optimal.gamma
+    assert f"all linear controllers is {optimal.gamma:.4g}" in " ".join(
+        tuned.report().split()
+    )
 
 
 REFUSED_BY_HINF = {
