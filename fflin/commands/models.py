@@ -7,6 +7,7 @@ import os
 import sys
 import warnings
 from argparse import Namespace
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
@@ -122,6 +123,12 @@ def info(arguments: Namespace) -> Report:
         "state_units": state.units,
         "input_names": inputs.names,
         "input_units": inputs.units,
+        "input_lags": {
+            names[0]: item.lag for item, names in robot.named_inputs if item.lag
+        },
+        "outputs": [
+            {"type": output.WORD, **asdict(output)} for output in robot.outputs
+        ],
         "limits": limits,
         "notes": notes,
         **constraints,

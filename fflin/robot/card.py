@@ -16,7 +16,7 @@ from fflin.robot.fields import limits_of
 from fflin.robot.inputs import Input, JointTorque
 from fflin.robot.joints import ROOT
 from fflin.robot.mass_properties import equivalent_box
-from fflin.robot.summary import LIMIT_UNITS, joint_table
+from fflin.robot.summary import LIMIT_UNITS, joint_table, output_words
 
 if TYPE_CHECKING:
     from fflin.robot.robot import Robot
@@ -42,6 +42,7 @@ def robot_card(robot: Robot) -> str:
         html.side_by_side(thumbnail(robot), html.table(joint_table(robot), "ll")),
         html.paragraph(LIMIT_UNITS if robot.joints else "", "note"),
         html.folded(f"inputs ({count})", table, html.paragraph(more)),
+        html.folded("outputs", *map(html.paragraph, output_words(robot))),
         html.folded("warnings", *map(html.paragraph, robot.notes)),
     )
 
@@ -49,11 +50,14 @@ def robot_card(robot: Robot) -> str:
 def _input_table(robot: Robot) -> list[list[str]]:
     """Return a table with the type, the place and the limits of each input."""
     limits = limits_of(robot)
-    rows = [["input", "type", "at", "lower", "upper"]]
+    lagging = any(item.lag for item in robot.inputs)
+    rows = [["input", "type", "at", "lower", "upper", *["lag [s]"] * lagging]]
     for item, names in robot.named_inputs:
         for name in names:
             ends = limits.get(name, (-math.inf, math.inf))
             cells = [f"{end:.5g}" if abs(end) < 1e300 else "." for end in ends]
+            if lagging:
+                cells.append(f"{item.lag:g}" if item.lag else ".")
             rows.append([name, type(item).__name__, _place(item), *cells])
     return rows
 

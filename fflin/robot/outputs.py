@@ -74,6 +74,20 @@ class Output:
                 object.__setattr__(self, name, given)
 
     @property
+    def sensor(self) -> str:
+        """Properties of the sensor that are given, such as "sample 0.25 s, delay 0.2 s"."""
+        times = {"sample": self.sample, "delay": self.delay, "lag": self.lag}
+        parts = [f"{name} {time:g} s" for name, time in times.items() if time]
+        for name in ("noise", "bias"):
+            value = getattr(self, name)
+            if isinstance(value, Mapping):
+                figures = (f"{key} {size:g}" for key, size in value.items())
+                parts.append(f"{name} {', '.join(figures)}")
+            elif value is not None:
+                parts.append(f"{name} {value:g}")
+        return ", ".join(parts)
+
+    @property
     def frames(self) -> tuple[str, ...]:
         """Names of the model's frames that the output depends on."""
         return tuple(

@@ -128,12 +128,19 @@ def _limit(value: float) -> str:
     return "."
 
 
+def output_words(robot: Robot) -> list[str]:
+    """Return each output as on the command line, with the properties of its sensor."""
+    words = []
+    for output in robot.outputs:
+        joints = vars(output).get("joints") or ()
+        word = ":".join((output.WORD, *output.frames, *joints))
+        words.append(f"{word} ({output.sensor})" if output.sensor else word)
+    return words
+
+
 def _settings(robot: Robot) -> list[str]:
     """Return lines about the fields that a URDF does not contain, except inputs and orbit."""
-    outputs = [
-        ":".join((y.WORD, *y.frames, *(vars(y).get("joints") or ())))
-        for y in robot.outputs
-    ]
+    outputs = output_words(robot)
     shown: dict[str, object] = {
         "stiffness [N m/rad | N/m | 1/s^2]": robot.stiffness,
         "damping [N m s/rad | N s/m | 1/s]": robot.damping,
@@ -149,6 +156,9 @@ def _settings(robot: Robot) -> list[str]:
         "disturbance, in simulations only": {
             name: [term.text(name, orbit=robot.orbit is not None) for term in terms]
             for name, terms in robot.disturbance.items()
+        },
+        "lags of inputs [s]": {
+            names[0]: item.lag for item, names in robot.named_inputs if item.lag
         },
         "outputs": outputs if outputs != ["state"] else (),
         "limits": {

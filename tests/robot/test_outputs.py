@@ -7,6 +7,7 @@ import pinocchio as pin
 import pytest
 
 import fflin
+from fflin.robot.summary import robot_info
 from tests.support.robots import FRAMES, mostly, random_point, random_pose
 
 
@@ -162,3 +163,24 @@ def test_pose_of_the_base_link_is_the_base_pose():
 def test_both_frames_of_an_output_must_be_there(robots):
     with pytest.raises(fflin.UnknownNameError, match="'nope'"):
         robots["servicer_7dof"].replace(outputs=[fflin.RelativePose("tool", "nope")])
+
+
+def test_reports_of_a_robot_show_the_fields_of_sensors_and_the_lags_of_inputs():
+    outputs = [
+        fflin.StarTracker(
+            sample=0.25, delay=0.2, noise={"noise_equivalent_angle": 10.0}
+        ),
+        fflin.Gyroscope("base", lag=0.1, noise=1e-5, bias={"bias_instability": 1.0}),
+    ]
+    inputs = [fflin.BaseTorque(lag=0.3)]
+    robot = fflin.load("cubesat", inputs=inputs, outputs=outputs)
+    text = " ".join(robot_info(robot).split())
+    assert (
+        "outputs: star_tracker (sample 0.25 s, delay 0.2 s, noise noise_equivalent_angle 10), "
+        "gyroscope:base (lag 0.1 s, noise 1e-05, bias bias_instability 1)" in text
+    )
+    assert "lags of inputs [s]: tau_b.x = 0.3" in text
+    card = robot._repr_html_()
+    assert "noise_equivalent_angle 10" in card
+    assert "lag [s]" in card
+    assert "lag [s]" not in fflin.load("cubesat")._repr_html_()
