@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from copy import copy
 from typing import TypeVar
 
@@ -13,7 +14,7 @@ from fflin.base.validation import Array, frozen, instance, number
 from fflin.control.loops import NOT_CORRECTED
 from fflin.control.policies import LinearLaw, StateFeedback
 from fflin.dynamics.state import selection
-from fflin.linear.holding import held_if_possible
+from fflin.linear.holding import held_if_possible, lags_by_name
 from fflin.linear.linearization import linearize
 from fflin.linear.model import LinearModel
 from fflin.robot.inputs import Thruster, lags_of
@@ -67,8 +68,8 @@ def unload_wheels(law: LawT, design: Robot, rate: float) -> LawT:
     InputError
         If the law already feeds back wheel speeds or does not measure them, `design` has other
         states or outputs than the robot of the law or lacks its inputs, the inputs have different
-        delays or lags, the model of the law contains lags, or the inputs of `design`
-        cannot change all wheel speeds without accelerating the rest of the robot.
+        delays or lags, or the inputs of `design` cannot change all wheel speeds without
+        accelerating the rest of the robot.
 
     Examples
     --------
@@ -133,18 +134,8 @@ def _models(law: LinearLaw, design: Robot) -> tuple[LinearModel, LinearModel]:
             f"the inputs of the law have the delays {listed(f'{x:g} s' for x in delays)}, expected "
             "one delay of all inputs, so that the external torque and the wheels act together"
         )
-    if lin.lag.any() or lin.output_lag.any():
-        raise InputError(
-            "the model of the law contains lags, expected a model without with_lags; unload_wheels "
-            "adds commands of the wheels from which the law does not compute their lagging torques"
-        )
-    lags = set(lags_of(design.named_inputs))
-    if len(lags) > 1:
-        raise InputError(
-            f"the inputs of '{design.name}' have the lags {listed(f'{x:g} s' for x in lags)}, "
-            "expected one lag of all inputs, so that the external torque and the wheels act "
-            "together"
-        )
+    lag = _common_lag("the inputs of the law", lin.lag.tolist())
+    _common_lag(f"the inputs of '{design.name}'", lags_of(design.named_inputs))
     continuous = held_if_possible(
         linearize(design, lin.q, lin.v, frame=lin.frame, reference=lin.reference)
     )
@@ -164,9 +155,25 @@ def _models(law: LinearLaw, design: Robot) -> tuple[LinearModel, LinearModel]:
             f"the law commands {listed(missing)}, expected inputs of '{design.name}'; give the "
             "robot of the law with an additional external torque"
         )
+    model = continuous
+    if lin.lag.any() or lin.output_lag.any():
+        # The wheels and the external torque lag alike, so their lagging torques cancel each other.
+        # The law computes the lagging torques of its own commands alone.
+        model = continuous.with_lags(lag, lags_by_name(lin)[1])
     if not lin.dt:
-        return continuous, continuous
-    return continuous.discretize(lin.dt, delay=delays.pop()), continuous
+        return model, continuous
+    return model.discretize(lin.dt, delay=delays.pop()), continuous
+
+
+def _common_lag(what: str, lags: Sequence[float]) -> float:
+    """Return the common lag [s] of inputs, or raise `InputError`; `what` names the inputs."""
+    different = sorted(set(lags))
+    if len(different) > 1:
+        raise InputError(
+            f"{what} have the lags {listed(f'{x:g} s' for x in different)}, expected one lag of "
+            "all inputs, so that the external torque and the wheels act together"
+        )
+    return different[0]
 
 
 def _require_unregulated(law: LinearLaw, speeds: list[str]) -> None:

@@ -18,6 +18,7 @@ from fflin.dynamics.coordinates import refuse_constraints
 from fflin.linear.files import record_of
 from fflin.linear.model import LinearModel, refuse_delayed, refuse_frozen
 from fflin.uncertainty.derivatives import ModelDerivatives
+from fflin.uncertainty.lagging_derivatives import LaggingDerivatives
 from fflin.uncertainty.parameters import Parameter, Parameters
 
 # Poles count as equal if their distance, relative to the largest pole, is smaller than this. Equal
@@ -381,7 +382,7 @@ def sensitivity(lin: LinearModel) -> Sensitivity:
     Raises
     ------
     InputError
-        If the model was loaded from a file, or contains delays or lags.
+        If the model was loaded from a file, or contains delays. Lags are supported.
     ModelError
         If the robot's Pinocchio model (``robot.model``) was modified after the robot was created.
 
@@ -399,7 +400,8 @@ def sensitivity(lin: LinearModel) -> Sensitivity:
         )
     refuse_constraints(robot, "sensitivities")
     refuse_frozen(lin, "sensitivity")
-    refuse_delayed(lin, "sensitivity")
+    if lin.delay.any():
+        refuse_delayed(lin, "sensitivity")
     if robot.orbit and lin.frame == "local":
         raise InputError(
             f"sensitivities in base axes are defined only without an orbit, but '{robot.name}' is "
@@ -411,4 +413,9 @@ def sensitivity(lin: LinearModel) -> Sensitivity:
             "the continuous model of this sampled model is not known; sample one with discretize"
         )
     lin.require_unchanged()
-    return Sensitivity(lin, Parameters(robot), ModelDerivatives(lin, robot, source))
+    derivatives: ModelDerivatives
+    if lin.added:
+        derivatives = LaggingDerivatives(lin, robot, source)
+    else:
+        derivatives = ModelDerivatives(lin, robot, source)
+    return Sensitivity(lin, Parameters(robot), derivatives)
