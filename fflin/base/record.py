@@ -237,9 +237,11 @@ def _from_mat(content: bytes) -> tuple[Record, bool]:
             f"{_other_format(content)}; save it with save -v7 (MATLAB and Octave)"
         )
     _require_room(_unpacked_size(content))
-    record = {
-        key: _of_mat(value) for key, value in loadmat(io.BytesIO(content)).items()
-    }
+    with warnings.catch_warnings():
+        # SciPy 1.18 announces another type of sparse matrices, which `_of_mat` reads too.
+        warnings.simplefilter("ignore", DeprecationWarning)
+        loaded = loadmat(io.BytesIO(content))
+    record = {key: _of_mat(value) for key, value in loaded.items()}
     return {key: value for key, value in record.items() if key[:2] != "__"}, checksummed
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -509,12 +510,12 @@ def _colored(path: Path) -> list[tuple[Array, Indices, Color | None]]:
     import trimesh
 
     try:
-        scene = trimesh.load_scene(path, process=False)
-        meshes = [
-            mesh
-            for mesh in scene.convert_units("meters").dump()
-            if hasattr(mesh, "faces")
-        ]
+        with warnings.catch_warnings():
+            # Packages that read COLLADA use deprecated functions of NumPy.
+            warnings.simplefilter("ignore", DeprecationWarning)
+            scene = trimesh.load_scene(path, process=False)
+            pieces = scene.convert_units("meters").dump()
+        meshes = [mesh for mesh in pieces if hasattr(mesh, "faces")]
         parts = list[tuple[Array, Indices, Color | None]]()
         for mesh in meshes:
             color = getattr(

@@ -86,7 +86,7 @@ def test_example_of_the_docstring(written):
     from textwrap import dedent
 
     text = fflin.load_inputs.__doc__
-    body = re.search(r"content ::\n\n(.*?)\n\n +gives", text, re.DOTALL)[1]
+    body = re.search(r"content ::\n\n(.*?)\n\n *gives", text, re.DOTALL)[1]
     shown = re.search(r"gives the inputs\s+``(.*?)``", text)[1]
     assert fflin.load_inputs(written(dedent(body))) == eval(shown, vars(fflin) | {})
 
