@@ -7,7 +7,9 @@
         for (j = 0; j < ${NAME}_STATES; j++) {
             next[i] += B[i][j] * x[j];
         }
-${windup_next}        if (!is_finite(next[i])) {
+    }
+${windup_next}    for (i = 0; i < ${NAME}_MEMORY; i++) {
+        if (!is_finite(next[i])) {
             status = ${NAME}_INVALID;
         }
     }

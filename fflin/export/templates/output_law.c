@@ -77,7 +77,9 @@ ${table_row}    int i, j, status = ${NAME}_OK;
         for (j = 0; j < ${NAME}_OUTPUTS; j++) {
             next[i] += B$table[i][j] * dy[j];
         }
-$windup_next        if (!is_finite(next[i])) {
+    }
+$windup_next    for (i = 0; i < ${NAME}_MEMORY; i++) {
+        if (!is_finite(next[i])) {
             status = ${NAME}_INVALID;
         }
     }

@@ -1,3 +1,1 @@
-        for (j = 0; j < ${NAME}_INPUTS; j++) {
-            next[i] += E$table[i][j] * cut(u[j], j);
-        }
+    limit_windup(E$table, u, next);
