@@ -21,7 +21,7 @@ from fflin.dynamics.outputs import Measuring
 from fflin.dynamics.state import StateMap
 from fflin.linear.aba_route import Route, inertia_matrix
 from fflin.linear.model import Certificate, LinearModel
-from fflin.linear.nonlinear import Nonlinear, jacobian, jacobians
+from fflin.linear.nonlinear import TRUNCATION, Nonlinear, jacobian, jacobians
 from fflin.linear.scales import (
     DIFFERENCE_TOLERANCE,
     EPS,
@@ -178,7 +178,8 @@ class ConstrainedReferences:
         rough = jacobian(manifold.states, z0, np.full(2 * d, _ROUGH), self._curved)
         self._steps = self._chosen_steps(rough)
         self.T, again = jacobians(manifold.states, z0, self._steps, self._curved)
-        self._T_error = np.max([np.abs(x - self.T) for x in again], axis=0)
+        apart = np.max([np.abs(x - self.T) for x in again], axis=0)
+        self._T_error = TRUNCATION * apart
 
     def _by_motion(self) -> None:
         """Differentiate the nonlinear motion and the outputs on the manifold, once."""

@@ -11,6 +11,7 @@ import pytest
 import fflin
 from fflin.linear.constrained_check import ConstrainedReferences
 from fflin.linear.files import given
+from fflin.linear.nonlinear import TRUNCATION, jacobians
 from tests.support.constrained import (
     Build,
     at,
@@ -379,3 +380,14 @@ def test_a_model_in_reduced_states_is_restored_from_its_file(tmp_path):
         assert read.state_names == lin.state_names
         np.testing.assert_array_equal(read.A, lin.A)
         np.testing.assert_array_equal(read.M, lin.M)
+
+
+def test_the_truncation_error_of_the_differences_is_estimated_in_full():
+    # sixth-order differences of exp(x) with large steps
+    steps, curved = np.array([0.3]), np.array([True])
+    value, again = jacobians(np.exp, np.zeros(1), steps, curved)
+    error = abs(value[0, 0] - 1.0)
+    estimate = TRUNCATION * max(abs(x[0, 0] - value[0, 0]) for x in again)
+    # The next term of the error is smaller by about the square of the step.
+    assert error == pytest.approx(estimate, rel=0.3**2)
+    assert max(abs(x[0, 0] - value[0, 0]) for x in again) < 0.95 * error
