@@ -180,9 +180,9 @@ class Plan:
         limits += _signals(plant, self.q, self.v, dt, duration)
         pace = Pace(limits, self.method, duration, _longest_step(plant, policy))
         late = delays_of(policy, plant, options.delay)
-        self.times = times = _with_lag_note(
-            times_of(options, duration, sample, pace, late), policy, plant
-        )
+        times = times_of(options, duration, sample, pace, late)
+        times = _with_lag_note(times, policy, plant)
+        self.times = times = _with_delay_note(times, policy, late)
         if policy and times.sample:
             policy = policy.held_for(times.sample * times.dt)
         # Errors that the outputs of the robot declare, or None.
@@ -599,6 +599,37 @@ def _with_lag_note(times: Times, policy: Policy | None, plant: Plant) -> Times:
     lags = lags_of_robot(plant.robot, plant.state, outputs=policy.senses_outputs)
     note = lag_difference(policy, lags, "the motion")
     return times._replace(notes=(*times.notes, note)) if note else times
+
+
+def _with_delay_note(
+    times: Times, policy: Policy | None, delays: tuple[float, ...]
+) -> Times:
+    """Return the times with a note on delays for which the law was not designed, if there are any.
+
+    `delays` [s] are those of all inputs or of each input.
+    """
+    if policy is None or policy.model is None:
+        return times
+    designed = tuple(policy.input_delays.values()) or (0.0,)
+    if np.allclose(_extremes(designed), _extremes(delays), rtol=0.0, atol=1e-9):
+        return times
+    note = (
+        f"the law was designed for a delay of {_range(designed)} of the inputs, but the motion has "
+        f"{_range(delays)}"
+    )
+    return times._replace(notes=(*times.notes, note))
+
+
+def _extremes(values: tuple[float, ...]) -> tuple[float, float]:
+    return min(values), max(values)
+
+
+def _range(delays: tuple[float, ...]) -> str:
+    """Write delays [s], such as '0.5 s' or '0 to 0.5 s'."""
+    least, largest = _extremes(delays)
+    if largest - least <= 1e-9:
+        return f"{largest:g} s"
+    return f"{least:g} to {largest:g} s"
 
 
 def times_of(

@@ -306,3 +306,32 @@ def test_integral_action_of_a_delayed_law():
         for feedback in (law, state_feedback(late))
     ]
     assert errors[0] < 1e-3 * errors[1]
+
+
+@pytest.mark.parametrize(
+    ("delay", "words"),
+    [
+        (None, None),
+        (0.4, None),
+        (0.2, "delay of 0.4 s of the inputs, but the motion has 0.2 s"),
+        (0.0, "but the motion has 0 s"),
+        ({"tau_b": 0.2}, "but the motion has 0 to 0.2 s"),
+    ],
+)
+def test_a_delay_that_the_law_does_not_expect_is_noted(delay, words):
+    robot = fflin.load("planar_detumble")
+    lin = fflin.linearize(robot).discretize(0.2, delay=0.4)
+    policy = fflin.StateFeedback(lin, fflin.lqr(lin))
+    motion = fflin.simulate(robot, policy, duration=2.0, dt=0.1, delay=delay)
+    notes = [note for note in motion.notes if "designed for a delay" in note]
+    assert len(notes) == (words is not None)
+    assert all(words in note for note in notes)
+
+
+def test_a_delay_is_noted_for_a_law_without_one():
+    robot = fflin.load("planar_detumble")
+    lin = fflin.linearize(robot).discretize(0.2)
+    policy = fflin.StateFeedback(lin, fflin.lqr(lin))
+    motion = fflin.simulate(robot, policy, duration=2.0, dt=0.1, delay=0.2)
+    (note,) = (note for note in motion.notes if "designed for a delay" in note)
+    assert "of 0 s" in note and note.endswith("has 0.2 s")
