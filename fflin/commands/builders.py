@@ -704,13 +704,21 @@ def with_errors(
     return with_sensor_errors(policy.fresh(), sizes["bias"], sizes["noise"], 0.0)
 
 
+def _budgeted_noise(arguments: Namespace) -> dict[str, float] | None:
+    """Return the noise of --noise, or None for that of the outputs unless --no-noise is given."""
+    given = once("--noise", getattr(arguments, "noise", []))
+    if given or arguments.no_noise:
+        return given
+    return None
+
+
 def budget_of(
     robot: fflin.Robot,
     policy: fflin.Policy | None,
-    motion: fflin.Motion,
+    motion: fflin.Motion | None,
     arguments: Namespace,
 ) -> fflin.ErrorBudget:
-    """Return the error budget of a simulated loop."""
+    """Return the error budget of a loop, compared with its motion if there is one."""
     if policy is None or policy.model is None or not policy.laws_of_period():
         raise InputError(
             "--budget needs a linear regulator about a point; remove --budget, or the options for "
@@ -723,12 +731,12 @@ def budget_of(
     return fflin.error_budget(
         policy,
         model,
-        noise=once("--noise", arguments.noise),
-        bias=once("--bias", arguments.bias),
+        noise=_budgeted_noise(arguments),
+        bias=once("--bias", getattr(arguments, "bias", [])),
         delay=delay,
         robot=robot,
         motion=motion,
-        limit_cycle=True,
+        limit_cycle=motion is not None,
     )
 
 

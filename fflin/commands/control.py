@@ -320,6 +320,10 @@ def montecarlo(arguments: Namespace) -> Report:
         settings[name] = getattr(arguments, name)
     if arguments.no_noise:
         settings["noise"] = 0.0
+    budget = None
+    if arguments.budget:
+        # Before the runs, because a loop without a budget is refused.
+        budget = budget_of(robot, policy, None, arguments)
     settings["histories"] = _ROWS if arguments.plot else 0
     settings["out"] = None if is_table else path
     with going_on(path, "runs") as progress:
@@ -347,6 +351,9 @@ def montecarlo(arguments: Namespace) -> Report:
         errors = campaign.pointing(window, accuracy=arguments.accuracy)
         result["pointing"] = pointing_record(errors)
         text += f"\n\n{errors}"
+    if budget is not None:
+        result["budget"] = budget
+        text += f"\n\n{budget}"
     return Report(robot.name, result, text, files)
 
 

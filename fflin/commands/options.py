@@ -130,7 +130,7 @@ OPTIONS: dict[str, dict[str, str]] = {
         **_LOOP,
         "": "ROBOT DISPERSIONS",
         "runs": "runs seed until width confidence workers threads no-noise",
-        "pointing errors": "pointing accuracy",
+        "pointing errors": "pointing accuracy budget",
         OUTPUT: f"goal worst plot output-file force html {_PICTURES}",
     },
 }
@@ -379,8 +379,9 @@ ABOUT: dict[str, str] = {
     "pointing": "report pointing errors as in ECSS-E-ST-60-10C, for windows of this length [s]",
     "accuracy": "angle [deg] for the settling time of --pointing",
     "budget": "report the error of each cause in the linear loop, see fflin.error_budget: the "
-    "disturbance of the robot, --noise and --bias. The part of the simulated errors that they do "
-    "not explain, such as the limit cycle of thrusters, is a further cause",
+    "disturbance of the robot, the noise of its outputs, --noise and --bias. The part of the "
+    "simulated errors that they do not explain, such as the limit cycle of thrusters, is a "
+    "further cause",
     "noise": "standard deviation of the noise in each sample of a measured signal, as a standard "
     "normal variable. NAME is a state, or an output for --controller, a group or a quantity such "
     "as gyroscope",
@@ -462,6 +463,8 @@ ABOUT: dict[str, str] = {
     "montecarlo plot": "plot quantile bands over time, histograms and the worst runs to FILE",
     "montecarlo html": "write a page that plays the worst run",
     "montecarlo seed": "random seed",
+    "montecarlo budget": "report the error of each cause in the linear loop of the nominal robot, "
+    "see fflin.error_budget: the disturbance of the robot and the noise of its outputs",
     "montecarlo goal": "report the fraction of runs that meet CONDITION, such as 'attitude < 1 deg "
     "and settle < 60 s', and draw the bounds of CONDITION in --plot",
     "montecarlo threads": "distribute the runs over N threads; by default one per core",

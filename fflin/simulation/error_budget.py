@@ -38,6 +38,7 @@ from fflin.control.optimal.periodic_loops import (
     steady_states,
 )
 from fflin.control.policy import Policy, System
+from fflin.control.sensor_errors import declared_errors
 from fflin.dynamics.coordinates import refuse_elliptic
 from fflin.dynamics.disturbance import phasors_of
 from fflin.dynamics.state import StateMap
@@ -257,7 +258,7 @@ def error_budget(
         White noise {measured signal: size}. In a sampled loop, the size is the standard deviation
         of each sample in the unit of the signal. In continuous time, it is the square root of the
         intensity [unit sqrt(s)]. `StateFeedback` and gains measure the states, other laws the
-        outputs.
+        outputs. By default, a sampled law receives the noise that the outputs of `robot` declare.
     bias : mapping, optional
         Constant errors {measured signal: bias} of sensors.
     disturbance : mapping, optional
@@ -277,7 +278,8 @@ def error_budget(
     motion : Motion, optional
         Simulated motion whose attitude errors are compared with the budget.
     robot : Robot, optional
-        Robot whose field `disturbance` contains further causes, at the attitude of `lin`. In orbit,
+        Robot whose field `disturbance` contains further causes, at the attitude of `lin`, and whose
+        outputs may declare noise; the drift of their biases is left out. In orbit,
         constants in inertial axes are sinusoids with the rate of the orbit. Flat plates are left
         out, with an `FflinWarning`.
     limit_cycle : bool
@@ -326,6 +328,8 @@ def error_budget(
     loop = DisturbedLoop(laws, lin, delay, sample, forces)
     acting = [loop.phasor(*key, value) for key, value in phasors.items()]
     causes: list[Contribution] = []
+    if noise is None:
+        noise = _declared_noise(policy, lin, robot, loop.dt)
     for key, values in _given("noise", noise).items():
         size = _size("noise", key, values)
         causes.append(loop.measurement_noise(key, size))
@@ -403,6 +407,28 @@ def _sinusoid(key: str, value: object) -> tuple[object, float]:
             f"{label} has the frequency {frequency:g} Hz, expected more than 0"
         )
     return amplitude, 2.0 * math.pi * frequency
+
+
+def _declared_noise(
+    policy: Policy | Gain, lin: LinearModel, robot: Robot | None, sample: float
+) -> dict[str, float]:
+    """Return {output or group: standard deviation} of the noise that a robot's outputs declare."""
+    if robot is None or not isinstance(policy, Policy):
+        return {}
+    state = StateMap(robot, reference=lin.reference, frame=lin.frame)
+    errors = declared_errors(policy, state, sample)
+    if errors is None:
+        return {}
+    groups: dict[str, dict[str, float]] = {}
+    for name, size in zip(policy.sensors, errors.noise.tolist(), strict=True):
+        groups.setdefault(name.rpartition(".")[0], {})[name] = size
+    noise: dict[str, float] = {}
+    for group, sizes in groups.items():
+        if group and len(set(sizes.values())) == 1:
+            noise[group] = next(iter(sizes.values()))
+        else:
+            noise |= sizes
+    return {name: size for name, size in noise.items() if size}
 
 
 def _disturbances(

@@ -180,9 +180,9 @@ class Plan:
         limits += _signals(plant, self.q, self.v, dt, duration)
         pace = Pace(limits, self.method, duration, _longest_step(plant, policy))
         late = delays_of(policy, plant, options.delay)
-        times = times_of(options, duration, sample, pace, late)
-        times = _with_lag_note(times, policy, plant)
-        self.times = times = _with_delay_note(times, policy, late)
+        self.times = times = _with_notes_on_design(
+            times_of(options, duration, sample, pace, late), policy, plant, late
+        )
         if policy and times.sample:
             policy = policy.held_for(times.sample * times.dt)
         # Errors that the outputs of the robot declare, or None.
@@ -590,6 +590,13 @@ def step_of(
         steps = int(np.ceil(duration / dt))
         dt = duration / steps
     return dt, steps, mode
+
+
+def _with_notes_on_design(
+    times: Times, policy: Policy | None, plant: Plant, delays: tuple[float, ...]
+) -> Times:
+    """Return the times with notes on lags and delays for which the law was not designed."""
+    return _with_delay_note(_with_lag_note(times, policy, plant), policy, delays)
 
 
 def _with_lag_note(times: Times, policy: Policy | None, plant: Plant) -> Times:

@@ -67,3 +67,48 @@ def test_what_has_no_budget_is_refused(satellite, tmp_path):
         *("simulate", satellite, *LOOP, "--noise", "gyro=1"), cwd=tmp_path
     )
     assert code == 2 and "gyro" in err
+
+
+SENSORS = """
+[[output]]
+type = "star_tracker"
+noise = 1e-5
+[[output]]
+type = "gyroscope"
+frame = "base"
+noise = 1e-6
+"""
+
+
+def test_a_budget_contains_the_noise_that_outputs_declare(satellite, tmp_path):
+    (tmp_path / "measured.toml").write_text(
+        (tmp_path / "satellite.toml").read_text() + SENSORS
+    )
+    robot = fflin.load("measured.toml")
+    lin = fflin.linearize(robot).discretize(0.5)
+    policy = fflin.lqg(fflin.lqr(lin), fflin.kalman(lin, 1e-10))
+    declared = {part.cause: part for part in budget_of(policy, lin, robot)}
+    by_hand = fflin.error_budget(
+        policy, lin, noise={"q_b": 1e-5, "base.gyroscope": 1e-6}
+    )
+    for part in by_hand.contributions:
+        np.testing.assert_allclose(declared[part.cause].size, part.size, rtol=1e-12)
+    assert len(declared) == 3
+    none = budget_of(policy, lin, robot, noise={})
+    assert [part.cause for part in none] == ["constant tau_b"]
+
+
+def budget_of(policy, lin, robot, **given):
+    return fflin.error_budget(policy, lin, robot=robot, **given).contributions
+
+
+@pytest.mark.compiled
+def test_a_campaign_reports_the_budget_of_the_nominal_robot(satellite, tmp_path):
+    (tmp_path / "u.toml").write_text('[dispersions]\n"omega_b.z" = 1e-4\n')
+    options = ("--runs", 3, *LOOP)
+    command = ("montecarlo", satellite, "u.toml", *options, "--budget", "--json")
+    code, out, _ = run(*command, cwd=tmp_path)
+    assert code == 0
+    (cause,) = json.loads(out)["budget"]["contributions"]
+    assert cause["cause"] == "constant tau_b"
+    refused("montecarlo", satellite, "u.toml", "--free", "--budget", cwd=tmp_path)
