@@ -502,7 +502,7 @@ def test_the_budget_of_a_robot_with_lags_needs_no_input_of_force():
         robot = fflin.load("cubesat", inputs=inputs, outputs=[fflin.BasePose()])
         lin = fflin.linearize(robot).with_lags().discretize(0.1)
         gain = fflin.lqr(lin)
-        estimator = fflin.kalman(lin, {"omega_b": 1e-8}, 1e-6)
+        estimator = fflin.kalman(lin, {"omega_b": 1e-8, "v_b": 1e-8}, 1e-6)
         law = fflin.OutputFeedback(lin, fflin.lqg(gain, estimator))
         budgets.append(fflin.error_budget(law, lin, noise={"q_b": 1e-4}))
     first, second = budgets
