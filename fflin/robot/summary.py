@@ -158,7 +158,10 @@ def _settings(robot: Robot) -> list[str]:
             for name, terms in robot.disturbance.items()
         },
         "lags of inputs [s]": {
-            names[0]: item.lag for item, names in robot.named_inputs if item.lag
+            name: item.lag
+            for item, names in robot.named_inputs
+            if item.lag
+            for name in names
         },
         "outputs": outputs if outputs != ["state"] else (),
         "limits": {

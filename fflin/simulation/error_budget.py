@@ -761,5 +761,8 @@ def _forces_of(model: LinearModel) -> tuple[tuple[str, ...], Array]:
         reference=model.reference,
         independent=model.independent,
     )
-    rows = [larger.state_names.index(name) for name in model.state_names]
-    return input_keys(larger), larger.B[rows]
+    # The force that acts passes no lag, so that it does not move the states of lags.
+    effects = dict(zip(larger.state_names, larger.B, strict=True))
+    none = np.zeros(larger.B.shape[1])
+    rows = [effects.get(name, none) for name in model.state_names]
+    return input_keys(larger), np.array(rows)

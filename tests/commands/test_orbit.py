@@ -30,6 +30,11 @@ def test_linearize_at_a_time():
     assert run("check", SATELLITE, "--time", 1000)[0] == 0
 
 
+def test_the_model_of_magnetorquers_is_shown_without_its_poles():
+    code, out, _ = run("linearize", SATELLITE, "--time", 1000)
+    assert code == 0 and "at t = 1000 s" in out and "unstable poles" not in out
+
+
 def test_the_models_of_one_period_and_their_multipliers(tmp_path):
     command = ("linearize", "cubesat", *ELLIPSE, "--periodic", 8)
     code, out, _ = run(*command, "-o", "models.npz", cwd=tmp_path)

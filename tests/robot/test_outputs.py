@@ -179,7 +179,8 @@ def test_reports_of_a_robot_show_the_fields_of_sensors_and_the_lags_of_inputs():
         "outputs: star_tracker (sample 0.25 s, delay 0.2 s, noise noise_equivalent_angle 10), "
         "gyroscope:base (lag 0.1 s, noise 1e-05, bias bias_instability 1)" in text
     )
-    assert "lags of inputs [s]: tau_b.x = 0.3" in text
+    lags = "tau_b.x = 0.3, tau_b.y = 0.3, tau_b.z = 0.3"
+    assert f"lags of inputs [s]: {lags}" in text
     card = robot._repr_html_()
     assert "noise_equivalent_angle 10" in card
     assert "lag [s]" in card

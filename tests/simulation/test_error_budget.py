@@ -493,3 +493,18 @@ def test_a_constant_torque_leaves_a_law_that_estimates_it_without_error():
     assert errors["constant tau_b"] < 1e-9
     assert errors["bias of gyroscope"] < 1e-9
     assert errors["bias of q_b.x"] == pytest.approx(np.degrees(2e-5), rel=1e-6)
+
+
+def test_the_budget_of_a_robot_with_lags_needs_no_input_of_force():
+    budgets = []
+    for others in ([], [fflin.BaseForce()]):
+        inputs = [fflin.BaseTorque(lag=0.3), *others]
+        robot = fflin.load("cubesat", inputs=inputs, outputs=[fflin.BasePose()])
+        lin = fflin.linearize(robot).with_lags().discretize(0.1)
+        gain = fflin.lqr(lin)
+        estimator = fflin.kalman(lin, {"omega_b": 1e-8, "v_b": 1e-8}, 1e-6)
+        law = fflin.OutputFeedback(lin, fflin.lqg(gain, estimator))
+        budgets.append(fflin.error_budget(law, lin, noise={"q_b": 1e-4}))
+    first, second = budgets
+    assert first.total[:3].min() > 0.0
+    np.testing.assert_allclose(first.total[:3], second.total[:3], rtol=1e-6)
