@@ -289,10 +289,11 @@ def model_report(lin: fflin.LinearModel) -> str:
             )
         )
     rates = lin.state_units if lin.dt else [_rate(unit) for unit in lin.state_units]
-    # Report unstable poles only for a continuous model at an equilibrium. Away from an equilibrium,
+    # Report unstable poles only for a continuous, constant model at an equilibrium. Otherwise,
     # poles do not determine stability. If A^2 = 0, do not compute the poles, because all of them
     # are zero.
-    has_poles = stays and not lin.dt and (lin.A @ lin.A).any()
+    constant = lin.t is None and not lin.dt
+    has_poles = stays and constant and (lin.A @ lin.A).any()
     growing = fflin.modes(lin).unstable if has_poles else ()
     if growing:
         shown = ", ".join(f"{mode.pole:.5g}" for mode in growing)

@@ -6,7 +6,7 @@ import math
 import warnings
 from typing import NamedTuple
 
-from fflin.base.errors import FflinWarning, listed
+from fflin.base.errors import FflinWarning, InputError, listed
 from fflin.base.names import LAG, input_keys, lag_name
 from fflin.control.gain import Gain
 from fflin.control.policy import Policy
@@ -141,3 +141,20 @@ def model_with_lags(lin: LinearModel, lags: Lags) -> LinearModel:
     if not (late or sensed):
         return lin
     return lin.with_lags(late, sensed)
+
+
+def model_of_loop(lin: LinearModel, lags: Lags) -> LinearModel:
+    """Return a model without lags, continuous or sampled, with the given lags."""
+    if not lags:
+        return lin
+    source = lin.generator if lin.dt else lin
+    if source is None:
+        raise InputError(
+            "the inputs or outputs of the robot have lags, but lin is sampled without them and its "
+            "continuous model is unknown; give the continuous model"
+        )
+    source = model_with_lags(source, lags)
+    if not lin.dt:
+        return source
+    delays = dict(zip(input_keys(lin), lin.delay.tolist(), strict=True))
+    return source.discretize(lin.dt, delay=delays)

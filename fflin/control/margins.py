@@ -17,7 +17,7 @@ from fflin.control.gain import Margins as GainMargins
 from fflin.control.lags import (
     designed_lags,
     lags_of_model,
-    model_with_lags,
+    model_of_loop,
     robot_lags,
     warn_of_lags,
 )
@@ -175,20 +175,7 @@ def _lagging(policy: Policy | Gain, lin: LinearModel) -> LinearModel:
     if lags_of_model(lin):
         return lin
     law = policy if isinstance(policy, Gain) else as_policy(policy)
-    lags = robot_lags(law, lin) or designed_lags(law)
-    if not lags:
-        return lin
-    source = lin.generator if lin.dt else lin
-    if source is None:
-        raise InputError(
-            "the inputs or outputs of the robot have lags, but lin is sampled without them and its "
-            "continuous model is unknown; give the continuous model"
-        )
-    source = model_with_lags(source, lags)
-    if not lin.dt:
-        return source
-    delays = dict(zip(input_keys(lin), lin.delay.tolist(), strict=True))
-    return source.discretize(lin.dt, delay=delays)
+    return model_of_loop(lin, robot_lags(law, lin) or designed_lags(law))
 
 
 @in_one_thread

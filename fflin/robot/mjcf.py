@@ -17,7 +17,7 @@ import pinocchio as pin
 from fflin.base.errors import UrdfError
 from fflin.base.tables import counted
 from fflin.robot.constraints import Constraint, Spherical, Weld
-from fflin.robot.inputs import JointTorque
+from fflin.robot.inputs import BaseForce, BaseTorque, JointTorque
 from fflin.robot.joints import ROOT
 from fflin.robot.urdf.xml import Element, parse
 
@@ -277,7 +277,8 @@ def _inputs(root: Element, model: pin.Model, *, floats: bool) -> dict[str, Any]:
         if name not in joints:
             continue
         driven[name] = JointTorque(name)
-        if element.tag == "motor" and "ctrlrange" in element.attributes:
+        limited = element.attributes.get("ctrllimited") != "false"
+        if element.tag == "motor" and limited and "ctrlrange" in element.attributes:
             gear = float(element.attributes.get("gear", "1").split()[0])
             ends = sorted(gear * x for x in element.vector("ctrlrange", 2))
             if ends[0] < ends[1]:
@@ -288,6 +289,9 @@ def _inputs(root: Element, model: pin.Model, *, floats: bool) -> dict[str, Any]:
             fields["passive"] = passive
     if not floats and joints:
         fields["inputs"] = list(driven.values()) or [JointTorque("*")]
+    elif any(motor.max is not None for motor in driven.values()):
+        motors = [driven[name] for name in model.names if name in driven]
+        fields["inputs"] = [BaseTorque(), BaseForce(), *motors]
     return fields
 
 
@@ -318,6 +322,9 @@ def _notes(root: Element, path: Path) -> Iterator[str]:
             elements = _inside(root, "default", "joint")
         if any(x.attributes.get(key, "0") != "0" for x in elements):
             parts.append(text)
+    motors = _inside(root, "default", "motor")
+    if any({"gear", "ctrlrange"} & set(motor.attributes) for motor in motors):
+        parts.append("gear and ctrlrange of motors in default classes")
     if parts:
         yield f"{path.name}: not modelled: {'; '.join(parts)}"
 

@@ -20,6 +20,7 @@ from fflin.linear.model import LinearModel
 from fflin.tuning.channels import Ends, channel_of, ends_of
 from fflin.tuning.goals import Goal, MaxGain
 from fflin.tuning.law import law_of
+from fflin.tuning.loop import require_plain_sensors, with_robot_lags
 from fflin.tuning.plant import Plant, plant_of, signals_of
 from fflin.tuning.reduction import truncations
 from fflin.tuning.structures import Names, indices, input_indices
@@ -200,7 +201,8 @@ def hinf(
     Parameters
     ----------
     lin : LinearModel
-        Continuous or sampled model. For a sampled one, the controller is sampled too.
+        Continuous or sampled model. For a sampled one, the controller is sampled too. A model
+        without lags gets the lags of the inputs and outputs of its robot.
     goals : MaxGain or sequence of MaxGain
         Goals at all frequencies; their bounds may depend on frequency.
     measured, inputs : str or sequence of str
@@ -214,7 +216,8 @@ def hinf(
     ------
     InputError
         If a goal is not a `MaxGain` at all frequencies, a signal does not exist, a command or
-        measured output is not in the goals, or no design is stable and verified.
+        measured output is not in the goals, a measured output has a `sample` or `delay` of its
+        own, the model holds only at one time, or no design is stable and verified.
     MissingPackageError
         If slycot is not installed.
 
@@ -230,8 +233,10 @@ def hinf(
     every = [goals] if isinstance(goals, Goal) else goals
     if not isinstance(every, Sequence) or not every:
         raise InputError(f"goals are {goals!r}, expected one goal or more")
+    lin = with_robot_lags(lin)
     signals = signals_of(lin)
     rows = indices("output", measured, signals.outputs)
+    require_plain_sensors(lin, rows, "hinf")
     columns = input_indices(inputs, signals)
     ends = []
     for goal in every:

@@ -98,9 +98,9 @@ class Plant:
 
 
 def signals_of(lin: LinearModel) -> Signals:
-    """Return the measured outputs and the inputs of a model, for its continuous time."""
+    """Return the measured outputs and inputs of a model, in continuous time and without lags."""
     source = lin.generator if lin.dt else lin
-    model = lin if source is None else source
+    model = lin if source is None else source.undelayed
     return Signals(
         lin.output_names,
         lin.input_names,

@@ -13,6 +13,8 @@ from fflin.base.validation import Array, ArrayLike, as_double, instance, positiv
 from fflin.dynamics.delays import HeldSystem
 from fflin.linear.linearization import linearize
 from fflin.linear.model import Delay, LinearModel, delays_of, refuse_sampled
+from fflin.tuning.loop import acting_lags, with_robot_lags
+from fflin.uncertainty.lagging import with_lags
 from fflin.uncertainty.lft import LFT
 from fflin.uncertainty.uncertain import Uncertain
 
@@ -88,7 +90,8 @@ def points_of(
 
 
 def _in_time(lin: LinearModel, dt: float | None, delay: Delay) -> LinearModel:
-    """Return a model sampled at dt [s] with delayed inputs, or the model itself."""
+    """Return a model with the lags of its robot, sampled at dt [s] with delayed inputs if given."""
+    lin = with_robot_lags(lin)
     if dt is None:
         if not isinstance(delay, int | float) or delay != 0.0:
             raise InputError(
@@ -105,8 +108,8 @@ def _of_ranges(
 ) -> Points:
     """Return the nominal model, the corners of the ranges and random points in them."""
     at = None if q is None else as_double("q", q)
-    lft = plant.lft(at)
     nominal = linearize(plant.robot, at)
+    lft = with_lags(plant.lft(at), acting_lags(nominal))
     lin = _in_time(nominal, dt, delay)
     size = len(lft.repeats)
     if 2**size <= _CORNERS:

@@ -19,6 +19,7 @@ from fflin.tuning.curves import GoalLoops
 from fflin.tuning.goals import Goal
 from fflin.tuning.hinf import hinf
 from fflin.tuning.law import Law
+from fflin.tuning.loop import require_plain_sensors
 from fflin.tuning.plant import Plant, Signals, plant_of, signals_of
 from fflin.tuning.points import Point, Points, points_of
 from fflin.tuning.problem import Case, Measure, Problem
@@ -71,7 +72,8 @@ def tune(
     plant : LinearModel, sequence of LinearModel, or Uncertain
         Model or models for which the goals must hold. For an `Uncertain`, the search begins with
         the nominal model. It adds the worst of the corners and of 200 random points of the ranges,
-        until none of them is worse.
+        until none of them is worse. Models without lags get the lags of the inputs and outputs of
+        their robot.
     structure : Structure
         Structure of the law: `PD`, `PID`, `StaticGain`, `StateSpaceLaw`, `CustomLaw`, filters, sums
         and series.
@@ -105,6 +107,8 @@ def tune(
         If one of these conditions is true:
 
         - a signal of a goal or of the structure does not exist;
+        - a measured output has a `delay`, or a `sample` other than `dt`;
+        - a model holds only at one time, as in an elliptic orbit;
         - no start reaches a stable loop, for example because no law can move an unstable pole;
         - the variance of a goal is infinite, because noise reaches its output without a lag.
 
@@ -165,6 +169,7 @@ class _Task:
         self.signals: Signals = signals_of(lin)
         self.structured = Structured(structure, self.signals)
         measured, commanded = self.structured.used
+        require_plain_sensors(lin, measured, "tune")
         self.measures = [
             Measure(
                 goal,

@@ -38,6 +38,11 @@ def test_the_models_of_a_circular_orbit_repeat_the_model_at_rest():
     assert len(record["multipliers"]) == 12
 
 
+def test_the_model_of_magnetorquers_is_shown_without_its_poles():
+    code, out, _ = run("linearize", SATELLITE, "--time", 1000)
+    assert code == 0 and "at t = 1000 s" in out and "unstable poles" not in out
+
+
 @pytest.mark.exhaustive
 def test_the_models_of_one_period_and_their_multipliers(tmp_path):
     command = ("linearize", "cubesat", *ELLIPSE, "--periodic", 8)

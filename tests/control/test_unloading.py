@@ -1,8 +1,7 @@
 """Unloading of wheels by external torques, beside laws with integrals, filters and delays."""
 
-from dataclasses import replace
-
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest

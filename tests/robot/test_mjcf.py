@@ -162,6 +162,24 @@ def test_one_warning_lists_what_is_not_modelled(tmp_path):
     ]
 
 
+def test_motors_of_a_free_robot_have_limits(tmp_path):
+    motors = """<actuator><motor joint="jb" gear="-5" ctrlrange="-2 1"/>
+    <motor joint="ja" ctrlrange="-1 1" ctrllimited="false"/></actuator></mujoco>"""
+    robot = load(tmp_path, TWIN.format("").replace("</mujoco>", motors))
+    limits = {item.joint: (item.min, item.max) for item in robot.inputs[2:]}
+    assert limits == {"ja": (None, None), "jb": (-5.0, 10.0)}
+    assert robot.inputs[:2] == (fflin.BaseTorque(), fflin.BaseForce())
+    assert set(robot.passive) == {"jc", "jd"} & set(robot.joint_names)
+
+
+def test_motors_in_default_classes_are_in_the_warning(tmp_path):
+    text = TWIN.format("").replace(
+        "<worldbody>", '<default><motor gear="2"/></default><worldbody>'
+    )
+    with pytest.warns(fflin.FflinWarning, match="gear and ctrlrange of motors in"):
+        load(tmp_path, text)
+
+
 def test_a_robot_file_may_name_an_mjcf_file(tmp_path):
     (tmp_path / "robot.xml").write_text(TWIN.format(EQUALITIES["connect"]))
     robot = load(tmp_path, 'urdf = "robot.xml"\ngravity = [0, 0, -1.62]\n', "moon.toml")

@@ -5,6 +5,7 @@ import sys
 
 import numpy as np
 import pytest
+import scipy.linalg
 
 import fflin
 
@@ -373,3 +374,112 @@ def test_hinf_without_slycot_names_the_package(stiff, monkeypatch):
     monkeypatch.setitem(sys.modules, "slycot", None)
     with pytest.raises(fflin.MissingPackageError, match="robust"):
         fflin.hinf(fflin.linearize(stiff), FULL, measured="q_b")
+
+
+def swept_margin(policy, system, frequencies, delay):
+    """Disk margin of a loop with one channel at a time: 1 / max |S - T| / 2, by a sweep."""
+    A, B, C = system
+    law, dt = policy.system, policy.system.dt
+    unit = np.eye(B.shape[1])
+    largest = 0.0
+    for w in frequencies:
+        z = np.exp(1j * w * dt)
+        plant = C @ np.linalg.solve(z * np.eye(len(A)) - A, B) / z**delay
+        inner = np.linalg.solve(z * np.eye(len(law.A)) - law.A, law.B)
+        S = np.linalg.inv(unit - (law.C @ inner + law.D) @ plant)
+        largest = max(largest, np.linalg.norm(2.0 * S - unit, 2) / 2.0)
+    return 1.0 / largest
+
+
+def test_the_lags_of_a_robot_are_in_the_tuned_loop():
+    """The zero-order hold of the plant with its lags is computed without models of fflin."""
+    late, sensed, h = 0.3, 0.1, 0.2
+    robot = fflin.load(
+        "cubesat",
+        inputs=[fflin.BaseTorque(lag=late)],
+        outputs=[fflin.StarTracker(lag=sensed)],
+    )
+    lin = fflin.linearize(robot)
+    goals = [fflin.Margin(0.75, hard=True), fflin.Decay(0.05)]
+    law = fflin.PD("q_b", "tau_b", shared=True)
+    tuned = fflin.tune(lin, law, goals, dt=h, delay=h, starts=1, steps=20)
+    nx, unit = len(lin.A), np.eye(3)
+    A = np.zeros((nx + 6, nx + 6))
+    A[:nx, :nx], A[:nx, nx : nx + 3] = lin.A, lin.B
+    A[nx : nx + 3, nx : nx + 3] = -unit / late
+    A[nx + 3 :, :nx], A[nx + 3 :, nx + 3 :] = lin.C / sensed, -unit / sensed
+    B = np.zeros((nx + 6, 3))
+    B[nx : nx + 3] = unit / late
+    held = scipy.linalg.expm(h * np.block([[A, B], [np.zeros((3, nx + 9))]]))
+    system = (
+        held[: nx + 6, : nx + 6],
+        held[: nx + 6, nx + 6 :],
+        np.eye(3, nx + 6, nx + 3),
+    )
+    margin = swept_margin(tuned, system, np.geomspace(0.01, np.pi / h, 2000), 1)
+    assert tuned.goals[0].met
+    assert 0.75 / margin == pytest.approx(tuned.goals[0].value, rel=1e-3)
+    assert fflin.margins(tuned, lin).disk == pytest.approx(margin, rel=1e-3)
+
+
+def test_the_lags_of_a_robot_are_in_uncertain_plants():
+    robot = fflin.load(
+        "cubesat",
+        inputs=[fflin.BaseTorque(lag=0.5)],
+        outputs=[fflin.StarTracker(lag=0.1)],
+    )
+    uncertain = fflin.uncertain(robot, {"base.mass": 0.2})
+    law = fflin.PD("q_b", "tau_b", shared=True)
+    margin = fflin.Margin(0.75, hard=True)
+    tuned = fflin.tune(uncertain, law, [margin, fflin.Decay(0.2)], starts=1, steps=20)
+    worst = min(
+        fflin.margins(tuned, fflin.linearize(uncertain.at({"base.mass": mass}))).disk
+        for mass in (robot.mass * 0.8, robot.mass, robot.mass * 1.2)
+    )
+    assert worst >= 0.75 * (1.0 - 1e-6)
+
+
+@pytest.mark.parametrize("field", [{"sample": 0.4}, {"delay": 0.2}])
+def test_sensors_with_their_own_times_are_refused(field):
+    robot = fflin.load(
+        "cubesat", inputs=[fflin.BaseTorque()], outputs=[fflin.StarTracker(**field)]
+    )
+    law = fflin.PD("q_b", "tau_b", shared=True)
+    with pytest.raises(fflin.InputError, match=r"q_b\.x has its own sample or delay"):
+        fflin.tune(fflin.linearize(robot), law, fflin.Decay(0.1), dt=0.1)
+    plain = robot.replace(outputs=[fflin.StarTracker(sample=0.1)])
+    tuned = fflin.tune(
+        fflin.linearize(plain), law, fflin.Decay(0.1), dt=0.1, starts=1, steps=5
+    )
+    assert tuned.met
+
+
+def test_the_lags_of_a_robot_are_in_the_loop_of_hinf():
+    pytest.importorskip("slycot")
+    goal = fflin.MaxGain({"tau_b": 0.01, "q_b": 1e-3}, {"q_b": 0.05, "tau_b": 1.0})
+    robot = fflin.load(
+        "cubesat", inputs=[fflin.BaseTorque(lag=1.0)], outputs=[fflin.BasePose()]
+    )
+    lin = fflin.linearize(robot)
+    design = fflin.hinf(lin, goal, measured="q_b")
+    aware = fflin.hinf(lin.with_lags(), goal, measured="q_b")
+    assert design.gamma == aware.gamma
+    assert design.order == aware.order > len(lin.A) - 6
+
+
+@pytest.mark.parametrize("design", ["tune", "hinf"])
+def test_a_model_of_one_time_is_refused(design):
+    orbit = fflin.EllipticOrbit(perigee=500e3, apogee=900e3)
+    robot = fflin.load(
+        "cubesat",
+        inputs=[fflin.BaseTorque()],
+        outputs=[fflin.BasePose()],
+        orbit=orbit,
+    )
+    lin = fflin.linearize(robot)
+    goal = fflin.MaxGain({"tau_b": 0.01, "q_b": 1e-3}, {"q_b": 0.05, "tau_b": 1.0})
+    with pytest.raises(fflin.InputError, match="does not depend on time"):
+        if design == "hinf":
+            fflin.hinf(lin, goal, measured="q_b")
+        else:
+            fflin.tune(lin, fflin.PD("q_b", "tau_b"), goal)
