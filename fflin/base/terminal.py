@@ -55,8 +55,8 @@ def color_message(line: str) -> str:
 def color_report(text: str, colors: Mapping[str, str] | None = None) -> str:
     """Return a report for stdout, with coloured verdicts and dimmed zeros on a terminal.
 
-    `colors` are the colours "#rrggbb" of joints, {joint: colour}. A joint stands on its colour in
-    black or white, so that its name can be read on light and on dark terminals.
+    `colors` are the colours "#rrggbb" of joints, {joint: colour}. The name of a joint is black or
+    white on its colour, so that it can be read on light and on dark terminals.
     """
     if not shows_colors(sys.stdout):
         return text
@@ -110,7 +110,7 @@ def _on_ground(color: str) -> str:
 
 
 def _in_cube(color: str) -> list[int]:
-    """Return the indices in _CUBE of the levels that are nearest to those of a colour."""
+    """Return the indices in _CUBE of the levels that are nearest to the levels of a colour."""
     return [
         min(range(len(_CUBE)), key=lambda at: abs(_CUBE[at] - level))
         for level in _levels(color)

@@ -132,7 +132,7 @@ class TomlFile:
 
 
 def toml_value(text: str) -> object:
-    """Return the value that a TOML text stands for; raise `ValueError` if it stands for none."""
+    """Return the value of a TOML text; raise `ValueError` if the text is not valid."""
     record = tomllib.loads(f"value = {text}")
     if len(record) > 1:
         raise ValueError("more than one value")

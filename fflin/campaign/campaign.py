@@ -314,7 +314,7 @@ class Campaign(FrozenArrays):
         )
 
     def _units_of_kinds(self) -> tuple[str, ...]:
-        """Return the units of the kinds of error; those of joints are the units of this robot."""
+        """Return the units of the kinds of error, with the units of this robot for joints."""
         others = {*self.wheels, *self.modes}
         joints: dict[str, list[str]] = {"q_m": [], "qdot_m": []}
         for state, unit in zip(self.state_names, self.state_units, strict=True):

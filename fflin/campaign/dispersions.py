@@ -232,7 +232,7 @@ class Dispersions:
                 self.columns.append(Column(name, kind, targets, axis, inverse))
 
     def _refuse(self, kind: str, key: str) -> None:
-        """Raise `InputError` for a dispersion of a kind of which there are no quantities."""
+        """Raise `InputError` for a quantity that the robot or the policy does not have."""
         robot = self._plant.robot
         what = f"'{key}.{kind}' is dispersed, but"
         if kind in _OF_SENSORS:
@@ -664,7 +664,7 @@ def _periodic(robot: Robot) -> tuple[str, ...]:
 def _plates(plant: Plant) -> dict[str, tuple[tuple[str, ...], Array]]:
     """Return {kind of force: (names, forces (k,) [N])} of the k flat plates of a robot.
 
-    The names, such as plate_1, are those of the plates on which the force acts.
+    The names, such as plate_1, belong to the plates on which the force acts.
     """
     plates = [Plate(plate, plant.field) for plate in plates_of(plant.robot.disturbance)]
     forces = {
@@ -725,8 +725,8 @@ def with_sensor_errors(
     """Add errors to the measurements (ny,) of a policy; return the new policy.
 
     The measurements are the states or outputs that the policy feeds back. `deviation` (ny,)
-    contains the standard deviations of the noise, and `steps` (ny,) those of the change of the bias
-    from sample to sample.
+    contains the standard deviations of the noise. `steps` (ny,) contains the standard deviations of
+    the change of the bias from sample to sample.
     """
     if steps is None:
         steps = np.zeros(len(bias))

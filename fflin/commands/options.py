@@ -300,7 +300,7 @@ ABOUT: dict[str, str] = {
     "horizon": "number of samples in the horizon of --mpc",
     "law": "law to tune, such as 'pd measured=q_b inputs=wheel lag=[0.1,1]'. TYPE is pd, pid, "
     "static_gain or state_space, or a filter: low_pass, lead or notch. The sum of all laws is in "
-    "series with all filters. Keys and values are those of [[tune.law]] in robot.toml, which this "
+    "series with all filters. Keys and values are as in [[tune.law]] of robot.toml, which this "
     "option replaces. A number fixes a parameter, [least,largest] bounds it",
     "starts": "number of starts of the search; 3 by default",
     "steps": "largest number of steps of each search; 300 by default",
@@ -427,7 +427,7 @@ ABOUT: dict[str, str] = {
     "tvlqr output-file": "save the gains to FILE",
     "tune goal": "requirement, such as 'margin disk=0.75 hard=true' or 'max_gain "
     "inputs={tau_b=0.01} outputs={q_b=1e-3}'. TYPE is max_gain, roll_off, margin, decay, damping, "
-    "variance or track. Keys and values are those of [[tune.goal]] in robot.toml, which this "
+    "variance or track. Keys and values are as in [[tune.goal]] of robot.toml, which this "
     "option replaces",
     "tune vary": "range of an uncertain parameter over which the goals must hold, as in `fflin "
     "uncertain`. This option replaces [tune.vary] in robot.toml",

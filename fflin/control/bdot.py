@@ -20,6 +20,9 @@ from fflin.robot.robot import Robot
 
 _FRAME: Frame = "lvlh"
 
+# Smallest divisor |b|^2 [T^2].
+_TINY = float(np.finfo(float).tiny)
+
 
 @dataclass(frozen=True)
 class _MagneticLaw(Policy):
@@ -60,7 +63,8 @@ class _MagneticLaw(Policy):
             if self._MEASURES_RATE:
                 orbit.move_to(t)
                 omega = v[PIN_ANGULAR] + orbit.rate @ R
-                vector = np.cross(b, omega) / (b @ b)
+                # Without a field, the vector is zero.
+                vector = np.cross(b, omega) / max(b @ b, _TINY)
             else:
                 vector = field.rate(t) @ R + np.cross(b, v[PIN_ANGULAR])
             u: Array = gains @ vector

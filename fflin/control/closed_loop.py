@@ -22,6 +22,7 @@ from fflin.control.optimal.disk import (
     Loop,
     as_continuous,
     disk_gain,
+    disk_margin,
     disk_phase,
     largest_scaled_gain,
     largest_structured_gain,
@@ -99,7 +100,7 @@ class ClosedLoop:
         return System(model.A[np.ix_(kept, kept)], model.B[kept], C[:, kept], D)
 
     def kept_states(self, model: LinearModel, C: Array) -> list[int]:
-        """Return the indices of the states of the plant; C is that of the used signals."""
+        """Return the indices of the states of the plant; C has the rows of the used signals."""
         return _joined(model.A, model.B, C)
 
     @property
@@ -124,7 +125,7 @@ class ClosedLoop:
         return self.plant
 
     def _require_short(self, delays: Array) -> None:
-        """Raise `InputError` if commands on their way would need very many states."""
+        """Raise `InputError` if the delayed commands need too many states."""
         longest = float(delays.max(initial=0.0))
         if longest > _MOST_SAMPLES * self.dt:
             raise InputError(
@@ -194,7 +195,7 @@ class ClosedLoop:
         if not self.is_stable(loop[0]):
             return 0.0
         largest, *_ = largest_scaled_gain(as_continuous(*loop, self.dt))
-        return min(1.0 / largest, 2.0)
+        return disk_margin(largest)
 
     def no_margins(self) -> Margins:
         """Return the margins of an unstable loop."""
@@ -234,8 +235,8 @@ class ClosedLoop:
             for index in range(count)
         )
         peak = largest_structured_gain(system)
-        disk = min(1.0 / peak.bound, 2.0)
-        reached = min(1.0 / peak.reached, 2.0) if peak.reached else 2.0
+        disk = disk_margin(peak.bound)
+        reached = disk_margin(peak.reached)
         change = peak.perturbation
         with np.errstate(divide="ignore", invalid="ignore"):
             factors = (1.0 + 0.5 * change) / (1.0 - 0.5 * change)
@@ -306,7 +307,7 @@ class ClosedLoop:
             phase=phase,
             phase_frequency=phase_frequency,
             delay=self._delay_margin(index, limits.crossings, delays),
-            disk=min(1.0 / peak, 2.0),
+            disk=disk_margin(peak),
             disk_frequency=self._frequency(w_disk),
         )
 
@@ -363,9 +364,9 @@ class ClosedLoop:
     def _refined(self, index: int, estimate: float, w: float, delays: Array) -> float:
         """Return the delay [s] near a long estimate at which a sampled loop oscillates.
 
-        A whole number of samples delays the loop gain by their phase alone. So the rest of the
-        delay is sought for which the lag of the loop is that of a whole number of samples. If none
-        is found within a sample of the estimate, the estimate is returned.
+        A delay of whole samples changes only the phase of the loop gain. The search therefore finds
+        the rest of the delay for which the phase lag of the loop equals the phase lag of whole
+        samples. If there is none within a sample of the estimate, the estimate is returned.
         """
         from scipy.optimize import newton
 
@@ -405,7 +406,7 @@ class ClosedLoop:
             more = delays.copy()
             more[channel] += extra
             return self.with_delays(more)
-        # The output is measured at a time within a sample, and passes a chain of samples.
+        # The output is measured within a sample, and then delayed by whole samples.
         A, B, C, D, *_ = self.plant
         held = HeldSystem(A, B, self.dt, delays)
         Ad, Bd = held.sampled()

@@ -23,6 +23,7 @@ from fflin.control.optimal.disk import (
     Loop,
     as_continuous,
     disk_gain,
+    disk_margin,
     disk_phase,
     largest_scaled_gain,
 )
@@ -409,7 +410,7 @@ class Gain(ModelDesign):
     def margins(self) -> Margins:
         """Gain and phase margins at the inputs, computed at first access."""
         largest, *_ = largest_scaled_gain(asymmetry(self))
-        disk = min(1.0 / largest, 2.0)
+        disk = disk_margin(largest)
         return Margins(disk, disk_gain(disk), disk_phase(disk))
 
 

@@ -60,7 +60,7 @@ def margins(
     as `MultirateFeedback` is, an oscillation has N frequencies at once, where N is the number of
     samples of the period. Its disk margin allows independent factors at each of them, as unknown
     dynamics of the channels cause them. The factors of the gain margins are constant, and the delay
-    margins are those of the exact loop.
+    margins are computed for the exact loop.
 
     Parameters
     ----------
@@ -73,9 +73,9 @@ def margins(
     delay : float, optional
         Delay [s] of all inputs. A delay of `lin`, see `LinearModel.discretize`, is added. By
         default, the delay is that of `lin`. If `lin` has none, it is the delay of the policy's
-        model, as in `simulate`. Likewise, if `lin` has no lags, the loop has those of its robot; a
-        warning states lags for which the law was not designed. If the robot has none either, the
-        loop has the lags of the policy's model.
+        model, as in `simulate`. Likewise, if `lin` has no lags, the loop has the lags of its
+        robot, and a warning states lags for which the law was not designed. If the robot has no
+        lags either, the loop has the lags of the policy's model.
     sample : float, optional
         Sampling time [s] with which a continuous law is executed.
     at : {"inputs", "outputs"}, optional
@@ -136,7 +136,7 @@ def delayed_model(
     """Return the model with which a loop is closed, and the delay [s] in addition to its own.
 
     If no delay is given and the model has none, the model gets the delay of the policy's model. If
-    the model has no lags, it gets those of its robot, or else those of the policy's model.
+    the model has no lags, it gets the lags of its robot, or else of the policy's model.
     """
     instance("lin", lin, LinearModel, "a fflin.LinearModel")
     refuse_frozen(lin, "the analysis of a closed loop")
@@ -171,7 +171,7 @@ def delayed_model(
 
 
 def _lagging(policy: Policy | Gain, lin: LinearModel) -> LinearModel:
-    """Return the model with lags: its own, or those of its robot, or of the policy's model."""
+    """Return the model with its lags, or with the lags of its robot or of the policy's model."""
     if lags_of_model(lin):
         return lin
     law = policy if isinstance(policy, Gain) else as_policy(policy)
@@ -251,7 +251,7 @@ def laws_in_loop(
 
 
 def _with_sensors(laws: list[System], lin: LinearModel) -> list[System]:
-    """Return laws of outputs in series with the sensors of the robot of a model."""
+    """Return laws of outputs in series with the sensors of the model's robot."""
     if lin._robot is None:
         if len(laws) > 1:
             raise InputError(

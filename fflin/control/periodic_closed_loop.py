@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 
 from fflin.base.errors import InputError
-from fflin.base.validation import Array
+from fflin.base.validation import Array, Values
 from fflin.control.closed_loop import ClosedLoop
 from fflin.control.loop_margins import ChannelMargins, Margins
-from fflin.control.optimal.disk import disk_gain, disk_phase
+from fflin.control.optimal.disk import Peak, disk_gain, disk_margin, disk_phase
 from fflin.control.optimal.periodic_loops import (
     ChannelHarmonics,
     Harmonics,
@@ -29,7 +29,7 @@ _FRACTIONS = 10
 
 
 class PeriodicClosedLoop(ClosedLoop):
-    """Loop of a law with N > 1 different samples and a model.
+    """Closed loop of a model and a law whose matrices repeat after N > 1 samples.
 
     The perturbations of the disk margin are stable systems that do not vary with time. Their
     responses at the N harmonics of an oscillation are independent of each other.
@@ -64,9 +64,9 @@ class PeriodicClosedLoop(ClosedLoop):
     def disk_margin(self) -> float:
         """Return the disk margin for changes of all channels at once."""
         loop = self._nominal()
-        if loop.radius >= 1.0 - _ROUNDING:
+        if not _is_stable(loop):
             return 0.0
-        return min(1.0 / Harmonics(loop).peak()[0], 2.0)
+        return disk_margin(Harmonics(loop).peak()[0])
 
     def no_margins(self) -> Margins:
         """Return the margins of an unstable loop."""
@@ -76,11 +76,34 @@ class PeriodicClosedLoop(ClosedLoop):
     def margins(self) -> Margins:
         """Return the margins of all channels."""
         loop = self._nominal()
-        if loop.radius >= 1.0 - _ROUNDING:
+        if not _is_stable(loop):
             return self.no_margins()
         harmonics = Harmonics(loop)
         peak = harmonics.structured_peak()
-        disk = min(1.0 / peak.bound, 2.0)
+        disk = disk_margin(peak.bound)
+        frequency, factors = self._oscillation_of(harmonics, peak)
+        channels = [
+            self._channel_of(loop, harmonics, index)
+            for index in range(len(self.channels))
+        ]
+        return Margins(
+            disk=disk,
+            disk_reached=disk_margin(peak.reached),
+            gain=disk_gain(disk),
+            phase=disk_phase(disk),
+            frequency=frequency,
+            factors=factors,
+            channels=tuple(channels),
+            stable=True,
+            at=self.at,
+            robot=self.lin.robot,
+            dt=self.dt,
+            delay=self.longest_delay,
+            samples=len(self.laws),
+        )
+
+    def _oscillation_of(self, harmonics: Harmonics, peak: Peak) -> tuple[float, Values]:
+        """Return the frequency [rad/s] of the strongest harmonic, and the factors from it on."""
         change = peak.perturbation.reshape(len(self.laws), -1)
         strongest = harmonics.strongest(peak.frequency, peak.perturbation)
         change = np.roll(change, -strongest, axis=0)
@@ -90,24 +113,7 @@ class PeriodicClosedLoop(ClosedLoop):
             change = np.roll(change.conj()[::-1], 1, axis=0)
         with np.errstate(divide="ignore", invalid="ignore"):
             factors = (1.0 + 0.5 * change) / (1.0 - 0.5 * change)
-        count = len(self.channels)
-        return Margins(
-            disk=disk,
-            disk_reached=min(1.0 / peak.reached, 2.0) if peak.reached else 2.0,
-            gain=disk_gain(disk),
-            phase=disk_phase(disk),
-            frequency=abs(frequency),
-            factors=factors,
-            channels=tuple(
-                self._channel_of(loop, harmonics, index) for index in range(count)
-            ),
-            stable=True,
-            at=self.at,
-            robot=self.lin.robot,
-            dt=self.dt,
-            delay=self.longest_delay,
-            samples=len(self.laws),
-        )
+        return abs(frequency), factors
 
     def _frequency_of(self, angle: float, harmonic: int) -> float:
         """Return the frequency [rad/s], at most pi/dt, of a harmonic; may be negative."""
@@ -133,7 +139,7 @@ class PeriodicClosedLoop(ClosedLoop):
             phase=math.nan,
             phase_frequency=math.nan,
             delay=self._delay_of(index, channel),
-            disk=min(1.0 / peak, 2.0),
+            disk=disk_margin(peak),
             disk_frequency=angle / self.dt,
         )
 
@@ -203,6 +209,10 @@ class PeriodicClosedLoop(ClosedLoop):
             if found.success and 0.0 <= found.x[1] <= 1.0:
                 return (samples + float(found.x[1])) * h
         return samples * h
+
+
+def _is_stable(loop: PeriodicLoop) -> bool:
+    return loop.radius < 1.0 - _ROUNDING
 
 
 def _limit(channel: PeriodicLoop, ends: tuple[float, float]) -> float:

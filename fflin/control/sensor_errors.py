@@ -12,8 +12,8 @@ from fflin.control.policy import Noise, Policy
 from fflin.dynamics.outputs import sensors_by_signal
 from fflin.dynamics.state import StateMap
 
-# The generators of the drift have this number in their seed, so that they differ from those of the
-# noise.
+# The generators of the drift have this number in their seed, so that the drift is independent of
+# the noise.
 _DRIFT = 1
 
 
@@ -80,7 +80,7 @@ def declared_errors(
     if not sample or not policy.senses_outputs or lin is None:
         return None
     if policy.measurement_noise is not None:
-        # The noise of the law replaces that of the outputs.
+        # The noise of the law replaces the noise of the outputs.
         return None
     sensors = sensors_by_signal(state)
     if all(one.noise is None and one.bias is None for one in sensors.values()):

@@ -40,7 +40,8 @@ def unload_wheels(law: LawT, design: Robot, rate: float) -> LawT:
     The unloading changes no other signal of the given law, so the margins do not change.
 
     In orbit, the law may feed back the wheel speeds itself, because the links that carry the wheels
-    rotate. Magnetorquers produce the part of the external torque across the field by `Allocation`,
+    rotate. The law then responds to the unloading, so the attitude and the margins may change.
+    Magnetorquers produce the part of the external torque across the field by `Allocation`,
     and the wheels wait for the rest.
 
     Thrusters that push in one direction only produce the external torque by `Allocation`. Choose k

@@ -71,9 +71,9 @@ def _require_same_constraints(made: str, lin: LinearModel, robot: Robot) -> None
         )
     if robot.constraints and not lin.dependent:
         raise InputError(
-            f"{made} without constraints, but those of the given robot '{robot.name}' leave fewer "
-            f"independent states than the {count} of the model; make the model again for the given "
-            "robot"
+            f"{made} without constraints and has {count} states, but the given robot "
+            f"'{robot.name}' has constraints and fewer independent states; make the model again "
+            "for the given robot"
         )
 
 

@@ -122,8 +122,8 @@ class Nonlinear:
 # ratio, and curved variables are displaced by sign * _NEGLIGIBLE * steps.
 _REPETITIONS = (1.5, 1.0), (1.2, -1.0)
 
-# The truncation error of sixth-order differences, divided by the difference between a Jacobian and
-# its repetition with the smallest steps: h^6 / (h^6 - (h / 1.5)^6).
+# Ratio of two errors of a Jacobian by sixth-order differences with the step h: its truncation
+# error, and its difference from the Jacobian with the smallest step: h^6 / (h^6 - (h / 1.5)^6).
 TRUNCATION = 1.0 / (1.0 - _REPETITIONS[0][0] ** -6)
 
 # Fraction of a step that changes the rounding errors of a function, but not its derivatives.

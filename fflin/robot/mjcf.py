@@ -137,7 +137,7 @@ def _start(model: pin.Model) -> np.ndarray:
 
 
 def _on_free_flyer(fixed: pin.Model) -> pin.Model:
-    """Return a model whose links are on a free-flyer, to which the world's own links belong.
+    """Return a model with a free-flyer base that contains the bodies fixed to the world.
 
     A base without mass gets 1 kg and 1 kg m^2, which have no effect, because it is welded.
     """

@@ -41,7 +41,7 @@ CLOSED_LOOP = "closed loop"
 ROTATION = "rotation of the base or of a joint"
 LAG = "lag of the inputs and outputs"
 LONGEST_STEP = 0.01  # [s] default time step, if no pole requires a shorter step
-# [s] the same for magnetorquers and for laws that repeat, which act slowly
+# [s] default time step for magnetorquers and periodic laws, which act slowly
 SLOW_STEP = 1.0
 _DAMPING, _AMPLITUDE = 0.05, 0.01  # tolerances in (11.4)
 _SHORTEST_STEP = 1e-12  # [s] at which the search for a step ends

@@ -197,8 +197,8 @@ def simulate(
         events, callbacks and disturbances. The results of both engines agree to machine precision.
     noise : float
         Factor of the noise and of the drifting biases that the outputs of the robot declare, see
-        `Output`; 0 leaves them out. They act on sampled laws that measure outputs and have no
-        `noise` of their own. A bias is zero at the start, and drifts as a random walk.
+        `Output`; 0 leaves them out. They act on sampled laws that measure outputs, if the
+        law was made without `noise`. A bias is zero at the start, and drifts as a random walk.
     seed : int
         Seed of this noise.
 

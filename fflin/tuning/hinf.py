@@ -58,7 +58,7 @@ class Generalised(NamedTuple):
 
 
 class _Design(NamedTuple):
-    """Controller for a generalised plant, its norm, and its signals among those of the model."""
+    """Controller for a generalised plant, its norm, and its signals among the model's signals."""
 
     law: tuple[Array, Array, Array, Array]
     gamma: float
@@ -125,7 +125,7 @@ class HInfinity(LinearController):
         ------
         InputError
             If the loop with a controller of the given order is unstable or its norm is above
-            `below`.
+            `below`, or if fewer states than `order` affect the goals.
 
         Examples
         --------
@@ -143,10 +143,18 @@ class HInfinity(LinearController):
         if order is not None:
             whole("order", order, 0, max(self.order - 1, 0))
         design = self._design
-        loop = _closed(design.plant, design.law)
-        for law in truncations(design.law, loop):
-            if order is not None and len(law[0]) != order:
-                continue
+        laws = truncations(design.law, _closed(design.plant, design.law))
+        if not self.order:
+            laws = [design.law]
+        if order is not None:
+            highest = len(laws) - 1
+            if order > highest:
+                raise InputError(
+                    f"order is {order}, but only {highest} states of the controller affect the "
+                    f"goals; give order={highest} or less"
+                )
+            laws = [laws[order]]
+        for law in laws:
             norm = _norm(design.plant, law)
             if norm is not None and norm <= level:
                 lower = design._replace(law=law, gamma=norm)

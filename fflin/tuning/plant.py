@@ -38,7 +38,7 @@ class Signals:
         return grouped(self.inputs, self.input_units)
 
     def expanded(self, key: str) -> tuple[str, ...]:
-        """Return the names for which a key stands: those of a group such as wheel, or itself."""
+        """Return the names that a key selects: the inputs of a group such as wheel, or the key."""
         if key in self.inputs or any(group_of(name) == key for name in self.inputs):
             return (key,)
         names = [

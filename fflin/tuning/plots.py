@@ -27,7 +27,7 @@ def plot_tuned(
 
     - For each goal `MaxGain`, `RollOff` and `Margin`, a panel shows the largest singular value of
       the closed loop over frequency, divided by the sizes of its signals, and the limit in red. For
-      `Track`, a panel shows the step response and its template. Grey curves are those of the other
+      `Track`, a panel shows the step response and its template. Grey curves belong to the other
       models of the search.
     - A Nichols plot shows the loop gain at each input, with all other loops closed, see
       `plot_loops`.

@@ -78,9 +78,8 @@ def _starts(
 ) -> Iterator[Array | None]:
     """Yield the starts of a search.
 
-    The first one has the values of the structure. A law that can be a static gain starts from
-    projected regulators instead, in the first and every other start. The remaining starts are
-    random.
+    The first one has the values of the structure. If the law can be a static gain, the starts 0, 1,
+    3, 5 and so on are projected regulators. The remaining starts are random.
     """
     has_gain = problem.structured.has_gain
     for number in range(starts):
@@ -101,7 +100,7 @@ def _simpler(problem: Problem, starts: int, steps: int, seed: int) -> Array | No
     simple = problem.simpler
     if simple is None:
         return None
-    # The simplest law is searched from all starts, and every other one from the simpler law.
+    # The simplest law is searched from all starts, and each other law from the next simpler law.
     few = starts if simple.simpler is None else 1
     best = searched(simple, few, min(steps, _SCREENING), seed)[0]
     return None if best is None else problem.extended(simple, best.x)
@@ -111,8 +110,9 @@ def _regulator(problem: Problem, rng: np.random.Generator | None) -> Array | Non
     """Return the point of a regulator of all states, projected to the measured outputs.
 
     The regulator minimises the outputs of all goals. Its gain F becomes ``K = F P C' (C P C')^-1``
-    with the covariance P of its loop under the inputs of all goals, so that K y is the best
-    estimate of F x from the measured outputs y. The weight of the commands is random.
+    with the covariance P of its loop under the inputs of all goals, so that K y is the best linear
+    estimate of F x from the measured outputs y. With `rng`, the weight of the commands is random.
+    Products of a state and a command in the outputs of the goals are neglected.
     """
     from scipy.linalg import solve_continuous_are, solve_continuous_lyapunov
 
@@ -123,7 +123,9 @@ def _regulator(problem: Problem, rng: np.random.Generator | None) -> Array | Non
     n, nu = B.shape
     if not n:
         return None
-    cost, effort, noise = _SMALL * np.eye(n), _SMALL * np.eye(nu), _SMALL * np.eye(n)
+    cost = _SMALL * np.eye(n)
+    effort = _SMALL * np.eye(nu)
+    noise = _SMALL * np.eye(n)
     for channel in case.channels:
         if channel is None or channel.plant is not plant:
             continue

@@ -223,11 +223,10 @@ class _Series(Structure):
 
         def start(gain: Array) -> Array:
             assert of_gain is not None
-            values = {
-                id(side): of_gain(gain) if side is part else _values(side.parameters)
-                for side in (left, right)
-            }
-            return np.concatenate((values[id(left)], values[id(right)]))
+            values = of_gain(gain)
+            if part is left:
+                return np.concatenate((values, _values(right.parameters)))
+            return np.concatenate((_values(left.parameters), values))
 
         parameters = (*left.parameters, *right.parameters)
         known = None if of_gain is None else start

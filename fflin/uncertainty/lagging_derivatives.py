@@ -15,7 +15,7 @@ from fflin.uncertainty.parameters import Parameter
 
 
 class LaggingDerivatives(ModelDerivatives):
-    """Derivatives of a model with lags, which follow from those of the model without lags.
+    """Derivatives of a model with lags, from the derivatives of the model without lags.
 
     `source` is the model `lin` in continuous time.
     """

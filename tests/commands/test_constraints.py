@@ -2,6 +2,8 @@
 
 import json
 
+import pytest
+
 from tests.support.commands import refused, run, warned
 
 GRASP = ("dual_arm", "--weld", "tool_left=tool_right")
@@ -66,6 +68,7 @@ def test_a_command_without_support_for_constraints_refuses_them():
     assert "sensitivities do not support constraints" in message
 
 
+@pytest.mark.exhaustive
 def test_a_held_robot_is_simulated_with_its_regulator_and_its_forces():
     how = ("--duration", "0.1", "--dt", "0.05", "--joint", "left_2=0.4")
     code, out, _ = run("simulate", "dual_arm", "--weld", "base", *how)

@@ -30,11 +30,20 @@ def test_linearize_at_a_time():
     assert run("check", SATELLITE, "--time", 1000)[0] == 0
 
 
+def test_the_models_of_a_circular_orbit_repeat_the_model_at_rest():
+    circle = ("--orbit", "500e3", "--periodic", 8, "--json")
+    record = json.loads(run("linearize", "cubesat", *circle)[1])
+    lin = fflin.linearize(fflin.load("cubesat", orbit={"altitude": 500e3}))
+    assert np.abs(np.array(record["A"]) - lin.A).max() < 1e-12
+    assert len(record["multipliers"]) == 12
+
+
 def test_the_model_of_magnetorquers_is_shown_without_its_poles():
     code, out, _ = run("linearize", SATELLITE, "--time", 1000)
     assert code == 0 and "at t = 1000 s" in out and "unstable poles" not in out
 
 
+@pytest.mark.exhaustive
 def test_the_models_of_one_period_and_their_multipliers(tmp_path):
     command = ("linearize", "cubesat", *ELLIPSE, "--periodic", 8)
     code, out, _ = run(*command, "-o", "models.npz", cwd=tmp_path)
@@ -56,6 +65,7 @@ def test_a_free_motion_and_checks_of_one_period():
     assert np.allclose(record["q"], free.q, atol=1e-12)
 
 
+@pytest.mark.exhaustive
 def test_a_periodic_schedule_from_the_command_line(tmp_path):
     design = ("--periodic", 8, "--sample", repr(SAMPLE), "--r", "dipole=1e6")
     code, out, _ = run("tvlqr", SATELLITE, *design, "-o", "gains.npz", cwd=tmp_path)
@@ -77,18 +87,24 @@ def test_a_periodic_schedule_is_simulated_from_a_file_or_designed_first(tmp_path
     assert max(map(abs, both[0][:3])) < 0.04  # the run begins at --rpy
 
 
-def test_a_regulator_is_allocated_to_magnetorquers_by_default(tmp_path):
-    code, out, _ = run("lqr", SATELLITE, "--sample", 10, "-o", "g.npz", cwd=tmp_path)
+def test_a_regulator_is_allocated_to_magnetorquers_by_default():
+    code, out, _ = run("lqr", SATELLITE, "--sample", 10)
     assert code == 0 and "the part of tau_b across the magnetic" in " ".join(
         out.split()
     )
-    flight = ("--sample", 10, "--dt", 10, "--duration", 100)
+    flight = ("--sample", 10, "--dt", 10, "--duration", 50)
     code, out, _ = run("simulate", SATELLITE, *flight)
     assert code == 0 and "the commanded tau_b are realised by dipole" in out
-    flight = ("--gain", "g.npz", "--dt", 10, "--duration", 100)
-    assert run("simulate", SATELLITE, *flight, cwd=tmp_path)[0] == 0
     assert "magnetorquers; use" in refused("lqr", SATELLITE, "--no-allocate")
     assert "none; define" in refused("lqr", "ets_vii", "--allocate")
+
+
+@pytest.mark.exhaustive
+def test_a_gain_from_a_file_is_allocated_to_magnetorquers(tmp_path):
+    run("lqr", SATELLITE, "--sample", 10, "-o", "g.npz", cwd=tmp_path)
+    flight = ("--gain", "g.npz", "--dt", 10, "--duration", 100)
+    code, out, _ = run("simulate", SATELLITE, *flight, cwd=tmp_path)
+    assert code == 0 and "the commanded tau_b are realised by dipole" in out
 
 
 @pytest.mark.exhaustive

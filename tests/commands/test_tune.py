@@ -44,6 +44,7 @@ def satellite(tmp_path, monkeypatch):
     return "satellite.toml"
 
 
+@pytest.mark.exhaustive
 def test_a_robot_file_is_tuned_saved_flown_and_reported(satellite):
     code, out, err = run("tune", satellite, "-o", "law.npz", "--json")
     assert (code, err) == (0, "")

@@ -127,6 +127,14 @@ def test_damping_exerts_the_torque_across_the_field(cubesat):
     assert torque == pytest.approx(-3e-5 * (inertial - along), rel=1e-12, abs=1e-18)
 
 
+def test_damping_without_a_field_commands_nothing(cubesat):
+    orbit = fflin.CircularOrbit(500e3, field=lambda t, r: np.zeros(3))
+    robot = cubesat.replace(orbit=orbit)
+    v = fflin.velocity(robot, {"omega_b": 0.05})
+    u = fflin.RateDamping(3e-5).bind(robot)(0.0, robot.neutral(), v)
+    assert np.array_equal(u, np.zeros(3))
+
+
 @pytest.mark.exhaustive
 def test_damping_stops_the_rotation_relative_to_inertial_space(cubesat):
     v0 = np.concatenate((np.zeros(3), np.full(3, 0.05)))
@@ -214,9 +222,9 @@ def test_models_of_magnetorquers_hold_at_their_time(cubesat):
 
 
 def test_the_periodic_model_of_magnetorquers_follows_the_field(cubesat):
-    along = fflin.linearize_orbit(cubesat, steps=32)
+    along = fflin.linearize_orbit(cubesat, steps=8)
     field = OrbitField(cubesat, "lvlh").magnetic
-    for k in (0, 5, 32):
+    for k in (0, 3, 8):
         expected = np.cross(np.eye(3), field.at(along.t[k])).T
         lin = along[k]
         assert lin.M[:3, :3] @ along.B[k, 6:9] == pytest.approx(expected, abs=1e-18)

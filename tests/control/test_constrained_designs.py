@@ -45,6 +45,7 @@ def test_the_margins_are_those_of_the_pendulum(lin):
     assert fflin.margins(gain, lin).disk == pytest.approx(disk, rel=1e-6)
 
 
+@pytest.mark.exhaustive
 def test_predictive_control_regulates_a_closed_loop(linkage, lin):
     """Without limits, the first input is that of the regulator."""
     model = fflin.linearize(

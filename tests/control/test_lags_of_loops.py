@@ -72,7 +72,7 @@ def test_margins_say_once_that_a_law_was_not_designed_for_lags():
 def test_a_motion_says_once_that_a_law_does_not_know_the_lags():
     robot = satellite()
     lin = fflin.linearize(robot)
-    options = {"duration": 1.0, "dt": 0.05, "engine": "python"}
+    options = {"duration": 0.4, "dt": 0.1, "engine": "python"}
     for design, count in ((lin, 1), (lin.with_lags(), 0)):
         law = state_law(design.discretize(0.2))
         notes = fflin.simulate(robot, law, **options).notes
@@ -99,5 +99,5 @@ def test_a_gain_of_constrained_robots_does_not_fly_on_the_free_robot_or_vice_ver
     }
     with pytest.raises(fflin.InputError, match="has no constraints"):
         fflin.simulate(free, laws[free], q0=q, duration=0.1)
-    with pytest.raises(fflin.InputError, match="leave fewer independent states"):
+    with pytest.raises(fflin.InputError, match="fewer independent states"):
         fflin.simulate(held, laws[held], q0=q, duration=0.1)

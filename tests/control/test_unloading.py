@@ -1,5 +1,6 @@
 """Unloading of wheels by external torques, beside laws with integrals, filters and delays."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -74,7 +75,7 @@ def test_the_speeds_of_wheels_decay_with_the_rate_and_the_attitude_stays(kind):
     alone, design, _ = cubesat()
     law = fflin.unload_wheels(LAWS[kind](alone), design, RATE)
     v0 = fflin.velocity(design, SPEEDS)
-    motion = fflin.simulate(design, law, v0=v0, duration=30.0, dt=SAMPLE)
+    motion = fflin.simulate(design, law, v0=v0, duration=10.0, dt=SAMPLE)
     steps = np.arange(len(motion.t))
     decay = (1.0 - RATE * SAMPLE) ** steps
     assert motion.v[:, 6:] == pytest.approx(decay[:, None] * v0[6:], abs=1e-6)
@@ -314,10 +315,11 @@ def test_magnetorquers_unload_wheels_while_the_attitude_stays():
     robot, law, design = magnetic_satellite()
     policy = fflin.Allocation(fflin.unload_wheels(law, design, 1e-3), design)
     v0 = fflin.velocity(robot, {"wheel_x": 300.0, "wheel_y": -200.0, "wheel_z": 150.0})
-    options = {"duration": 8000.0, "dt": 1.0, "limits": "urdf"}
+    duration = math.floor(1.6 * robot.orbit.period)
+    options = {"duration": duration, "dt": 1.0, "limits": "urdf"}
     motion = fflin.simulate(robot, policy, v0=v0, **options)
     assert motion.attitude_error.max() < 1.0
-    assert np.abs(motion.v[-1, 6:]).max() < 30.0
+    assert (np.abs(motion.v[-1, 6:]) < 0.1 * np.abs(v0[6:])).all()
 
 
 def test_laws_and_robots_that_cannot_unload_are_refused():

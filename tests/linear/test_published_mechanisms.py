@@ -86,6 +86,7 @@ def squeezer_effort(robot):
     return fflin.effort(robot, {"tau_m.beta": 0.033, "tau_m.gamma": torque})
 
 
+@pytest.mark.exhaustive
 def test_andrews_squeezer_starts_with_the_published_accelerations():
     robot = squeezer()
     q = fflin.configuration(robot, SQUEEZER)

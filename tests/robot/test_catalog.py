@@ -310,9 +310,7 @@ def test_closed_robots_load_by_name_closed_at_the_neutral_configuration(name):
     assert np.abs(q - robot.neutral()).max() < 1e-10  # 12 digits in the file
 
 
-@pytest.mark.parametrize(
-    "name", ["scissor_mast", *exhaustive("berthed_stack", "grasped_target")]
-)
+@pytest.mark.parametrize("name", exhaustive(*sorted(CLOSED)))
 def test_closed_robots_are_verified_and_regulated(name):
     robot = fflin.load(name)
     lin = fflin.linearize(robot)

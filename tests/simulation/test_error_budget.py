@@ -174,6 +174,7 @@ def test_force_noise_of_a_sampled_loop_tends_to_that_of_the_continuous_loop(sate
     assert near < 0.02 and near == pytest.approx(0.5 * far, rel=0.05)
 
 
+@pytest.mark.exhaustive
 def test_an_output_feedback_and_its_constant_torque(satellite):
     robot, lin, _ = satellite
     sampled = lin.discretize(0.2)

@@ -26,7 +26,7 @@ def test_held_commands_give_the_exact_sampled_motion(delay):
     plain = lin.discretize(0.25)
     law = fflin.StateFeedback(plain, fflin.lqr(plain).K)
     motion = fflin.simulate(
-        robot, law, x0=0.1 * (np.arange(12) % 6 == 3), duration=3.0, delay=delay
+        robot, law, x0=0.1 * (np.arange(12) % 6 == 3), duration=1.5, delay=delay
     )
     model = lin.with_lags().discretize(0.25, delay=delay)
     z = np.zeros(len(model.A))

@@ -1,5 +1,6 @@
 """Laws of robots: reports against independent computations, uncertain models, seeds, errors."""
 
+import copy
 import sys
 
 import numpy as np
@@ -310,6 +311,23 @@ def test_a_reduced_controller_may_have_a_given_order_or_norm(optimal):
         optimal.reduced(0)
     with pytest.raises(fflin.InputError, match="order"):
         optimal.reduced(10)
+
+
+def test_states_that_do_not_affect_the_goals_are_not_counted(optimal):
+    A, B, C, D = optimal._design.law
+    idle = np.zeros((len(A), 2))
+    padded = copy.copy(optimal)
+    law = (
+        np.block([[A, idle], [idle.T, -np.eye(2)]]),
+        np.vstack((B, idle.T @ B)),
+        np.hstack((C, C @ idle)),
+        D,
+    )
+    padded._design = optimal._design._replace(law=law)
+    padded.order = optimal.order + 2
+    assert padded.reduced(8).gamma == pytest.approx(optimal.gamma, rel=1e-3)
+    with pytest.raises(fflin.InputError, match="states of the controller affect"):
+        padded.reduced(optimal.order + 1)
 
 
 def test_hinf_is_no_worse_than_tune(optimal):

@@ -104,7 +104,7 @@ def test_no_block_is_larger_than_the_rank_of_its_effect():
     assert uncertain.lft(q).repeats == [np.sum(sizes > 1e-9 * sizes[0])]
 
 
-def test_it_is_printed_saved_and_handed_on(tmp_path):
+def test_it_is_printed_and_saved(tmp_path):
     robot = fflin.load("cubesat")
     uncertain = fflin.uncertain(robot, CASES["cubesat"])
     lft = uncertain.lft()
@@ -114,6 +114,11 @@ def test_it_is_printed_saved_and_handed_on(tmp_path):
         lft.save(tmp_path / f"u.{ending}")
         again = fflin.LFT.load(tmp_path / f"u.{ending}")
         assert again.parameters == lft.parameters and (again.D11 == lft.D11).all()
+
+
+@pytest.mark.exhaustive
+def test_the_fraction_is_a_system_of_the_package_control():
+    lft = fflin.uncertain(fflin.load("cubesat"), CASES["cubesat"]).lft()
     control = pytest.importorskip("control")
     plant = lft.to_control()
     assert plant.input_labels[0] == "w_base_mass_1" and plant.nstates == 12
@@ -128,7 +133,7 @@ def test_it_is_printed_saved_and_handed_on(tmp_path):
     )
 
 
-def test_samples_are_rigid_bodies_and_corners_that_are_none_are_counted():
+def test_samples_are_rigid_bodies():
     robot = fflin.load("servicer_7dof")
     uncertain = fflin.uncertain(robot, {"link_3.inertia.xx": 0.3, "link_3.mass": 0.3})
     draws, lost = uncertain.draws(30, seed=2)
@@ -137,6 +142,12 @@ def test_samples_are_rigid_bodies_and_corners_that_are_none_are_counted():
         body = made.model.inertias[made.model.getJointId("joint_3")]
         second = 0.5 * np.trace(body.inertia) * np.eye(3) - body.inertia
         assert np.linalg.eigvalsh(second)[0] > -1e-9
+
+
+@pytest.mark.exhaustive
+def test_corners_that_are_no_rigid_bodies_are_counted():
+    robot = fflin.load("servicer_7dof")
+    uncertain = fflin.uncertain(robot, {"link_3.inertia.xx": 0.3, "link_3.mass": 0.3})
     # Corners by the triangle inequality of the moments; mass alone makes none impossible.
     body = robot.model.inertias[robot.model.getJointId("joint_3")]
     moments = np.linalg.eigvalsh(body.inertia)

@@ -45,7 +45,7 @@ def whole_of(loops):
     return Channel(C, np.zeros((len(C), len(loops.K))), np.ones(len(loops.K)))
 
 
-@pytest.mark.parametrize("drawn", [80, pytest.param(400, marks=pytest.mark.exhaustive)])
+@pytest.mark.parametrize("drawn", exhaustive(80, 400))
 @pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
 def test_no_draw_is_worse_than_the_result(servicer, drawn):
     uncertain, gain, loops = servicer

@@ -92,6 +92,11 @@ def as_continuous(F: Array, G: Array, H: Array, J: Array, dt: float) -> Loop:
     )
 
 
+def disk_margin(peak: float) -> float:
+    """Return the disk margin, at most 2, of a largest structured singular value."""
+    return min(1.0 / peak, 2.0) if peak else 2.0
+
+
 def disk_gain(disk: float) -> tuple[float, float]:
     """Return the gain factors in a disk."""
     most = math.inf

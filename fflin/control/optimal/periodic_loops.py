@@ -34,8 +34,8 @@ _ACCURACY = 1e-7
 _MAXIMA = 4
 _MOST_SCALINGS = 60
 
-# Angles are added until a phase turns by at most _STEP [rad] between two of them, in at most
-# _REFINEMENTS rounds, and if they are at most _MOST_ANGLES.
+# Angles are added until the phase changes by at most _STEP [rad] between neighbours. There are at
+# most _REFINEMENTS rounds, which end above _MOST_ANGLES angles.
 _STEP = 1.0
 _REFINEMENTS = 30
 _MOST_ANGLES = 20000
@@ -92,13 +92,14 @@ def steady_states(F: Array, G: Values, angle: float = 0.0) -> Values:
     states is left out.
     """
     count, size = F.shape[:2]
-    turn = np.exp(1j * angle) if angle else 1.0
-    Phi, effect = np.eye(size), np.zeros_like(G * turn)[0]
+    z = np.exp(1j * angle) if angle else 1.0
+    effect = np.zeros_like(G[0] * z)
     for k in range(count):
-        Phi, effect = F[k] @ Phi, F[k] @ effect + G[k] * turn**k
-    states = [np.linalg.solve(turn**count * np.eye(size) - Phi, effect)]
+        effect = F[k] @ effect + G[k] * z**k
+    over_period = z**count * np.eye(size) - monodromy(F)
+    states = [np.linalg.solve(over_period, effect)]
     for k in range(count - 1):
-        states.append((F[k] @ states[-1] + G[k]) / turn)
+        states.append((F[k] @ states[-1] + G[k]) / z)
     result: Values = np.array(states)
     return result
 
@@ -110,10 +111,10 @@ def steady_covariances(F: Array, W: Array) -> Array:
     """
     from scipy.linalg import solve_discrete_lyapunov
 
-    Phi, total = np.eye(F.shape[1]), np.zeros(F.shape[1:])
+    total = np.zeros(F.shape[1:])
     for one, noise in zip(F, W, strict=True):
-        Phi, total = one @ Phi, one @ total @ one.T + noise
-    covariances = [solve_discrete_lyapunov(Phi, total)]
+        total = one @ total @ one.T + noise
+    covariances = [solve_discrete_lyapunov(monodromy(F), total)]
     for one, noise in zip(F[:-1], W[:-1], strict=True):
         covariances.append(one @ covariances[-1] @ one.T + noise)
     return np.array(covariances)
@@ -210,15 +211,11 @@ class Harmonics:
             scaled = d[:, None] * self.responses / d
             bounds = np.minimum(bounds, np.linalg.norm(scaled, 2, axis=(1, 2)))
             bounds[index] = value
-        order = sorted(tried, key=lambda index: -tried[index][0])
-        starts = list[int]()
-        for index in order:
-            if len(starts) < _MAXIMA and all(abs(index - one) > 1 for one in starts):
-                starts.append(index)
-        return max(
-            (self._climbed(index, *tried[index]) for index in starts),
-            key=lambda result: result[0],
-        )
+        values = {index: value for index, (value, _) in tried.items()}
+        maxima = [
+            self._climbed(index, *tried[index]) for index in _separate_maxima(values)
+        ]
+        return max(maxima, key=lambda result: result[0])
 
     def _climbed(
         self, index: int, value: float, d: Array
@@ -227,8 +224,8 @@ class Harmonics:
         from scipy.optimize import minimize_scalar
 
         best = value, float(self.angles[index]), d
-        limits = self.angles[max(index - 1, 0)], self.angles[index + 1 :][:1]
-        ends = limits[0], limits[1][0] if len(limits[1]) else self.angles[-1]
+        last = len(self.angles) - 1
+        ends = self.angles[max(index - 1, 0)], self.angles[min(index + 1, last)]
 
         def cost(angle: float) -> float:
             nonlocal best
@@ -260,6 +257,15 @@ class Harmonics:
         return int(powers.argmax())
 
 
+def _separate_maxima(values: dict[int, float]) -> list[int]:
+    """Return the indices of the _MAXIMA largest values, of which no two are neighbours."""
+    chosen = list[int]()
+    for index in sorted(values, key=lambda index: -values[index]):
+        if all(abs(index - other) > 1 for other in chosen):
+            chosen.append(index)
+    return chosen[:_MAXIMA]
+
+
 class ChannelHarmonics:
     """Effects of a factor and of a delay of whole samples in one channel of a stable loop."""
 
@@ -272,7 +278,7 @@ class ChannelHarmonics:
         self._response = self._of_channel(harmonics.responses)
 
     def _of_channel(self, responses: Values) -> Values:
-        """Return the responses (k, N, N) of the channel's signal to an addition to it."""
+        """Return the responses (k, N, N) of the channel's signal to a signal added to it."""
         values: Values = responses[:, self._part, self._part] - 0.5 * self._unit
         return values
 
@@ -283,22 +289,25 @@ class ChannelHarmonics:
         """
         count = math.ceil(math.log(_LARGEST_FACTOR) / math.log(_FACTOR))
         factors = (_FACTOR ** np.arange(count + 1)).tolist()
-        low, high = (0.0, 0.0), (math.inf, math.inf)
+        larger = self._first_unstable(factors)
+        smaller = self._first_unstable([1.0 / factor for factor in factors])
+        low = smaller[::-1] if smaller else (0.0, 0.0)
+        high = larger or (math.inf, math.inf)
+        return low, high
+
+    def _first_unstable(self, factors: list[float]) -> tuple[float, float] | None:
+        """Return the first factor that makes the loop unstable, after the factor before it."""
         for before, factor in pairwise(factors):
             if self._is_unstable(partial(self._with_factor, factor)):
-                high = before, factor
-                break
-        for before, factor in pairwise(factors):
-            if self._is_unstable(partial(self._with_factor, 1.0 / factor)):
-                low = 1.0 / factor, 1.0 / before
-                break
-        return low, high
+                return before, factor
+        return None
 
     def delay_interval(self) -> tuple[int, float] | None:
         """Return the largest delay in whole samples before the loop becomes unstable.
 
-        The second value is the angle [rad] of the oscillation at a slightly longer delay. None if
-        the loop stays stable.
+        Up to 40 samples, each delay is tried, and then delays in steps of 3 %. The second value is
+        the angle [rad] of the oscillation at a slightly longer delay. None if the loop stays
+        stable.
         """
         before, samples = 0, 1
         while not self._is_unstable(partial(self._with_delay, samples)):
@@ -330,10 +339,10 @@ class ChannelHarmonics:
         return values
 
     def _is_unstable(self, difference: Callable[[], Values]) -> bool:
-        """Return whether a determinant turns around zero for angles from 0 to pi/N.
+        """Return whether a determinant encircles zero for angles from 0 to pi/N.
 
         Then the changed loop is unstable, because the original loop is stable. The values for other
-        angles follow by symmetry. Angles are added where the phase turns fast.
+        angles follow by symmetry. Angles are added where the phase changes fast.
         """
         for _ in range(_REFINEMENTS):
             values = difference()
