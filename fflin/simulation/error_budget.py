@@ -425,7 +425,9 @@ def _declared_noise(
     noise: dict[str, float] = {}
     for group, sizes in groups.items():
         if group and len(set(sizes.values())) == 1:
-            noise[group] = next(iter(sizes.values()))
+            # The name of an output such as base.gyroscope is a group only as a pattern.
+            key = f"{group}.*" if "." in group else group
+            noise[key] = next(iter(sizes.values()))
         else:
             noise |= sizes
     return {name: size for name, size in noise.items() if size}
