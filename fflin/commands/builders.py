@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import fflin
 from fflin.base.errors import InputError, UnknownNameError, located
-from fflin.base.figures import CurveStyle, joint_styles
 from fflin.base.names import joints_by_name, rates_by_name
 from fflin.commands import DONE, NO_ORBIT
 
 if TYPE_CHECKING:
     import pinocchio as pin
 
+    from fflin.base.figures import CurveStyle
     from fflin.base.validation import Array
     from fflin.dynamics.coordinates import Frame
 
@@ -75,6 +75,8 @@ def load_robot(arguments: Namespace) -> fflin.Robot:
 
     `arguments.joint_colors` becomes {joint: colour}, for the tables of the report on a terminal.
     """
+    from fflin.base.figures import joint_styles
+
     given = {
         name: value
         for name in ("passive", "gravity", "orbit", "stiffness", "damping")

@@ -148,7 +148,7 @@ def test_a_campaign_from_detumbling_to_the_earth(tmp_path):
     code, out, err = run(*command, *options, cwd=tmp_path)
     assert code == 0, err
     (goal,) = json.loads(out)["goals"].values()
-    assert goal["fraction"] == 1.0
+    assert goal[0] == 1.0
 
 
 def test_errors_of_periodic_models():

@@ -64,7 +64,8 @@ def test_periodic_output_feedback_repeats_alike():
 def test_campaigns_in_an_ellipse_are_compiled():
     robot = in_ellipse(free_body(BODY), 0.1)
     spread = {"q_b": 0.05, "base.mass": 0.05}
-    options = {"runs": 3, "duration": 400.0, "dt": 2.0, "seed": 4}
+    # Three revolutions: a tumbling body in an ellipse is chaotic, which enlarges rounding errors.
+    options = {"runs": 3, "duration": 63.0, "dt": 0.5, "seed": 4}
     one, other = (
         fflin.monte_carlo(robot, None, spread, engine=engine, **options)
         for engine in ("compiled", "python")
