@@ -6,7 +6,6 @@ The rest are the equality constraints, springs, gravity and motors of the file.
 from __future__ import annotations
 
 import hashlib
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -111,10 +110,12 @@ def _built(document: bytes, root: Element, path: Path) -> pin.Model:
                     "a free joint in a file with several bodies in <worldbody>; a robot has one "
                     "free body, so remove the other ones"
                 )
+    from tempfile import TemporaryDirectory
+
     first = document.index(b"<body", document.index(b"<worldbody"))
     last = document.rindex(b"</worldbody")
     parts = (document[:first], document[first:last], document[last:])
-    with tempfile.TemporaryDirectory() as folder:
+    with TemporaryDirectory() as folder:
         wrapped = Path(folder, path.name)
         wrapped.write_bytes(b'%s<body name="base">%s</body>%s' % parts)
         return pin.buildModelFromMJCF(str(wrapped))
