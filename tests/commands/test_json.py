@@ -9,6 +9,7 @@ import pytest
 import fflin
 from fflin.commands import cli
 from tests.support.commands import run
+from tests.support.marks import exhaustive
 
 HEAD = ["fflin", "command", "robot", "result", "files"]
 ROBOT = "planar_detumble"
@@ -169,7 +170,10 @@ def python(tmp_path_factory, brief_validity):
     return session
 
 
-@pytest.mark.parametrize("command", CASES)
+@pytest.mark.parametrize(
+    "command",
+    [*(name for name in CASES if name != "funnel"), *exhaustive("funnel")],
+)
 def test_json_has_one_schema_and_the_figures_of_python(command, python):
     words, figures = CASES[command]
     code, out, err = run(command, *shlex.split(words), "--json", cwd=python.folder)

@@ -116,6 +116,7 @@ def test_target_options_override_the_file(sat):
     )
 
 
+@pytest.mark.exhaustive
 def test_a_gain_holds_the_base_at_the_target(sat):
     assert run("lqr", "sat.toml", "-o", "gain.npz", cwd=sat)[0] == 0
     motion = simulated(sat, "--gain", "gain.npz")

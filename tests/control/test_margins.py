@@ -295,6 +295,7 @@ def test_the_margin_that_the_weights_guarantee_is_a_lower_bound(name, dt):
         assert guaranteed_margin(regulator(lin, *costs[0])) == pytest.approx(2.0 / 3.0)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
 def test_margins_are_computed_only_for_a_warning():
     lin = fflin.linearize(fflin.load("canadarm2"))

@@ -305,6 +305,7 @@ def test_the_force_of_a_clamp_carries_the_weight_and_the_inputs():
     np.testing.assert_allclose(lin.D[3:, :3], -np.eye(3), atol=1e-12)
 
 
+@pytest.mark.exhaustive
 def test_forces_of_constraints_agree_with_differences():
     rng = np.random.default_rng(6)
     robot, q, v, u = random_constraints(rng, count=1, joints=3)

@@ -95,7 +95,7 @@ def test_an_almost_circular_orbit_gives_the_matrices_of_the_circular_one():
     assert np.allclose(along.u, expected.u, rtol=0.0, atol=1e-14)
 
 
-@pytest.mark.parametrize("e", [1e-3, *exhaustive(1e-4)])
+@pytest.mark.parametrize("e", exhaustive(1e-3, 1e-4))
 def test_the_forced_pitch_motion_has_the_amplitude_of_the_closed_form(e):
     inertia = (5.0, 6.0, 2.0)  # along x, opposite to the normal y, nadir z
     K = (inertia[0] - inertia[2]) / inertia[1]

@@ -81,6 +81,7 @@ def test_inertial_disturbances_turn_with_the_true_anomaly():
 STRONG = {"tau_b": 0.05, "F_b": 5e-4}
 
 
+@pytest.mark.exhaustive
 def test_a_periodic_schedule_repeats():
     robot = in_ellipse(free_body(BODY), 0.3)
     along = fflin.linearize_orbit(robot, steps=16)
