@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 
@@ -104,7 +104,7 @@ def _drawn(
         return close(row)
 
 
-def _of_joints(closure: Closure, names: object) -> Indices:
+def _of_joints(closure: Closure, names: Iterable[str]) -> Indices:
     """Return the indices in nu of named joints."""
     joints = closure.state.robot.joint_names
-    return np.array([6 + joints.index(str(name)) for name in names], dtype=np.intp)  # type: ignore[attr-defined]
+    return np.array([6 + joints.index(name) for name in names], dtype=np.intp)
