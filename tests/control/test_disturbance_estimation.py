@@ -291,6 +291,7 @@ def test_a_periodic_torque_leaves_no_error_at_the_samples():
     assert errors[1] > 1e-2
 
 
+@pytest.mark.exhaustive
 def test_a_constant_torque_is_rejected_in_the_simulation_with_wheels():
     robot = satellite()
     model = fflin.linearize(robot).discretize(SAMPLE)

@@ -95,6 +95,7 @@ def test_constant_models_give_the_solution_of_the_algebraic_equation(sampled):
         assert apart(P, expected) < 1e-9
 
 
+@pytest.mark.exhaustive
 def test_the_continuous_solution_repeats(along):
     schedule = fflin.tvlqr(along, Q, R, "periodic")
     assert apart(schedule.P[0], schedule.P[-1]) < 1e-12

@@ -662,6 +662,7 @@ def test_a_guess_of_joints_that_move_in_loops_rotates_the_base(loop):
         fflin.plan(robot, goal, 10.0, guess=known.q, knots=21)
 
 
+@pytest.mark.exhaustive
 def test_a_failed_plan_of_joint_torques_advises_to_move_joints_in_loops(
     loop, monkeypatch
 ):
@@ -1021,6 +1022,7 @@ def test_the_axes_of_rotation_are_those_of_the_joints(name, count):
         assert np.abs(axes) == pytest.approx(np.array([[0.0, 1.0, 0.0]]), abs=1e-9)
 
 
+@pytest.mark.exhaustive
 def test_a_failed_plan_of_sprung_wings_advises_to_free_their_end(monkeypatch):
     monkeypatch.setattr(plan_search, "_MOST", 1)
     wings = ["panel_left", "panel_right"]

@@ -97,6 +97,7 @@ def test_double_integrators_have_the_closed_form():
     )
 
 
+@pytest.mark.exhaustive
 def test_cost_to_go_is_the_cost_of_the_loop(moving):
     Q, R = weights(moving)
     schedule = fflin.tvlqr(moving, Q, R, 3.0)

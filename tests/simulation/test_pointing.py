@@ -110,6 +110,7 @@ def test_pointing_of_a_flown_motion_agrees_with_its_attitude_error(flown):
     assert max(map(len, text.splitlines())) <= 80
 
 
+@pytest.mark.exhaustive
 def test_wheels_report_the_used_fractions_of_their_limits():
     robot = fflin.load("cubesat", inputs=fflin.load_inputs("cubesat"))
     design = robot.replace(

@@ -422,6 +422,7 @@ def test_the_lags_of_a_robot_are_in_the_tuned_loop():
     assert fflin.margins(tuned, lin).disk == pytest.approx(margin, rel=1e-3)
 
 
+@pytest.mark.exhaustive
 def test_the_lags_of_a_robot_are_in_uncertain_plants():
     robot = fflin.load(
         "cubesat",

@@ -62,6 +62,7 @@ def largest_difference(watched, robot, q, node="robot"):
 @pytest.mark.exhaustive
 @pytest.mark.sample
 @pytest.mark.browser
+@pytest.mark.exhaustive
 def test_bodies_stand_where_forward_kinematics_puts_them(settled, watch):
     robot, motion, path = settled
     # not painted: drawing takes most of the time
