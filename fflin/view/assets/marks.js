@@ -86,17 +86,20 @@ function trail({ name, points, colour, radius, dashed }) {
   return group;
 }
 
+// Turn an arrow along force i and set its length; a short arrow is hidden.
+function showForce(group, values, i, { longest, most, size }) {
+  const force = new THREE.Vector3().fromArray(values, 3 * i);
+  const length = (longest * force.length()) / most;
+  group.visible = length > 0.004 * size;
+  if (!group.visible) return;
+  group.setLength(length);
+  group.quaternion.setFromUnitVectors(UP, force.normalize());
+}
+
 function forceArrow({ colour, values, longest, size }) {
   const most = largest(values, 3);
   const group = arrow(colour, 0.010 * size, seenThrough(colour));
-  group.show = (i) => {
-    const force = new THREE.Vector3().fromArray(values, 3 * i);
-    const length = (longest * force.length()) / most;
-    group.visible = length > 0.004 * size;
-    if (!group.visible) return;
-    group.setLength(length);
-    group.quaternion.setFromUnitVectors(UP, force.normalize());
-  };
+  group.show = (i) => showForce(group, values, i, { longest, most, size });
   return group;
 }
 
@@ -104,13 +107,8 @@ function forceArrow({ colour, values, longest, size }) {
 function reactionArrow({ points, values, longest, most, size }) {
   const group = arrow(CONSTRAINT, 0.008 * size, seenThrough(CONSTRAINT));
   group.show = (i) => {
-    const force = new THREE.Vector3().fromArray(values, 3 * i);
-    const length = (longest * force.length()) / most;
-    group.visible = length > 0.004 * size;
-    if (!group.visible) return;
-    group.setLength(length);
     group.position.fromArray(points, 3 * i);
-    group.quaternion.setFromUnitVectors(UP, force.normalize());
+    showForce(group, values, i, { longest, most, size });
   };
   return group;
 }
