@@ -365,7 +365,7 @@ def models_along(
     """
     if getattr(arguments, "periodic", None):
         return _models_of_period(arguments, robot or load_robot(arguments), prefix)
-    refuse(arguments, ("motion",), "without --periodic N, this has no effect")
+    refuse(arguments, ("motion", "period"), "without --periodic N, this has no effect")
     if arguments.trajectory is None:
         raise InputError(
             "neither --trajectory FILE nor --periodic N is given; give one of them"
@@ -393,7 +393,13 @@ def _models_of_period(
     states = (robot.point, robot.target) if prefix else (robot.point,)
     q, _ = state_of(robot, arguments, *states, prefix=prefix)
     motion = arguments.motion or "held"
-    return fflin.linearize_orbit(robot, q, motion=motion, steps=arguments.periodic)
+    return fflin.linearize_orbit(
+        robot,
+        q,
+        motion=motion,
+        steps=arguments.periodic,
+        period=arguments.period,
+    )
 
 
 def robot_of_design(
@@ -593,7 +599,7 @@ def loop_of(
         return tracking, settings
     refuse(
         arguments,
-        ("offset", "hold", "motion"),
+        ("offset", "hold", "motion", "period"),
         "without --trajectory FILE or --periodic N, this has no effect",
     )
     if (law := detumbling_law(arguments)) is not None:
@@ -902,7 +908,11 @@ def along(robot: fflin.Robot, arguments: Namespace) -> fflin.TrajectoryFeedback:
         schedule = fflin.tvlqr(models, Qf=end, sample=arguments.sample, weights=weights)
         return fflin.TrajectoryFeedback(models, schedule)
     designed = "the file of --schedule already contains the trajectory and the design of its gains"
-    refuse(arguments, ("trajectory", "hold", "periodic", "motion", *_WEIGHTS), designed)
+    refuse(
+        arguments,
+        ("trajectory", "hold", "periodic", "period", "motion", *_WEIGHTS),
+        designed,
+    )
     schedule = fflin.GainSchedule.load(arguments.schedule)
     refuse(arguments, regulator if schedule.period else (*regulator, *start), why)
     return fflin.TrajectoryFeedback(schedule.trajectory(robot), schedule)
