@@ -119,9 +119,7 @@ def test_a_payload_keeps_its_loop_closed():
         jacobian(caught.robot, caught.q, "payload") @ caught.v,
         caught.v[caught.robot.nv - twin.nv + 6 :],
     )
-    np.testing.assert_allclose(
-        (M @ (before - after))[:6], caught.impulse, atol=1e-12
-    )
+    np.testing.assert_allclose((M @ (before - after))[:6], caught.impulse, atol=1e-12)
 
 
 def test_a_berth_in_inertial_space_takes_the_impulse_of_a_capture():
