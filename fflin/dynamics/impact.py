@@ -265,7 +265,7 @@ def struck(
     before: Array = np.concatenate([own_v for *_, own_v in parts])
     momenta = reduced.T @ (M @ before)
     v: Array = spread @ np.linalg.solve(reduced.T @ M @ reduced, momenta)
-    forces = np.zeros(0)
+    forces: Array = np.zeros(0)
     if whole.constraints:
         # Two orthogonal projections, the second on a part of the space of the first, are one
         # projection on that part.
