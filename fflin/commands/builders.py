@@ -119,11 +119,9 @@ def load_robot(arguments: Namespace) -> fflin.Robot:
             robot = robot.replace(inputs=new_inputs)
     if outputs := getattr(arguments, "output", None):
         given["outputs"] = outputs
-    if welds := getattr(arguments, "weld", None):
-        added = [fflin.Weld(frame, to) for frame, to in welds]
-        given["constraints"] = [*robot.constraints, *added]
+    robot = with_welds(robot, arguments)
     if independent := getattr(arguments, "independent", None):
-        if not given.get("constraints", robot.constraints):
+        if not robot.constraints:
             raise InputError(
                 f"--independent needs constraints, but '{robot.name}' has none; add --weld, or "
                 "remove --independent"
@@ -400,6 +398,15 @@ def _models_of_period(
         steps=arguments.periodic,
         period=arguments.period,
     )
+
+
+def with_welds(robot: fflin.Robot, arguments: Namespace) -> fflin.Robot:
+    """Return the robot with the welds of --weld."""
+    welds = getattr(arguments, "weld", None)
+    if not welds:
+        return robot
+    added = [fflin.Weld(frame, to) for frame, to in welds]
+    return robot.merged({"constraints": [*robot.constraints, *added]})
 
 
 def robot_of_design(
@@ -861,7 +868,7 @@ def _about_gain(
 
     from fflin.control.gain import model_of
 
-    if gain.x0[:6].any():
+    if gain.dependent or gain.x0[:6].any():
         refuse(
             arguments, _POSE, "the file of --gain already contains the pose of the base"
         )

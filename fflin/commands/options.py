@@ -117,7 +117,7 @@ OPTIONS: dict[str, dict[str, str]] = {
         "pointing errors": "pointing accuracy budget noise bias no-noise",
         OUTPUT: f"plot show output-file html {_PICTURES}",
     },
-    "export": {"": "FILE", OUTPUT: "output-folder robot limits name real"},
+    "export": {"": "FILE", OUTPUT: "output-folder robot weld limits name real"},
     "sweep": {
         "": "ROBOT",
         "points": "grid random seed range",
