@@ -115,6 +115,19 @@ class Closure:
         kept: Array = G @ np.linalg.solve(G.T @ M @ G, G.T @ (M @ nu))
         return kept
 
+    def after_impact(self, q: Array, v: Array) -> tuple[Array, Array]:
+        """Return the velocity (nv,) just after the constraints close at a closed q, and impulses.
+
+        v (nv,) is the velocity just before. The impulses (rows,) of the constraints are the
+        smallest ones if the constraints are redundant.
+        """
+        space = self.tangent(q)
+        nu = self.state.velocities(v)
+        kept = self.kept(space, q, nu)
+        change = self._inertia(q) @ (kept - nu)
+        impulses = np.linalg.lstsq(space.jacobian.T, change, None)[0]
+        return self.state.spread(kept), impulses
+
     def distance(self, q: Array) -> tuple[float, str]:
         """Return the largest residual at q, and the text that names its constraint."""
         residual = np.abs(self.constraints.residual(q))
