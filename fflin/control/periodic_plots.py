@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -137,9 +137,9 @@ def _draw_loci(panel: Axes, loci: Values, colors: list[str]) -> None:
     )
 
 
-def _draw_decibels(panel: Axes, w: Array, values: Array) -> list[Axes]:
+def _draw_decibels(panel: Axes, w: Array, values: Array) -> list[Any]:
     """Draw the values (n, k) in decibels, and return the curves."""
-    curves: list[Axes] = panel.semilogx(w, 20.0 * np.log10(values.T), lw=1.0)
+    curves: list[Any] = panel.semilogx(w, 20.0 * np.log10(values.T), lw=1.0)
     panel.axhline(0.0, color=_LINE, lw=0.8)
     panel.set(ylabel="[dB]")
     return curves
