@@ -828,9 +828,6 @@ def about_point(
         refuse(
             arguments, of_gain, "--controller replaces the regulator and its options"
         )
-        from fflin.tuning.files import in_time_of
-
-        lin = in_time_of(arguments.controller, lin)
         sign = -1.0 if arguments.negative_feedback else 1.0
         feedback = fflin.LinearController(arguments.controller, lin, sign=sign)
     else:

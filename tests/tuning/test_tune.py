@@ -88,6 +88,17 @@ def test_a_tuned_law_flies_and_is_saved(tuned, stiff, tmp_path):
     assert np.array_equal(again.system.A, tuned.system.A)
 
 
+def test_a_saved_law_is_read_with_its_delay(stiff, tmp_path):
+    lin = fflin.linearize(stiff)
+    goal = fflin.Margin(0.5)
+    late = fflin.tune(lin, LAW, goal, dt=0.2, delay=0.1, starts=1, steps=2)
+    path = tmp_path / "law.npz"
+    late.save(path)
+    policy = fflin.LinearController(path, lin)
+    assert policy.dt == 0.2 and policy.input_delays == late.input_delays
+    assert set(policy.input_delays.values()) == {0.1}
+
+
 @pytest.mark.exhaustive
 def test_two_runs_with_one_seed_are_equal_bit_for_bit(stiff):
     lin = fflin.linearize(stiff)
