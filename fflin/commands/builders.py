@@ -118,11 +118,9 @@ def load_robot(arguments: Namespace) -> fflin.Robot:
             robot = robot.replace(inputs=new_inputs)
     if outputs := getattr(arguments, "output", None):
         given["outputs"] = outputs
-    if welds := getattr(arguments, "weld", None):
-        added = [fflin.Weld(frame, to) for frame, to in welds]
-        given["constraints"] = [*robot.constraints, *added]
+    robot = with_welds(robot, arguments)
     if independent := getattr(arguments, "independent", None):
-        if not given.get("constraints", robot.constraints):
+        if not robot.constraints:
             raise InputError(
                 f"--independent needs constraints, but '{robot.name}' has none; add --weld, or "
                 "remove --independent"
@@ -404,7 +402,7 @@ def models_along(
     """
     if getattr(arguments, "periodic", None):
         return _models_of_period(arguments, robot or load_robot(arguments), prefix)
-    refuse(arguments, ("motion",), "without --periodic N, this has no effect")
+    refuse(arguments, ("motion", "period"), "without --periodic N, this has no effect")
     if arguments.trajectory is None:
         raise InputError(
             "neither --trajectory FILE nor --periodic N is given; give one of them"
@@ -432,7 +430,22 @@ def _models_of_period(
     states = (robot.point, robot.target) if prefix else (robot.point,)
     q, _ = state_of(robot, arguments, *states, prefix=prefix)
     motion = arguments.motion or "held"
-    return fflin.linearize_orbit(robot, q, motion=motion, steps=arguments.periodic)
+    return fflin.linearize_orbit(
+        robot,
+        q,
+        motion=motion,
+        steps=arguments.periodic,
+        period=arguments.period,
+    )
+
+
+def with_welds(robot: fflin.Robot, arguments: Namespace) -> fflin.Robot:
+    """Return the robot with the welds of --weld."""
+    welds = getattr(arguments, "weld", None)
+    if not welds:
+        return robot
+    added = [fflin.Weld(frame, to) for frame, to in welds]
+    return robot.merged({"constraints": [*robot.constraints, *added]})
 
 
 def robot_of_design(
@@ -632,7 +645,7 @@ def loop_of(
         return tracking, settings
     refuse(
         arguments,
-        ("offset", "hold", "motion"),
+        ("offset", "hold", "motion", "period"),
         "without --trajectory FILE or --periodic N, this has no effect",
     )
     if (law := detumbling_law(arguments)) is not None:
@@ -894,7 +907,7 @@ def _about_gain(
 
     from fflin.control.gain import model_of
 
-    if gain.x0[:6].any():
+    if gain.dependent or gain.x0[:6].any():
         refuse(
             arguments, _POSE, "the file of --gain already contains the pose of the base"
         )
@@ -941,7 +954,11 @@ def along(robot: fflin.Robot, arguments: Namespace) -> fflin.TrajectoryFeedback:
         schedule = fflin.tvlqr(models, Qf=end, sample=arguments.sample, weights=weights)
         return fflin.TrajectoryFeedback(models, schedule)
     designed = "the file of --schedule already contains the trajectory and the design of its gains"
-    refuse(arguments, ("trajectory", "hold", "periodic", "motion", *_WEIGHTS), designed)
+    refuse(
+        arguments,
+        ("trajectory", "hold", "periodic", "period", "motion", *_WEIGHTS),
+        designed,
+    )
     schedule = fflin.GainSchedule.load(arguments.schedule)
     refuse(arguments, regulator if schedule.period else (*regulator, *start), why)
     return fflin.TrajectoryFeedback(schedule.trajectory(robot), schedule)

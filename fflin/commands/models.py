@@ -213,7 +213,7 @@ def linearize(arguments: Namespace) -> Report:
         if arguments.dt is not None:
             along = along.discretize(arguments.dt)
         return _report_along(along, path)
-    refuse(arguments, ("motion",), "without --periodic N, this has no effect")
+    refuse(arguments, ("motion", "period"), "without --periodic N, this has no effect")
     _, lin = linear_model(arguments)
     if arguments.dt is not None:
         lin = lin.discretize(arguments.dt)

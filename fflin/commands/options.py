@@ -21,7 +21,7 @@ _SYSTEM = (
     "output"
 )
 _TRAJECTORY = "trajectory hold strict"
-_PATH = f"{_TRAJECTORY} periodic motion"
+_PATH = f"{_TRAJECTORY} periodic period motion"
 _WEIGHTS = "weights q r bryson sample reduce wheel-speeds"
 _SCENE = "scene tool follow"
 _PICTURES = f"png gif times {_SCENE} fps speed"
@@ -118,7 +118,7 @@ OPTIONS: dict[str, dict[str, str]] = {
         "pointing errors": "pointing accuracy budget noise bias no-noise",
         OUTPUT: f"plot show output-file html {_PICTURES}",
     },
-    "export": {"": "FILE", OUTPUT: "output-folder robot limits name real"},
+    "export": {"": "FILE", OUTPUT: "output-folder robot weld limits name real"},
     "sweep": {
         "": "ROBOT",
         "points": "grid random seed range",
@@ -250,6 +250,8 @@ ABOUT: dict[str, str] = {
     "periodic motion that --motion selects. --joint, --rpy and --position define where the robot "
     "rests, relative to the axes `lvlh`. In a simulation, --target-joint, --target-rpy and "
     "--target-position define it",
+    "period": "time [s] after which the models of --periodic repeat; by default the period of the "
+    "orbit. The field of a tilted dipole repeats if the ground track does",
     "motion": "periodic motion of --periodic: at rest in the orbital frame and held by the inputs "
     "(held, default), or without inputs (free)",
     "time": "time of the model [s], for a robot whose model depends on time: in an elliptic orbit, "

@@ -282,7 +282,7 @@ FORMS: dict[str, Form] = {
     **dict.fromkeys(("every", "random", "workers", "threads"), _COUNT),
     "periodic": one(count_of, "N"),
     "motion": {"choices": ("held", "free")},
-    "time": one(number, "T"),
+    **dict.fromkeys(("time", "period"), one(number, "T")),
     **dict.fromkeys(("bdot", "rate-damping"), one(number, "GAIN")),
     "runs": one(count_of, "N", required=True),
     "samples": one(count_of, "N", 100),

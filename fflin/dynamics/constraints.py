@@ -25,7 +25,7 @@ import pinocchio as pin
 from fflin.base.errors import InputError
 from fflin.base.rotation import skew
 from fflin.base.validation import Array, Mask
-from fflin.robot.constraints import Constraint, Hinge, Spherical
+from fflin.robot.constraints import Constraint, Hinge, Spherical, Weld
 from fflin.robot.joints import ROOT, Carried, find_frame
 from fflin.robot.robot_data import RobotData
 
@@ -106,6 +106,14 @@ class Constraints:
             of_pairs = [pair.selected[:, 3:].any(axis=1) for pair in self._pairs]
             self._angular = np.concatenate(of_pairs)
         return self._pairs
+
+    @property
+    def signs(self) -> Array:
+        """Signs (rows, nv) of the velocities in the rows, for a robot without mimic joints."""
+        signs = np.empty((self.count, self._model.nv))
+        for pair, sign in zip(self.pairs, self._signs, strict=True):
+            signs[pair.rows] = sign
+        return signs
 
     @property
     def angular(self) -> Mask:
@@ -298,6 +306,66 @@ class Constraints:
             self._model, self._data, frame.joint, _LOCAL
         )
         return jacobian
+
+
+class Hold:
+    """One constraint of a robot whose base is in its neutral pose in `data`.
+
+    `rows` (rows, 6) are the rows of all constraints.
+    """
+
+    def __init__(self, pair: Pair, data: pin.Data, rows: Array) -> None:
+        self._pair = pair
+        self._placement = pair.first.placement
+        # Pinocchio overwrites these poses in place.
+        self._first = data.oMi[pair.first.joint]
+        self._second = data.oMi[pair.second.joint]
+        self._root = data.oMi[ROOT]
+        self._rows = rows[pair.rows]
+
+    def write(self, q: Array, limit: float) -> bool:
+        """Write the rows of the constraint; return whether it is closed within a limit [m, rad].
+
+        The product of the rows with the twists of joints, in the axes of `data`, is the relative
+        twist in the rows of the constraint, or a regular combination of these rows.
+        """
+        first = self._first * self._placement
+        if not self._pair.is_loop:
+            moved = self._root * pin.XYZQUATToSE3(q[:7])
+            first = self._root * moved.actInv(first)
+        return self._write(first, limit)
+
+    def _write(self, first: pin.SE3, limit: float) -> bool:
+        pair = self._pair
+        np.dot(pair.selected, first.actionInverse, out=self._rows)
+        apart = first.actInv(self._second * pair.second.placement)
+        left = apart.translation
+        square = left.dot(left)
+        if isinstance(pair.constraint, Hinge):
+            axis = np.array(pair.constraint.axis)
+            tilted = apart.rotation.dot(axis) - axis
+            square += tilted.dot(tilted)
+        return bool(square <= limit * limit)
+
+
+class HeldWeld(Hold):
+    """One weld. Its rows are the relative twist in the axes of `data`, so they are constant."""
+
+    def __init__(self, pair: Pair, data: pin.Data, rows: Array) -> None:
+        super().__init__(pair, data, rows)
+        # If the weld is closed, this frame coincides with the frame of the second joint.
+        self._placement = pair.first.placement * pair.second.placement.inverse()
+        self._rows[:] = np.eye(6)
+
+    def _write(self, first: pin.SE3, limit: float) -> bool:
+        return bool(first.actInv(self._second).isIdentity(limit))
+
+
+def hold_of(pair: Pair, data: pin.Data, rows: Array) -> Hold:
+    """Return the `Hold` of a constraint."""
+    if isinstance(pair.constraint, Weld):
+        return HeldWeld(pair, data, rows)
+    return Hold(pair, data, rows)
 
 
 def _distances(pair: Pair, apart: pin.SE3) -> Array:

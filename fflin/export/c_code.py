@@ -63,7 +63,8 @@ def write_c(
 
     - For a state feedback, the arguments are the measured attitude, position, joint angles and
       velocities. ``NAME_step`` computes the state in the same way as `StateMap`, then the inputs
-      from the state.
+      from the state. For a robot with constraints, the arguments are the same. The law feeds back
+      the independent states only; the header names the other states.
     - For an output feedback, the arguments are the outputs y, and the controller memory, which the
       caller allocates. A state feedback with integral action also has this memory. If the inputs
       saturate at `limits`, the integrals are corrected as in `simulate`.
@@ -474,6 +475,7 @@ def _texts(law: Law, name: str, real: str) -> tuple[str, dict[str, str]]:
         "count": CASES,
         "law": law.title,
         "frame": frame or "not known",
+        "dependent": _dependent_comment(law),
         "robot": _plain(robot.name),
         "sha256": robot.urdf_sha256 or "not known",
         "world": ", the orbital frame" if robot.orbit else "",
@@ -523,6 +525,17 @@ def _texts(law: Law, name: str, real: str) -> tuple[str, dict[str, str]]:
     about["sha256"] = digest_of(about, header.encode(), source.encode())
     code = {".h": header, ".c": source, "_test.c": _filled("test.c", words)}
     return title, {**code, ".json": json.dumps(about, indent=1) + "\n"}
+
+
+def _dependent_comment(law: Law) -> str:
+    """Return the comment on the states that constraints determine; empty without constraints."""
+    if law.state is None or law.lin is None or not law.lin.dependent:
+        return ""
+    lines = [f"\n *   {_plain(name)}" for name in law.lin.dependent]
+    return (
+        "\n * Constraints of the robot determine the following states from the others. The law\n"
+        f" * does not feed them back, and their measured values have no effect:{''.join(lines)}"
+    )
 
 
 def _frame_of(law: Law) -> str:

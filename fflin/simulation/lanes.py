@@ -23,7 +23,8 @@ from fflin.control.policy import BDotForm, Form, OutputForm, PathForm, Policy, S
 from fflin.control.sensor_errors import drift_generator, noise_generator
 from fflin.control.tracking import AT_THE_END, TrajectoryFeedback
 from fflin.dynamics.disturbance import Wave, waves_of
-from fflin.dynamics.orbital import OrbitField, mean_motion
+from fflin.dynamics.magnetic import MagneticField
+from fflin.dynamics.orbital import mean_motion
 from fflin.dynamics.state import StateMap
 from fflin.kernel import allocation, forward, loop, orbit, policies
 from fflin.kernel.compiled import compiles, is_kept, kernel
@@ -682,28 +683,43 @@ def orbit_of(plant: Plant) -> orbit.Orbit:
     if field is None or path is None:
         return none
     ellipse = np.zeros(0)
-    latitude = 0.0
     if isinstance(path, EllipticOrbit):
-        start = path.mean_anomaly, path.at(0.0).angle
-        ellipse = np.array([path.eccentricity, *start])
+        anomaly = path.at(0.0).angle
+        ellipse = np.array([path.eccentricity, path.mean_anomaly, anomaly])
+        latitude = path.argument_of_perigee + anomaly
+        distance = path.semi_major_axis
     else:
         latitude = path.argument_of_latitude
+        distance = path.radius
+    dipole: Array = np.zeros(3)
+    pole: Array = np.zeros(0)
+    if field.magnetic is not None:
+        dipole, pole = _dipole_of(field.magnetic, path.inclination, distance)
     return none._replace(
         outwards=field.axes[:, 0],
         normal=field.axes[:, 2],
         mean_motion=[mean_motion(plant.robot)],
         ellipse=ellipse,
         latitude=[latitude],
-        dipole=_dipole_of(field),
+        dipole=dipole,
+        pole=pole,
         now=np.zeros(orbit.END),
     )
 
 
-def _dipole_of(field: OrbitField) -> Array:
-    """Return the amplitudes (3,) [T] of the magnetic field of an orbit; zero without a field."""
-    if field.magnetic is None or field.magnetic.amplitudes is None:
-        return np.zeros(3)
-    return field.magnetic.amplitudes
+def _dipole_of(
+    field: MagneticField, inclination: float, distance: float
+) -> tuple[Array, Array]:
+    """Return the fields `dipole` and `pole` of the kernel's `Orbit`."""
+    sine, cosine = math.sin(inclination), math.cos(inclination)
+    a = field.moment / distance**3
+    axial = a * math.cos(field.pole.colatitude)
+    dipole = axial * np.array([-2.0 * sine, sine, cosine])
+    if not field.rotates:
+        return dipole, np.zeros(0)
+    amplitude = a * math.sin(field.pole.colatitude)
+    pole = [amplitude, field.pole.longitude, field.pole.rate, sine, cosine]
+    return dipole, np.array(pole)
 
 
 def no_law(state: StateMap, u: Array) -> policies.Law:

@@ -196,5 +196,8 @@ def test_errors_of_periodic_models():
     assert "remove --trajectory" in refused("tvlqr", SATELLITE, *both)
     assert "neither --trajectory" in refused("tvlqr", SATELLITE)
     assert "without --periodic" in refused("linearize", SATELLITE, "--motion", "free")
+    assert "without --periodic" in refused("linearize", SATELLITE, "--period", 60)
+    short = refused("linearize", SATELLITE, "--periodic", 8, "--period", 60)
+    assert "differs from the field one period later" in short
     wrong = refused("tvlqr", SATELLITE, "--periodic", 8, "--sample", 60)
     assert "59.75766345816693" in wrong

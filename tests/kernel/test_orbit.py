@@ -151,6 +151,49 @@ def test_the_b_dot_law_matches_the_python_engine(robots, sample):
     assert np.abs(run.u[:, 0]).max() > 0.1
 
 
+@pytest.mark.parametrize("field", ["dipole", "tilted_dipole"])
+@pytest.mark.parametrize("eccentricity", [None, 0.3])
+def test_the_magnetic_field_matches_the_python_engine(robots, eccentricity, field):
+    """The angular velocity of the earth and of the orbit are similar, so that each is seen."""
+    options = {"inclination": 0.9, "field": field, "node_longitude": 0.4}
+    if eccentricity is None:
+        options |= {"argument_of_latitude": 0.4}
+        path = fflin.CircularOrbit(8000e3, **options)
+    else:
+        options |= {"argument_of_perigee": -0.5, "anomaly": 2.0}
+        path = fflin.EllipticOrbit(perigee=8000e3, eccentricity=0.3, **options)
+    for frame in ("lvlh", "hill"):
+        plant = planned(
+            robots["cubesat"].replace(orbit=path), frame=frame, duration=1.0
+        ).plant
+        values = orbit_of(plant)
+        values = values._replace(mean_motion=np.array(values.mean_motion))
+        for t in (0.0, 1e3, 5e4):
+            orbit.write_now(values, t)
+            for at, expected in (
+                (orbit.FLUX, plant.field.magnetic.at(t)),
+                (orbit.FLUX_CHANGE, plant.field.magnetic.rate(t)),
+            ):
+                size = np.abs(expected).max()
+                apart = values.now[at : at + 3] - expected
+                assert np.abs(apart).max() < TOLERANCE * size
+
+
+def test_the_b_dot_law_in_an_ellipse_matches_the_python_engine(robots):
+    robot, options = moving(robots["cubesat"])
+    path = fflin.EllipticOrbit(
+        perigee=1e6,
+        eccentricity=0.3,
+        anomaly=1.0,
+        inclination=0.9,
+        field="tilted_dipole",
+    )
+    rods = [fflin.Magnetorquer([1.0, 2.0, -1.0], max=50.0)]
+    robot = robot.replace(orbit=path, inputs=rods)
+    run = agree(planned(robot, fflin.BDot(1e5), **options))
+    assert np.abs(run.u).max() > 0.1
+
+
 def swept(robot, monkeypatch, **options):
     """Models of the batch kernel, uncompiled, and models of `linearize`."""
     monkeypatch.setattr(
