@@ -365,7 +365,7 @@ def analyze(arguments: Namespace) -> Report:
     """
     if arguments.periodic:
         return _analysis_of_period(arguments)
-    refuse(arguments, ("motion",), "without --periodic N, this has no effect")
+    refuse(arguments, ("motion", "period"), "without --periodic N, this has no effect")
     _, lin = linear_model(arguments)
     moved = fflin.controllability(lin)
     shown = fflin.observability(lin)

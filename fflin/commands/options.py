@@ -63,7 +63,7 @@ OPTIONS: dict[str, dict[str, str]] = {
         TRAJECTORY: _PATH,
         OUTPUT: "tolerance plot",
     },
-    "analyze": {**_AT_POINT, TRAJECTORY: "periodic motion", OUTPUT: "plot"},
+    "analyze": {**_AT_POINT, TRAJECTORY: "periodic period motion", OUTPUT: "plot"},
     "modes": {**_AT_POINT, OUTPUT: "plot html"},
     "equilibrium": {**_AT_POINT, OUTPUT: "output-file"},
     "sensitivity": {**_AT_POINT, "derivatives": "dt top only", OUTPUT: "output-file"},
@@ -145,12 +145,13 @@ DESCRIPTIONS = {
 # {command: options that its short help lists}. For a command without an entry, the short help lists
 # all options.
 COMMON = {
+    "info": "joint rpy position velocity lock orbit stiffness passive inputs output",
     "linearize": "joint rpy position velocity effort equilibrium time frame reference inputs dt "
     "for trajectory periodic output-file plot",
     "check": "joint rpy position velocity effort equilibrium frame reference inputs trajectory "
     "tolerance plot",
     "analyze": "joint rpy velocity equilibrium relative-equilibrium orbit stiffness inputs output "
-    "frame plot",
+    "frame periodic plot",
     "modes": "joint rpy velocity equilibrium relative-equilibrium orbit stiffness inputs output "
     "frame plot html",
     "equilibrium": "joint rpy velocity tilt relative-equilibrium orbit stiffness gravity passive "
@@ -228,7 +229,8 @@ ABOUT: dict[str, str] = {
     "orbital frame. Inclination and magnetic field are those of the orbit in robot.toml, if it has "
     "the same central body. `none` removes the orbit of a robot file",
     "inclination": "inclination of the orbit [rad], on which the magnetic field depends",
-    "field": "magnetic field of the orbit, for magnetorquers, such as dipole; `none` removes it",
+    "field": "magnetic field of the orbit, for magnetorquers: dipole, tilted_dipole (which rotates "
+    "with the earth) or none",
     "stiffness": "stiffness of a joint [N m/rad|N/m], or one value for all joints",
     "damping": "damping of a joint [N m s/rad|N s/m], or one value for all joints. With `urdf` as "
     "VALUE, the damping in the URDF is used",

@@ -427,10 +427,8 @@ def tvlqr(
         )
     Q, R, _ = cost_weights(traj, Q, R, None)
     if periodic:
-        Q, left_out = _of_regulated(traj, Q)
-        if left_out:
-            rule += f"; not regulated: {', '.join(left_out)}"
-        regulated = np.array([name not in left_out for name in names])
+        Q, regulated, left_out = _of_regulated(traj, Q)
+        rule += left_out
         Qf = np.zeros_like(Q)  # replaced by the periodic solution
     elif steady:
         Qf = steady_regulator(steady_end(traj), Q, R, sample)[0]
@@ -459,8 +457,9 @@ def tvlqr(
         elif periodic:
             t, P, maps = _periodic_back(traj, at)
             Qf = P[-1]
-            factors = periodic_riccati.loop_factors(maps, P)
-            multipliers = loop_multipliers(factors, regulated)
+            multipliers = loop_multipliers(
+                periodic_riccati.loop_factors(maps, P), regulated
+            )
             A, B = traj.matrices_at(t)
             K = np.linalg.solve(R, B.transpose(0, 2, 1) @ P)
         else:
@@ -521,8 +520,11 @@ def asks_periodic(value: object, traj: LinearTrajectory, name: str = "Qf") -> bo
     return periodic
 
 
-def _of_regulated(traj: LinearTrajectory, Q: Array) -> tuple[Array, list[str]]:
-    """Return Q with zero weight for states that are not regulated, and their names."""
+def _of_regulated(traj: LinearTrajectory, Q: Array) -> tuple[Array, Mask, str]:
+    """Return Q with zero weight for states that are not regulated.
+
+    Further results are the mask (nx,) of the regulated states, and a text that names the others.
+    """
     lin = traj[0]
     kept = regulated_part(lin, None).state_names
     left_out = [name for name in lin.state_names if name not in kept]
@@ -530,7 +532,9 @@ def _of_regulated(traj: LinearTrajectory, Q: Array) -> tuple[Array, list[str]]:
     Q = Q.copy()
     Q[rows] = 0.0
     Q[:, rows] = 0.0
-    return Q, left_out
+    regulated = np.array([name in kept for name in lin.state_names])
+    text = f"; not regulated: {', '.join(left_out)}" if left_out else ""
+    return Q, regulated, text
 
 
 def periodic_end(

@@ -20,6 +20,7 @@ from fflin.robot.inputs import BaseForce, BaseTorque, Thruster
 from fflin.robot.joints import ROOT, Joint
 
 if TYPE_CHECKING:
+    from fflin.robot.orbit import Orbit
     from fflin.robot.robot import Robot
 
 LIMIT_UNITS = "limits in rad, N m and rad/s, or in m, N and m/s for prismatic joints"

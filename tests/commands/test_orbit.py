@@ -32,8 +32,10 @@ def test_another_altitude_keeps_the_magnetic_field_of_the_robot_file():
     orbit = orbit_of("--orbit", "600e3")
     shown = orbit["altitude"], orbit["inclination"], orbit["field"]
     assert shown == (600e3, 1.7, "dipole")
-    changed = orbit_of("--orbit", "600e3", "--inclination", 0.9, "--field", "none")
-    assert (changed["inclination"], changed["field"]) == (0.9, None)
+    changed = orbit_of(
+        "--orbit", "600e3", "--inclination", 0.9, "--field", "tilted_dipole"
+    )
+    assert (changed["inclination"], changed["field"]) == (0.9, "tilted_dipole")
     turned = orbit_of("--inclination", 0.9)
     assert (turned["altitude"], turned["field"]) == (500e3, "dipole")
     ellipse = orbit_of("--orbit", "500e3/900e3")
