@@ -145,6 +145,7 @@ DESCRIPTIONS = {
 # {command: options that its short help lists}. For a command without an entry, the short help lists
 # all options.
 COMMON = {
+    "uncertain": "joint vary lock stiffness damping passive inputs output output-file",
     "info": "joint rpy position velocity lock orbit stiffness passive inputs output",
     "linearize": "joint rpy position velocity effort equilibrium time frame reference inputs dt "
     "for trajectory periodic output-file plot",
