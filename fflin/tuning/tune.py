@@ -23,6 +23,7 @@ from fflin.tuning.loop import require_plain_sensors
 from fflin.tuning.plant import Plant, Signals, plant_of, signals_of
 from fflin.tuning.points import Point, Points, points_of
 from fflin.tuning.problem import Case, Measure, Problem
+from fflin.tuning.robust import UncertainLoop
 from fflin.tuning.search import Minimum, Term, minimise
 from fflin.tuning.starts import searched, stabilised
 from fflin.tuning.structures import Structure, Structured
@@ -339,6 +340,9 @@ class _Task:
         worst = self.worst(problem, minimum.x, distinct)
         law = problem.law(minimum.x)
         level = self._soft_level([found.value for found in worst])
+        uncertain = None
+        if self.points.lft is not None:
+            uncertain = UncertainLoop(self.points.lft, law, self.used)
         goals = []
         for index, (found, measure) in enumerate(
             zip(worst, self.measures, strict=True)
@@ -352,6 +356,10 @@ class _Task:
                 where = found.piece.where
             hard = measure.goal.hard
             active = is_active(found.value, hard, level)
+            bound = math.nan
+            if uncertain is not None:
+                largest = max(found.value, 0.0 if math.isnan(check) else check)
+                bound = uncertain.bound(measure.goal, measure.ends, largest)
             goals.append(
                 GoalValue(
                     measure.goal.label,
@@ -362,6 +370,7 @@ class _Task:
                     dict(found.point.parameters),
                     active,
                     self._least(measure.goal),
+                    bound,
                 )
             )
         values = problem.values(minimum.x)[0].tolist()

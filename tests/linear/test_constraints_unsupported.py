@@ -35,7 +35,6 @@ CALLS = {
     ),
     "plan": lambda robot, _: fflin.plan(robot, {}, duration=10.0),
     "relative_equilibria": lambda robot, _: fflin.relative_equilibria(robot),
-    "sensitivity": lambda _, lin: fflin.sensitivity(lin),
     "to": lambda _, lin: lin.to("mujoco"),
     "gain.to": lambda _, lin: fflin.lqr(lin).to("drake"),
     "transform": lambda robot, lin: fflin.transform(robot, lin, "pinocchio"),
