@@ -275,6 +275,26 @@ def test_loops_within_the_stability_bound_are_stable():
         assert np.linalg.eigvals(A - B @ gain.K).real.max() < 0.0
 
 
+@pytest.mark.exhaustive
+def test_stability_is_guaranteed_until_the_stiffness_of_a_panel_is_zero():
+    robot = fflin.load(
+        "servicer_7dof",
+        lock=["joint_*"],
+        inputs=[fflin.BaseTorque()],
+        outputs=[fflin.BasePose()],
+        stiffness={"panel_*": 100.0},
+        damping={"panel_*": 1.0},
+    )
+    policy = fflin.PD("q_b", "tau_b", shared=True, kp=300.0, lag=0.03)
+    lin = fflin.linearize(robot)
+    tuned = fflin.tune(lin, policy, fflin.Margin(0.5), starts=1, steps=1)
+    stiffness = {"range": 0.2, "tied": True}
+    uncertain = fflin.uncertain(robot, {"panel_*.stiffness": stiffness})
+    safe = uncertain.worst(tuned, samples=5).safe
+    assert safe == pytest.approx(5.0, rel=1e-2)
+    assert safe <= 5.0
+
+
 def test_a_pole_that_crosses_the_axis_between_frequencies_of_the_grid_is_not_missed():
     """s^3 + s^2 + (2 + delta) s + 1 has its poles at +-j where delta is -1, by Routh."""
     pytest.importorskip("slycot")
