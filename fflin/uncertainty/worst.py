@@ -535,6 +535,8 @@ def _safe(loops: Loops) -> float:
     If all ranges are scaled by less than the returned factor, all loops are stable.
     """
     lft = loops.lft
+    if not lft.repeats.any():
+        return np.inf  # no parameter has an effect
     F = loops.matrices(np.zeros(len(loops.lft.repeats)))[0]
     poles = np.linalg.eigvals(F)
 
