@@ -755,7 +755,8 @@ def with_errors(
         sizes[name] = np.zeros(len(policy.sensors))
         for index, value in by_name("measured signal", by_key, policy.sensors).items():
             sizes[name][index] = value
-    return with_sensor_errors(policy.fresh(), sizes["bias"], sizes["noise"], 0.0)
+    seed = float(arguments.seed)
+    return with_sensor_errors(policy.fresh(), sizes["bias"], sizes["noise"], seed)
 
 
 def _budgeted_noise(arguments: Namespace) -> dict[str, float] | None:

@@ -225,6 +225,7 @@ def simulate(arguments: Namespace) -> Report:
         settings.pop("linear", None)  # the linear model has no sensor errors
     if arguments.no_noise:
         settings["noise"] = 0.0
+    settings["seed"] = arguments.seed
     motion = fflin.simulate(
         robot, measuring, every=arguments.every, engine=arguments.engine, **settings
     )

@@ -115,7 +115,7 @@ OPTIONS: dict[str, dict[str, str]] = {
     "simulate": {
         **_LOOP,
         SIMULATION: f"{_LOOP[SIMULATION]} every engine",
-        "pointing errors": "pointing accuracy budget noise bias no-noise",
+        "pointing errors": "pointing accuracy budget noise bias no-noise seed",
         OUTPUT: f"plot show output-file html {_PICTURES}",
     },
     "export": {"": "FILE", OUTPUT: "output-folder robot weld limits name real"},
@@ -474,6 +474,7 @@ ABOUT: dict[str, str] = {
     "montecarlo plot": "plot quantile bands over time, histograms and the worst runs to FILE",
     "montecarlo html": "write a page that plays the worst run",
     "montecarlo seed": "random seed",
+    "simulate seed": "random seed of the noise and the drifting biases of sensors",
     "montecarlo budget": "report the error of each cause in the linear loop of the nominal robot, "
     "see fflin.error_budget: the disturbance of the robot and the noise of its outputs",
     "montecarlo goal": "report the fraction of runs that meet CONDITION, such as 'attitude < 1 deg "

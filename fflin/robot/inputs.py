@@ -9,6 +9,7 @@ from typing import ClassVar, TypeAlias, cast
 import numpy as np
 
 from fflin.base.errors import InputError
+from fflin.base.shown import shown_fields
 from fflin.base.validation import Array, dimension, number, positive, truth
 
 Vector3: TypeAlias = Sequence[float]
@@ -17,7 +18,7 @@ Vector3: TypeAlias = Sequence[float]
 Range: TypeAlias = tuple[float, float]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Input:
     """Base class of inputs, which checks their limits and names."""
 
@@ -35,6 +36,9 @@ class Input:
     min: float | Vector3 | None = field(default=None, kw_only=True, repr=False)
     # Time constant T [s] of the actuator: the force u_a that acts follows u_a' = (u - u_a) / T.
     lag: float | None = field(default=None, kw_only=True, repr=False)
+
+    def __repr__(self) -> str:
+        return shown_fields(self)
 
     def __post_init__(self) -> None:
         for name in ("frame", "joint", "name"):
@@ -118,7 +122,7 @@ class BaseForce(Input):
     KEY, GROUP, UNIT, ENTRIES = "base_force", "F_b", "N", "xyz"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class JointTorque(Input):
     """Torque [N m] or force [N] of the motor of one joint.
 
@@ -140,7 +144,7 @@ class JointTorque(Input):
     joint: str
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Thruster(Input):
     """Force [N] of a thruster or rotor, with its point of action and direction fixed in a frame.
 
@@ -227,7 +231,7 @@ class Thruster(Input):
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class ReactionWheel(Input):
     r"""Motor torque [N m] of a balanced reaction wheel, whose axis is fixed on a link.
 
@@ -318,7 +322,7 @@ class ReactionWheel(Input):
         return np.concatenate((np.zeros(3), -np.array(self.axis)))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Magnetorquer(Input):
     r"""Magnetic dipole moment [A m^2] of a coil or rod, whose axis is fixed on a link.
 

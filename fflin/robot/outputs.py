@@ -9,13 +9,14 @@ from dataclasses import dataclass, field, fields
 from typing import ClassVar, TypeAlias
 
 from fflin.base.errors import InputError, require_known
+from fflin.base.shown import shown_fields
 from fflin.base.validation import number, positive
 
 # Standard deviation, or one figure of a data sheet such as {"angle_random_walk": 0.1}.
 SensorError: TypeAlias = float | Mapping[str, float]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Output:
     """Base class of outputs, with their names, units and properties of the sensor.
 
@@ -51,6 +52,9 @@ class Output:
         default=None, kw_only=True, repr=False, hash=False
     )
     bias: SensorError | None = field(default=None, kw_only=True, repr=False, hash=False)
+
+    def __repr__(self) -> str:
+        return shown_fields(self)
 
     def __post_init__(self) -> None:
         for name in ("sample", "lag"):
@@ -107,7 +111,7 @@ class Output:
         ]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class FrameOutput(Output):
     """Base class of outputs that depend on one or two frames on the base or on links."""
 
@@ -142,7 +146,7 @@ class BasePose(Output):
     WORD = "base"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class JointOutput(Output):
     """Base class of joint outputs, for chosen joints or by default for all joints."""
 
@@ -244,7 +248,7 @@ class FrameVelocity(FrameOutput):
     VECTORS = (("angular_velocity", "rad/s"), ("velocity", "m/s"))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class RelativePose(FrameOutput):
     """Output of the pose of one frame relative to another, independent of the base pose.
 
@@ -400,7 +404,7 @@ FORCES = {
 }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class ConstraintForce(Output):
     """Output of the force and torque that a constraint exerts on its `frame`, at its origin.
 

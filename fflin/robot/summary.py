@@ -351,9 +351,13 @@ def ideal_inputs(robot: Robot) -> str:
         "torque" if isinstance(x, BaseTorque) else "force" for x in ideal
     )
     limits = "" if all(x.max is not None for x in ideal) else " without limits"
+    remark = f"an ideal {kinds}{limits} on the base stands for its actuators"
+    if BaseTorque() not in ideal or BaseForce() not in ideal:
+        # These are not the default inputs, so the user has chosen them.
+        return remark
     return (
-        f"an ideal {kinds}{limits} on the base stands for its actuators; for thrusters or wheels, "
-        "give the robot file [[input]] tables, or the option --inputs a file"
+        f"{remark}; for thrusters or wheels, give the robot file [[input]] tables, or the option "
+        "--inputs a file"
     )
 
 
