@@ -7,7 +7,7 @@ from itertools import compress
 import numpy as np
 
 from fflin.base.errors import InputError
-from fflin.base.validation import Mask, instance
+from fflin.base.validation import Array, Mask, instance
 from fflin.control.loops import NOT_CORRECTED, Loop, PredictedLaw, Sample
 from fflin.control.multirate import MultirateCompensator
 from fflin.control.policies import Feedback, OutputSensing, at_samples
@@ -66,6 +66,10 @@ class MultirateFeedback(OutputSensing, Feedback):
             "delay; use fflin.OutputFeedback for other compensators",
         )
         self.lin = lin = held_if_possible(about_point(lin))
+        # Gain (nu, ny) of the received outputs, which `unload_wheels` adds to the commands.
+        self.feedthrough: Array = np.zeros(
+            (len(lin.input_names), len(lin.output_names))
+        )
         self.noise = noise
         if noise is not None and not callable(noise):
             raise InputError(
@@ -98,6 +102,7 @@ class MultirateFeedback(OutputSensing, Feedback):
         """Names of the states in the measured outputs."""
         lin = self.lin
         used: Mask = np.any(self.compensator.B, axis=(0, 1))
+        used = used | np.any(self.feedthrough, axis=0)
         felt: Mask = np.any(lin.C[used], axis=0)
         return tuple(compress(lin.state_names, felt))
 
@@ -105,12 +110,10 @@ class MultirateFeedback(OutputSensing, Feedback):
         """Return the matrices and offsets for each sample of the period."""
         law = self.compensator
         lin = self.lin
-        none = np.zeros((len(law.u0), len(law.y0)))
+        D = self.feedthrough
         corrected = law.E.any()
         return [
-            Sample(
-                A, B, law.C, none, lin.u0, lin.y0, E=E if corrected else NOT_CORRECTED
-            )
+            Sample(A, B, law.C, D, lin.u0, lin.y0, E=E if corrected else NOT_CORRECTED)
             for A, B, E in zip(law.A, law.B, law.E, strict=True)
         ]
 

@@ -568,7 +568,9 @@ class Allocation(Policy):
     thrusters and motors of the simulated robot then produce the generalised force that is closest
     to the commanded force, without negative thrust and without exceeding an input limit. The
     squared distance between the two forces is e^T M e. Here e is the difference between the
-    accelerations that the two forces cause, and M is the inertia of the robot.
+    accelerations that the two forces cause, and M is the inertia of the robot. So a force on the
+    base that was not commanded is an error, too. If thrusters exert torque only together with a
+    force, the torque therefore differs from the command; use pairs of opposite thrusters.
 
     Parameters
     ----------

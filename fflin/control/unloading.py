@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
-from typing import TypeVar
+from dataclasses import replace
+from typing import TypeVar, cast
 
 import numpy as np
 from scipy.linalg import null_space
@@ -12,7 +13,9 @@ from scipy.linalg import null_space
 from fflin.base.errors import InputError, listed
 from fflin.base.validation import Array, frozen, instance, number
 from fflin.control.loops import NOT_CORRECTED
+from fflin.control.multirate_feedback import MultirateFeedback
 from fflin.control.policies import LinearLaw, StateFeedback
+from fflin.control.sensors import timing_of_model
 from fflin.dynamics.state import selection
 from fflin.linear.holding import held_if_possible, lags_by_name
 from fflin.linear.linearization import linearize
@@ -20,7 +23,7 @@ from fflin.linear.model import LinearModel
 from fflin.robot.inputs import Thruster, lags_of
 from fflin.robot.robot import Robot
 
-LawT = TypeVar("LawT", bound=LinearLaw)
+LawT = TypeVar("LawT", bound=LinearLaw | MultirateFeedback)
 
 # Singular values below this fraction of the largest one count as zero.
 _ZERO = 1e-9
@@ -46,11 +49,12 @@ def unload_wheels(law: LawT, design: Robot, rate: float) -> LawT:
 
     Thrusters that push in one direction only produce the external torque by `Allocation`. Choose k
     such that ``k * momentum`` is below the torque of the thrusters, because saturated thrusters
-    disturb the attitude. A constant external torque T leaves the momentum T/k in the wheels.
+    disturb the attitude. The thrusters must also be able to exert the torque without a force on the
+    base, because `Allocation` counts this force as an error. A constant external torque T leaves the momentum T/k in the wheels.
 
     Parameters
     ----------
-    law : StateFeedback, OutputFeedback or LinearController
+    law : StateFeedback, OutputFeedback, LinearController or MultirateFeedback
         Law for a robot whose inputs include the wheels. An output feedback must measure the wheel
         speeds, for example by ``JointVelocities(("wheel_*",))``. `lqr` and `kalman` must leave out
         the wheel speeds, as they do by default without an external torque.
@@ -61,15 +65,15 @@ def unload_wheels(law: LawT, design: Robot, rate: float) -> LawT:
 
     Returns
     -------
-    StateFeedback, OutputFeedback or LinearController
-        Law for `design`.
+    StateFeedback, OutputFeedback, LinearController or MultirateFeedback
+        Law for `design`, of the same type.
 
     Raises
     ------
     InputError
         If the law already feeds back wheel speeds or does not measure them, `design` has other
-        states or outputs than the robot of the law or lacks its inputs, the inputs have different
-        delays or lags, or the inputs of `design` cannot change all wheel speeds without
+        states, outputs or sensors than the robot of the law or lacks its inputs, the inputs have
+        different delays or lags, or the inputs of `design` cannot change all wheel speeds without
         accelerating the rest of the robot.
 
     Examples
@@ -84,9 +88,8 @@ def unload_wheels(law: LawT, design: Robot, rate: float) -> LawT:
     >>> fflin.simulate(design, unloading, duration=1.0).u.shape[1]
     6
     """
-    instance(
-        "law", law, LinearLaw, "a StateFeedback, OutputFeedback or LinearController"
-    )
+    kinds = "a StateFeedback, OutputFeedback, LinearController or MultirateFeedback"
+    instance("law", law, (LinearLaw, MultirateFeedback), kinds)
     instance("design", design, Robot, "a fflin.Robot")
     rate = number("rate", rate)
     if rate <= 0.0:
@@ -99,6 +102,8 @@ def unload_wheels(law: LawT, design: Robot, rate: float) -> LawT:
         )
     _require_unregulated(law, speeds)
     null = _null_feedback(continuous, speeds)
+    if isinstance(law, MultirateFeedback):
+        return cast(LawT, _multirate(law, lin, continuous, rate * null, speeds))
 
     sensors = lin.output_names if law.senses_outputs else lin.robot_states
     rows = selection(law.lin.input_names, lin.input_names)
@@ -114,7 +119,7 @@ def unload_wheels(law: LawT, design: Robot, rate: float) -> LawT:
         inputs=sensors,
         outputs=lin.input_names,
     )
-    unloading.windup = _windup(law, continuous, rows)
+    unloading.windup = _windup(law.windup, continuous, rows)
     if isinstance(unloading, StateFeedback):
         states = selection(law.lin.state_names, lin.state_names)
         attitude = rows.T @ unloading.K @ states
@@ -123,7 +128,43 @@ def unload_wheels(law: LawT, design: Robot, rate: float) -> LawT:
     return unloading
 
 
-def _models(law: LinearLaw, design: Robot) -> tuple[LinearModel, LinearModel]:
+def _multirate(
+    law: MultirateFeedback,
+    lin: LinearModel,
+    continuous: LinearModel,
+    feedback: Array,
+    speeds: list[str],
+) -> MultirateFeedback:
+    """Return a law of sensors with their own sampling times that also unloads the wheels.
+
+    `lin` and `continuous` are the models of the design, and `feedback` (nu, number of wheels) is
+    the gain of the wheel speeds.
+    """
+    if timing_of_model(lin) != timing_of_model(law.lin):
+        raise InputError(
+            f"the sensors of '{lin.robot}' have other sampling times or delays than those of the "
+            "law; give the robot of the law with an additional external torque"
+        )
+    rows = selection(law.lin.input_names, lin.input_names)
+    given = law.compensator
+    E = np.array([_windup(windup, continuous, rows) for windup in given.E])
+    unloading = copy(law)
+    unloading.lin = lin
+    unloading.compensator = replace(
+        given,
+        C=rows.T @ given.C,
+        E=E,
+        u0=rows.T @ given.u0,
+        output_names=lin.input_names,
+    )
+    of_speeds = selection(speeds, lin.output_names)
+    unloading.feedthrough = -feedback @ of_speeds
+    return unloading
+
+
+def _models(
+    law: LinearLaw | MultirateFeedback, design: Robot
+) -> tuple[LinearModel, LinearModel]:
     """Return the model of `design` at the point of a law, sampled like the law's model.
 
     The second model is in continuous time. Both contain the inputs of the law.
@@ -177,16 +218,17 @@ def _common_lag(what: str, lags: Sequence[float]) -> float:
     return different[0]
 
 
-def _require_unregulated(law: LinearLaw, speeds: list[str]) -> None:
+def _require_unregulated(law: LinearLaw | MultirateFeedback, speeds: list[str]) -> None:
     """Raise `InputError` if a law feeds back the wheel speeds already or cannot measure them."""
-    sensors = law.system.inputs
+    systems = law.laws_of_period()
+    sensors = systems[0].inputs
     unmeasured = [name for name in speeds if name not in sensors]
     if unmeasured:
         raise InputError(
             f"the law does not measure {listed(unmeasured)}; add the output "
             'JointVelocities(("wheel_*",))'
         )
-    matrices = np.vstack((law.system.D, law.system.B))
+    matrices = np.vstack([x for system in systems for x in (system.D, system.B)])
     fed_back = [name for name in speeds if matrices[:, sensors.index(name)].any()]
     if fed_back and not law.lin.mean_motion:
         raise InputError(
@@ -232,17 +274,18 @@ def _thrusters(lin: LinearModel) -> set[str]:
     }
 
 
-def _windup(law: LinearLaw, lin: LinearModel, rows: Array) -> Array:
+def _windup(windup: Array, lin: LinearModel, rows: Array) -> Array:
     """Return the anti-windup gain (nz, nu) of a law with further inputs.
 
     A further input has the effect of the inputs of the law that cause the nearest accelerations.
-    `rows` selects the inputs of the law from all inputs of the model `lin`.
+    `windup` is the gain of the law. `rows` selects the inputs of the law
+    from all inputs of the model `lin`.
     """
-    if not law.windup.size:
+    if not windup.size:
         return NOT_CORRECTED
     wheels = {f"qdot_m.{name}" for name in lin.wheels}
     others = [name for name in lin.state_names if name not in wheels]
     B = selection(others, lin.state_names) @ lin.B
     equivalent = np.linalg.lstsq(B @ rows.T, B, rcond=None)[0]
-    windup: Array = law.windup @ equivalent
-    return windup
+    corrected: Array = windup @ equivalent
+    return corrected

@@ -159,6 +159,45 @@ def test_lagging_wheels_are_unloaded_and_the_attitude_stays(make):
     assert 0.5 < ratio.mean() < 0.6
 
 
+def multirate_law(robot):
+    """Return LQG of a slow and late star tracker."""
+    model = fflin.linearize(robot).discretize(SAMPLE, delay=0.1)
+    noise = {"q_b": 1e-10, "gyroscope": 1e-10, "qdot_m": 1e-6}
+    estimator = fflin.kalman(
+        model, {"omega_b": 1e-10}, noise, disturbance_noise={"tau_b": 1e-14}
+    )
+    default = fflin.lqr(model)
+    gain = fflin.lqr(model, default.Q, default.R, default.N)
+    return fflin.MultirateFeedback(model, fflin.lqg(gain, estimator))
+
+
+def with_star_tracker(robot, sample=0.5):
+    outputs = [
+        fflin.StarTracker(sample=sample, delay=0.25),
+        *robot.outputs[1:],
+    ]
+    return robot.replace(outputs=outputs)
+
+
+@pytest.mark.exhaustive
+def test_a_multirate_law_unloads_the_wheels_and_the_attitude_stays():
+    alone, design, _ = map(with_star_tracker, cubesat())
+    unloading = fflin.unload_wheels(multirate_law(alone), design, RATE)
+    v0 = fflin.velocity(design, SPEEDS)
+    motion = fflin.simulate(design, unloading, v0=v0, duration=30.0, dt=0.05)
+    assert motion.attitude_error.max() < 1e-9
+    # the delay holds the first command back
+    factor = (1.0 - RATE * SAMPLE) ** (30.0 / SAMPLE)
+    np.testing.assert_allclose(motion.v[-1, 6:], factor * v0[6:], rtol=0.02)
+
+
+def test_a_multirate_law_of_other_sensors_is_refused():
+    alone, design, _ = map(with_star_tracker, cubesat())
+    other = with_star_tracker(design, sample=0.25)
+    with pytest.raises(fflin.InputError, match="other sampling times or delays"):
+        fflin.unload_wheels(multirate_law(alone), other, RATE)
+
+
 def test_inputs_that_unload_accelerate_only_wheels():
     alone, design, _ = cubesat()
     law = state_law(alone)
