@@ -27,9 +27,6 @@ CALLS = {
     ),
     "plan": lambda robot, _: fflin.plan(robot, {}, duration=10.0),
     "relative_equilibria": lambda robot, _: fflin.relative_equilibria(robot),
-    "to": lambda _, lin: lin.to("mujoco"),
-    "gain.to": lambda _, lin: fflin.lqr(lin).to("drake"),
-    "transform": lambda robot, lin: fflin.transform(robot, lin, "pinocchio"),
 }
 
 
