@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fflin.base.errors import FflinWarning, InputError, listed
+from fflin.base.errors import FflinWarning, InputError, listed, located
 from fflin.base.names import chosen, group_of, input_keys
 from fflin.base.process import Progress
 from fflin.base.validation import Array, ArrayLike, Mask, number, whole
@@ -18,7 +18,8 @@ from fflin.control.optimal.plan_search import Search, excess
 from fflin.control.optimal.shooting import Point, Shooting
 from fflin.control.weights import Weight, weight
 from fflin.dynamics import points
-from fflin.dynamics.coordinates import refuse_constraints, refuse_orbit
+from fflin.dynamics.closure import closure_of
+from fflin.dynamics.coordinates import refuse_orbit
 from fflin.dynamics.state import Actuation, StateMap
 from fflin.linear.model import LinearModel
 from fflin.linear.optimality import STATIONARY, Optimality
@@ -155,9 +156,8 @@ def plan(
     """
     state = StateMap(robot)
     refuse_orbit(robot, "plans")
-    refuse_constraints(robot, "plans")
     start = points.point_of(state, x0, q0, v0, partial(points.start_of, robot))
-    end = _goal_point(state, goal)
+    start, end = _on_constraints(state, start, _goal_point(state, goal))
     knots, duration = whole("knots", knots, 3, 10_000), number("duration", duration)
     if not 1e-9 < duration < 1e9:
         raise InputError(f"duration is {duration:g} s, expected a positive time")
@@ -196,11 +196,21 @@ def plan(
         inputs = np.array((low, high))
         cost = _knot_weights(shooting)[:, None] * weights
         size = np.abs(np.where(np.isfinite(bounds), bounds, 0.0)).max(axis=0)
+        determining = shooting.determining(end, asked)
         search = Search(
-            shooting, start, end, asked, bounds, inputs, size, cost, _PARTS, line.say
+            shooting,
+            start,
+            end,
+            determining,
+            bounds,
+            inputs,
+            size,
+            cost,
+            _PARTS,
+            line.say,
         )
         first = initial_guess(shooting, guess, start, end, asked, bounds, weights)
-        made = _least(search, first)
+        made = _least(search, first, asked)
     if made.reached:
         q, v, u = made.q, made.v, made.u
         if asked.all():
@@ -259,6 +269,23 @@ def _goal_point(
     return points.point_of(state, goal, None, None, at_rest)
 
 
+def _on_constraints(state: StateMap, start: Point, end: Point) -> tuple[Point, Point]:
+    """Return start and goal on the constraints of the robot, if it has some.
+
+    Raise `ConstraintError` if one of them is far from the constraints.
+    """
+    closure = closure_of(state)
+    if closure is None:
+        return start, end
+    closed = list[Point]()
+    for name, point in {"start": start, "goal": end}.items():
+        with located(f"the {name} of the plan"):
+            q = closure.configuration(point[0])
+            closed.append((q, closure.velocity(q, point[1])))
+    first, last = closed
+    return first, last
+
+
 def _without_velocity(goal: object) -> bool:
     """Return whether a goal is a configuration without a velocity."""
     return isinstance(goal, tuple) and len(goal) == 2 and goal[1] is None
@@ -277,10 +304,11 @@ def _knot_weights(shooting: Shooting) -> Array:
     return weights
 
 
-def _least(search: Search, guess: tuple[Array, Array, Array]) -> _Made:
+def _least(search: Search, guess: tuple[Array, Array, Array], asked: Mask) -> _Made:
     """Search for a plan of least effort in up to two attempts, and return the better attempt.
 
-    The search begins at the knots q, v and the inputs u of the guess.
+    The search begins at the knots q, v and the inputs u of the guess. `asked` (nx,) is True for all
+    states whose value at the end is prescribed.
 
     An attempt that reaches the goal is better than an attempt that does not. If both or neither
     reach the goal, the attempt with the smaller violation is better.
@@ -303,7 +331,7 @@ def _least(search: Search, guess: tuple[Array, Array, Array]) -> _Made:
         if shooting.held:
             # the last row repeats the input of the last interval
             u = np.vstack((u[:-1], u[-2]))
-        missed = np.abs(shooting.between((q[-1], v[-1]), search.end)) * search.asked
+        missed = np.abs(shooting.between((q[-1], v[-1]), search.end)) * asked
         within = shooting.inside(shooting.motions(q, v, u), _PARTS)
         beyond = excess(bounds[:, None, None] - within)
         beyond /= np.where(search.size > 0.0, search.size, 1.0)

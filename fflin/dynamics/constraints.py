@@ -126,24 +126,26 @@ class Constraints:
 
     def jacobian(self, q: Array) -> Array:
         """Return J (rows, nv) at q (nq,)."""
-        return self.residual_and_jacobian(q)[1]
-
-    def residual_and_jacobian(self, q: Array) -> tuple[Array, Array]:
-        """Return phi (rows,), see `residual`, and J (rows, nv) at q (nq,)."""
         pairs = self.pairs
         columns = pin.computeJointJacobians(self._model, self._data, q)
-        residual = np.empty(self.count)
         jacobian = np.empty((self.count, self._model.nv))
         for pair, signs in zip(pairs, self._signs, strict=True):
             first = self._pose(pair.first)
-            apart = first.actInv(self._pose(pair.second))
-            residual[pair.rows] = _distances(pair, apart)
             if signs is None:
+                apart = first.actInv(self._pose(pair.second))
                 jacobian[pair.rows] = self._mimic_rows(pair, apart)
                 continue
             # Column k of `columns` is the twist in world axes of all bodies that joint k moves.
             selected = pair.selected.dot(first.actionInverse)
             np.multiply(selected.dot(columns), signs, out=jacobian[pair.rows])
+        return jacobian
+
+    def residual_and_jacobian(self, q: Array) -> tuple[Array, Array]:
+        """Return phi (rows,), see `residual`, and J (rows, nv) at q (nq,)."""
+        jacobian = self.jacobian(q)
+        residual = np.empty(self.count)
+        for pair in self.pairs:
+            residual[pair.rows] = _distances(pair, self._apart(pair))
         return residual, jacobian
 
     def _mimic_rows(self, pair: Pair, apart: pin.SE3) -> Array:
@@ -323,7 +325,7 @@ def _of_frame(frame: Carried, columns: Array) -> Array:
 def _tilt(axis: Array, rotation: Array) -> Array:
     """Return the rotation vector (3,) that tilts an axis to the axis rotated by a matrix R."""
     tilted = rotation @ axis
-    across = np.cross(axis, tilted)
+    across = _cross(axis, tilted)
     sine = float(np.linalg.norm(across))
     cosine = float(axis @ tilted)
     if sine < 1e-12 and cosine > 0.0:
@@ -335,3 +337,10 @@ def _tilt(axis: Array, rotation: Array) -> Array:
         sine = float(np.linalg.norm(across))
     vector: Array = angle * across / sine
     return vector
+
+
+def _cross(first: Array, second: Array) -> Array:
+    """Return the cross product of two vectors (3,), faster than `np.cross`."""
+    a, b, c = first.tolist()
+    x, y, z = second.tolist()
+    return np.array((b * z - c * y, c * x - a * z, a * y - b * x))

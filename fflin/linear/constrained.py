@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -53,6 +53,47 @@ class Reduction:
     M: Array
 
 
+class _Motions(NamedTuple):
+    """Motions of unit kinetic energy that the constraints permit, in the coordinates of Z."""
+
+    positions: Array  # (6 + n, d)
+    rates: Array  # (6 + n, d)
+    lower: Array  # (6 + n, d) rates per displacement of the positions
+    size: Array  # (6 + n,) square root of the inertia of each coordinate
+
+    def best(self) -> Indices:
+        """Return the indices (d,) of the coordinates that determine the motion best."""
+        from scipy.linalg import qr
+
+        weighted = self.size[:, None] * self.rates
+        order = 1.0 - _LESS * np.arange(len(self.size))
+        pivots = qr((order[:, None] * weighted).T, mode="r", pivoting=True)[1]
+        best: Indices = np.sort(pivots[: self.rates.shape[1]])
+        return best
+
+    def least(self, picked: Indices) -> float:
+        """Return how well coordinates determine the motion, from 0 to 1."""
+        if not len(picked):
+            return 1.0
+        parts = self.size[picked, None] * np.array(
+            (self.rates[picked], self.positions[picked])
+        )
+        return float(np.linalg.svd(parts)[1].min())
+
+    def reduction(self, picked: Indices) -> Reduction:
+        """Return the reduction to the coordinates with given indices."""
+        nv, d = self.rates.shape
+        first = np.linalg.inv(self.positions[picked])
+        second = np.linalg.inv(self.rates[picked])
+        lower = (self.lower - self.rates @ second @ self.lower[picked]) @ first
+        T = np.zeros((2 * nv, 2 * d))
+        T[:nv, :d], T[nv:, :d] = self.positions @ first, lower
+        T[nv:, d:] = self.rates @ second
+        kept = np.concatenate((picked, picked + nv))
+        T[kept] = np.eye(2 * d)
+        return Reduction(kept, T, second.T @ second)
+
+
 class Reducer:
     """Choice of independent coordinates of one robot, and reduction of its models to them.
 
@@ -90,6 +131,20 @@ class Reducer:
         self, chart: Chart, q: Array, v: Array, nu: Array, space: TangentSpace
     ) -> Reduction:
         """Return the reduction at a point; `nu` is v in state order."""
+        motions = self._motions(chart, q, v, nu, space)
+        return motions.reduction(self._independent(motions))
+
+    def local_reduction(
+        self, chart: Chart, q: Array, v: Array, nu: Array, space: TangentSpace
+    ) -> Reduction:
+        """Return the reduction to the coordinates that are the best choice at this point."""
+        motions = self._motions(chart, q, v, nu, space)
+        return motions.reduction(motions.best())
+
+    def _motions(
+        self, chart: Chart, q: Array, v: Array, nu: Array, space: TangentSpace
+    ) -> _Motions:
+        """Return the motions at a point that the constraints permit."""
         state = self._state
         M = state.project(pin.crba(state.robot.model, self._data, q).T)
         G = space.basis
@@ -98,21 +153,13 @@ class Reducer:
         Y = np.zeros_like(G)
         if v.any():
             Y = -self._turning(space, q, v) @ G
-        positions, rates = by_position @ G, by_rate @ G
         in_frame = by_rate @ M @ by_rate.T
-        size = np.sqrt(in_frame.diagonal())
-        picked = self._independent(size, positions, rates)
-        first = np.linalg.inv(positions[picked])
-        second = np.linalg.inv(rates[picked])
-        lower = mixed @ G + by_rate @ Y
-        lower = (lower - rates @ second @ lower[picked]) @ first
-        nv, d = len(M), len(picked)
-        T = np.zeros((2 * nv, 2 * d))
-        T[:nv, :d], T[nv:, :d] = positions @ first, lower
-        T[nv:, d:] = rates @ second
-        T[np.concatenate((picked, picked + nv))] = np.eye(2 * d)
-        kept = np.concatenate((picked, picked + nv))
-        return Reduction(kept, T, second.T @ second)
+        return _Motions(
+            positions=by_position @ G,
+            rates=by_rate @ G,
+            lower=mixed @ G + by_rate @ Y,
+            size=np.sqrt(in_frame.diagonal()),
+        )
 
     def _coordinates(self, chart: Chart, nu: Array) -> tuple[Array, Array, Array]:
         """Return the blocks of Z: of positions, of rates, and of rates by positions."""
@@ -137,20 +184,11 @@ class Reducer:
         solved: Array = np.linalg.pinv(space.rows) @ space.selected @ by_q
         return solved
 
-    def _independent(self, size: Array, positions: Array, rates: Array) -> Indices:
-        """Return the indices (d,) of the independent coordinates.
-
-        `positions` and `rates` (6 + n, d) are the motions of unit kinetic energy, and `size` is
-        the square root of the inertia of each coordinate.
-        """
-        from scipy.linalg import qr
-
-        count = positions.shape[1]
-        weighted = size[:, None] * rates
+    def _independent(self, motions: _Motions) -> Indices:
+        """Return the indices (d,) of the independent coordinates."""
+        count = motions.rates.shape[1]
         if self._picked is None and self.given is None:
-            order = 1.0 - _LESS * np.arange(len(size))
-            pivots = qr((order[:, None] * weighted).T, mode="r", pivoting=True)[1]
-            self._picked = np.sort(pivots[:count])
+            self._picked = motions.best()
         elif self._picked is None:
             self._picked = self._named(count)
         picked = self._picked
@@ -159,11 +197,7 @@ class Reducer:
                 f"{count} coordinates are independent at this point, but {len(picked)} were chosen "
                 "at the first point; linearise the points separately"
             )
-        least = 1.0
-        if count:
-            parts = (weighted[picked], size[picked, None] * positions[picked])
-            least = min(float(np.linalg.svd(x)[1][-1]) for x in parts)
-        if least < _INDEPENDENT:
+        if motions.least(picked) < _INDEPENDENT:
             names = listed(self._state.names[i] for i in picked)
             raise ConstraintError(
                 f"the coordinates {names} do not determine the motion at this point; give other "

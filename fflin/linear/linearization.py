@@ -21,7 +21,7 @@ from fflin.dynamics.rnea import AccelerationDerivatives, Accelerations, Turning
 from fflin.dynamics.state import Actuation, StateMap
 from fflin.linear.aba_route import inertia_matrix
 from fflin.linear.check import certify
-from fflin.linear.constrained import Reducer, reduced_fields
+from fflin.linear.constrained import Reducer, Reduction, reduced_fields
 from fflin.linear.constrained_rest import RestSolver
 from fflin.linear.files import given
 from fflin.linear.model import LinearModel
@@ -407,6 +407,30 @@ class Linearizer:
         return make, (self.robot,)
 
     def _anywhere(self, q: Array, v: Array, u: Array, t: float) -> LinearModel:
+        state = self.prepared.map
+        chart, made = self._in_all_states(q, v, u, t)
+        time = {"t": t} if state.varying else {}
+        contact = self._accelerations.contact
+        if self._reducer is not None and contact is not None:
+            whole = LinearModel(self._fields | made)
+            nu = state.velocities(v)
+            reduction = self._reducer.reduction(chart, q, v, nu, contact.space)
+            fields = reduced_fields(state, reduction, whole)
+            if self._rest is not None and self._rest.waits:
+                self._rest.choose(reduction.kept, q, self._fields | self._reducer.names)
+            return LinearModel(
+                {**self._fields, "_computed": {}, **made, **fields}
+                | {"_inertia": partial(given, frozen(reduction.M))},
+                **time,
+            )
+        if state.varying:
+            return LinearModel(self._fields | made, t=t)
+        return LinearModel(self._fields | made)
+
+    def _in_all_states(
+        self, q: Array, v: Array, u: Array, t: float
+    ) -> tuple[Chart, dict[str, Array]]:
+        """Return the chart at a point, and the arrays of the model in all states of the robot."""
         ready, lower = self.prepared, self._lower
         state, actuation = ready.map, ready.actuation
         state.move_to(t)
@@ -449,22 +473,30 @@ class Linearizer:
         made = {"A": A, "B": B, "q": q, "v": v, "u0": u, self._rate: rate} | seen
         for array in made.values():
             array.setflags(write=False)
-        time = {"t": t} if state.varying else {}
-        contact = self._accelerations.contact
-        if self._reducer is not None and contact is not None:
-            whole = LinearModel(self._fields | made)
-            reduction = self._reducer.reduction(chart, q, v, nu, contact.space)
-            fields = reduced_fields(state, reduction, whole)
-            if self._rest is not None and self._rest.waits:
-                self._rest.choose(reduction.kept, q, self._fields | self._reducer.names)
-            return LinearModel(
-                {**self._fields, "_computed": {}, **made, **fields}
-                | {"_inertia": partial(given, frozen(reduction.M))},
-                **time,
-            )
-        if state.varying:
-            return LinearModel(self._fields | made, t=t)
-        return LinearModel(self._fields | made)
+        return chart, made
+
+    def tangent_along(self, q: Array, v: Array, u: Array) -> tuple[Array, Array]:
+        """Return A (N, nx, nx) and B (N, nx, nu) in all nx states, about N closed points.
+
+        A maps errors on the manifold of the constraints to their rates.
+        """
+        A = np.empty((len(q), *self.prepared.rest["A"].shape))
+        B = np.empty((len(q), *self._shape_B))
+        with self._lock:
+            for k, point in enumerate(zip(q, v, u, strict=True)):
+                _, made = self._in_all_states(*point, 0.0)
+                A[k], B[k] = made["A"], made["B"]
+        return A, B
+
+    def local_reduction(self, q: Array, v: Array) -> Reduction:
+        """Return the reduction to the best choice of coordinates at a closed point."""
+        assert self._closure is not None
+        assert self._reducer is not None
+        state = self.prepared.map
+        with self._lock:
+            space = self._closure.tangent(q)
+            nu = state.velocities(v)
+            return self._reducer.local_reduction(_REFERENCE_CHART, q, v, nu, space)
 
     def along(
         self, q: Array, v: Array, u: Array, t: Array | None = None
