@@ -71,6 +71,10 @@ def plan(
     and `print` shows them. If the plan is not stationary, a warning states how large the gradient
     of the effort still is, relative to the gradient without the goal and the limits.
 
+    If the robot has constraints, start and goal must be closed, see `closed`. The search uses
+    independent coordinates at each knot, and each knot of the plan is closed. States in `free` may
+    still follow from the other states.
+
     The base may rotate by any angle, including full turns if the angular rates at both ends require
     them. Continuous joints take the shorter direction.
 
@@ -118,7 +122,8 @@ def plan(
         By default, the search begins at a cubic curve from the start to the goal. If all inputs are
         joint torques, the system is nonholonomic, and the base reaches most attitudes only if the
         joints move in loops. Then the search begins at loops of the joints that rotate the base to
-        the attitude of the goal. The loops stay within the limits of the joints if possible.
+        the attitude of the goal. The loops stay within the limits of the joints if possible. If the
+        robot has constraints, the search always begins at the cubic curve, closed at the knots.
     progress : bool, optional
         Whether to show the iteration, the cost relative to the initial guess, and the largest
         violation on stderr. By default, they are shown for long runs if stderr is a terminal.
@@ -135,6 +140,9 @@ def plan(
         If an argument has a wrong size or value, the start or goal is outside a limit, or no motion
         to the goal within the limits is found. The message states by how much the last trial misses
         the goal or exceeds a limit. A feasible motion may exist even if none is found.
+    ConstraintError
+        If the start or the goal violates a constraint of the robot, or the motion at which the
+        search begins cannot be closed.
     MissingPackageError
         If PIQP is not installed.
     UnknownNameError

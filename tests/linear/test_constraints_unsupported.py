@@ -33,7 +33,6 @@ CALLS = {
     "linearize_orbit": lambda robot, _: fflin.linearize_orbit(
         robot.replace(orbit=500e3)
     ),
-    "plan": lambda robot, _: fflin.plan(robot, {}, duration=10.0),
     "relative_equilibria": lambda robot, _: fflin.relative_equilibria(robot),
     "sensitivity": lambda _, lin: fflin.sensitivity(lin),
     "to": lambda _, lin: lin.to("mujoco"),
