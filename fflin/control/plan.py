@@ -209,6 +209,7 @@ def plan(
             shooting,
             start,
             end,
+            asked,
             determining,
             bounds,
             inputs,
@@ -218,7 +219,7 @@ def plan(
             line.say,
         )
         first = initial_guess(shooting, guess, start, end, asked, bounds, weights)
-        made = _least(search, first, asked)
+        made = _least(search, first)
     if made.reached:
         q, v, u = made.q, made.v, made.u
         if asked.all():
@@ -315,8 +316,7 @@ def _knot_weights(shooting: Shooting) -> Array:
 def _least(search: Search, guess: tuple[Array, Array, Array], asked: Mask) -> _Made:
     """Search for a plan of least effort in up to two attempts, and return the better attempt.
 
-    The search begins at the knots q, v and the inputs u of the guess. `asked` (nx,) is True for all
-    states whose value at the end is prescribed.
+    The search begins at the knots q, v and the inputs u of the guess.
 
     An attempt that reaches the goal is better than an attempt that does not. If both or neither
     reach the goal, the attempt with the smaller violation is better.
@@ -339,7 +339,7 @@ def _least(search: Search, guess: tuple[Array, Array, Array], asked: Mask) -> _M
         if shooting.held:
             # the last row repeats the input of the last interval
             u = np.vstack((u[:-1], u[-2]))
-        missed = np.abs(shooting.between((q[-1], v[-1]), search.end)) * asked
+        missed = np.abs(shooting.between((q[-1], v[-1]), search.end)) * search.asked
         within = shooting.inside(shooting.motions(q, v, u), _PARTS)
         beyond = excess(bounds[:, None, None] - within)
         beyond /= np.where(search.size > 0.0, search.size, 1.0)

@@ -83,9 +83,9 @@ def test_a_plan_leaves_open_what_the_constraints_do_not_determine(door):
 
 def test_a_start_or_goal_that_violates_a_constraint_is_refused(door):
     apart = fflin.configuration(door, base=at(x=0.1))
-    with any_wording(), pytest.raises(fflin.ConstraintError, match="goal.*edge"):
+    with any_wording(), pytest.raises(fflin.ConstraintError, match=r"goal.*edge"):
         fflin.plan(door, (apart, None), 4.0, q0=door.neutral())
-    with any_wording(), pytest.raises(fflin.ConstraintError, match="start.*edge"):
+    with any_wording(), pytest.raises(fflin.ConstraintError, match=r"start.*edge"):
         fflin.plan(door, (opened(door, 1.0), None), 4.0, q0=apart)
 
 

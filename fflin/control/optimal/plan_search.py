@@ -136,6 +136,7 @@ class Search(NamedTuple):
     start: Point
     end: Point
     asked: Mask  # states whose value at the end is prescribed (nx,)
+    determining: Mask  # prescribed states (nx,) that determine all of them near the end
     bounds: Array  # limits of states (2, nx)
     limits: Array  # limits of inputs (2, nu)
     size: Array  # magnitudes of the limits of states (nx,), 0 for states without limits
@@ -339,7 +340,8 @@ class Search(NamedTuple):
         knots[0, 0] = -np.inf
         knots[1, 0] = np.inf
         to_end = shooting.between((q[-1], v[-1]), self.end)
-        knots[:, -1, self.asked] = np.clip(to_end, *knots[:, -1])[self.asked]
+        goal = self.determining
+        knots[:, -1, goal] = np.clip(to_end, *knots[:, -1])[goal]
         tighter = self.bounds + _TIGHTER * np.array((self.size, -self.size))
         inside = tighter[:, None, None] - shooting.inside(motions, self.parts)[:, :-1]
         return Trial(q, v, u, shooting.missed(q, v, motions), knots, inside)
