@@ -313,7 +313,7 @@ def _knot_weights(shooting: Shooting) -> Array:
     return weights
 
 
-def _least(search: Search, guess: tuple[Array, Array, Array], asked: Mask) -> _Made:
+def _least(search: Search, guess: tuple[Array, Array, Array]) -> _Made:
     """Search for a plan of least effort in up to two attempts, and return the better attempt.
 
     The search begins at the knots q, v and the inputs u of the guess.
