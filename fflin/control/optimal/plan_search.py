@@ -361,7 +361,7 @@ class Search(NamedTuple):
         try:
             charts = self.shooting.charts(trial.q, trial.v)
             ends, inside = self.shooting.jacobians(
-                trial.q, trial.v, trial.u, charts, self.parts
+                trial.q, trial.v, trial.u, self.parts, charts
             )
         except (InputError, np.linalg.LinAlgError):  # the motion has diverged
             return None

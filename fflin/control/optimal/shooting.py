@@ -217,7 +217,12 @@ class Shooting:
                 break
 
     def jacobians(
-        self, q: Array, v: Array, u: Array, charts: Charts, parts: int = 1
+        self,
+        q: Array,
+        v: Array,
+        u: Array,
+        parts: int = 1,
+        charts: Charts | None = None,
     ) -> tuple[Array, Array]:
         """Return the Jacobians of the interval ends, and of points within the intervals.
 
@@ -234,6 +239,8 @@ class Shooting:
         N = len(self.h)
         nx = len(self._size)
         nu = u.shape[1]
+        if charts is None:
+            charts = self.charts(q, v)
         nz = charts.kept.shape[1]
         steps = min(self.steps // 4, _MOST_OF_JACOBIANS)
         stages = 2 * steps + 1  # of an interval; neighbouring steps share a stage
