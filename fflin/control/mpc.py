@@ -35,7 +35,7 @@ from fflin.control.policies import Deviation, Feedback, OutputSensing, StateFeed
 from fflin.control.policy import BoundLaw, Command, Noise
 from fflin.control.tracking import TrajectoryFeedback
 from fflin.control.trajectory_end import rest_or_fall, steady_regulator
-from fflin.control.tvlqr import asks_steady, held_stages, tvlqr
+from fflin.control.tvlqr import StateCost, asks_steady, held_stages, tvlqr
 from fflin.control.weights import Rule, Weight, sampled_cost, warn_of_integral, weight
 from fflin.dynamics.outputs import Measuring
 from fflin.dynamics.state import StateMap
@@ -476,8 +476,10 @@ def _along(traj: LinearTrajectory, horizon: Horizon, cost: Cost) -> TrajectoryMp
     """Design the controller along a trajectory; its horizon has no stages yet."""
     Q, R, Qf, weights = cost
     dt = horizon.dt
+    traj.refuse_switches("predictive controllers")
     schedule = tvlqr(traj, Q, R, Qf, dt, weights=weights)
     Q, R = schedule.Q, schedule.R  # with default weights, if none are given
+    state_cost = StateCost(traj, Q, 0)
     state = StateMap(traj.robot, frame="local")
 
     def limited_state(lin: LinearModel, v: Array) -> Array:
@@ -490,8 +492,8 @@ def _along(traj: LinearTrajectory, horizon: Horizon, cost: Cost) -> TrajectoryMp
     stages = list[Stage]()
     # Along the trajectory: sample k ends at knot k + 1.
     follows = TrajectoryFeedback(traj, schedule)
-    models = along(traj.resampled(dt))
-    for k, (total, transition) in enumerate(held_stages(traj, dt, Q, R)):
+    models = along(traj.resampled(dt), traj.partition)
+    for k, (total, transition) in enumerate(held_stages(traj, dt, state_cost, R)):
         K = schedule.K[k]
         P = schedule.P[k + 1]
         lin = models[k + 1]

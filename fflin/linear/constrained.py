@@ -53,7 +53,7 @@ class Reduction:
     M: Array
 
 
-class _Motions(NamedTuple):
+class Motions(NamedTuple):
     """Motions of unit kinetic energy that the constraints permit, in the coordinates of Z."""
 
     positions: Array  # (6 + n, d)
@@ -131,19 +131,15 @@ class Reducer:
         self, chart: Chart, q: Array, v: Array, nu: Array, space: TangentSpace
     ) -> Reduction:
         """Return the reduction at a point; `nu` is v in state order."""
-        motions = self._motions(chart, q, v, nu, space)
+        return self.of_motions(self.motions(chart, q, v, nu, space))
+
+    def of_motions(self, motions: Motions) -> Reduction:
+        """Return the reduction at a point from the motions that the constraints permit there."""
         return motions.reduction(self._independent(motions))
 
-    def local_reduction(
+    def motions(
         self, chart: Chart, q: Array, v: Array, nu: Array, space: TangentSpace
-    ) -> Reduction:
-        """Return the reduction to the coordinates that are the best choice at this point."""
-        motions = self._motions(chart, q, v, nu, space)
-        return motions.reduction(motions.best())
-
-    def _motions(
-        self, chart: Chart, q: Array, v: Array, nu: Array, space: TangentSpace
-    ) -> _Motions:
+    ) -> Motions:
         """Return the motions at a point that the constraints permit."""
         state = self._state
         M = state.project(pin.crba(state.robot.model, self._data, q).T)
@@ -154,7 +150,7 @@ class Reducer:
         if v.any():
             Y = -self._turning(space, q, v) @ G
         in_frame = by_rate @ M @ by_rate.T
-        return _Motions(
+        return Motions(
             positions=by_position @ G,
             rates=by_rate @ G,
             lower=mixed @ G + by_rate @ Y,
@@ -184,7 +180,7 @@ class Reducer:
         solved: Array = np.linalg.pinv(space.rows) @ space.selected @ by_q
         return solved
 
-    def _independent(self, motions: _Motions) -> Indices:
+    def _independent(self, motions: Motions) -> Indices:
         """Return the indices (d,) of the independent coordinates."""
         count = motions.rates.shape[1]
         if self._picked is None and self.given is None:

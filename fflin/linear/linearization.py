@@ -21,7 +21,7 @@ from fflin.dynamics.rnea import AccelerationDerivatives, Accelerations, Turning
 from fflin.dynamics.state import Actuation, StateMap
 from fflin.linear.aba_route import inertia_matrix
 from fflin.linear.check import certify
-from fflin.linear.constrained import Reducer, Reduction, reduced_fields
+from fflin.linear.constrained import Motions, Reducer, Reduction, reduced_fields
 from fflin.linear.constrained_rest import RestSolver
 from fflin.linear.files import given
 from fflin.linear.model import LinearModel
@@ -490,13 +490,22 @@ class Linearizer:
 
     def local_reduction(self, q: Array, v: Array) -> Reduction:
         """Return the reduction to the best choice of coordinates at a closed point."""
+        motions = self.motions(q, v)
+        return motions.reduction(motions.best())
+
+    def reduction(self, q: Array, v: Array) -> Reduction:
+        """Return the reduction to the coordinates of this `Linearizer` at a closed point."""
+        assert self._reducer is not None
+        return self._reducer.of_motions(self.motions(q, v))
+
+    def motions(self, q: Array, v: Array) -> Motions:
+        """Return the motions that the constraints permit at a closed point."""
         assert self._closure is not None
         assert self._reducer is not None
-        state = self.prepared.map
         with self._lock:
             space = self._closure.tangent(q)
-            nu = state.velocities(v)
-            return self._reducer.local_reduction(_REFERENCE_CHART, q, v, nu, space)
+            nu = self.prepared.map.velocities(v)
+            return self._reducer.motions(_REFERENCE_CHART, q, v, nu, space)
 
     def along(
         self, q: Array, v: Array, u: Array, t: Array | None = None
@@ -583,21 +592,18 @@ class Linearizer:
                 point = self.on_constraints(q[index], v[index])
                 with np.errstate(over="ignore", invalid="ignore"):
                     models.append(self._anywhere(*point, u[index], t))
-        self._require_same_side(models, times)
         arrays = {key: np.array([getattr(x, key) for x in models]) for key in "ABCD"}
-        return {**arrays, "y": np.array([model.y0 for model in models])}
+        maps = np.array([model._all_states for model in models])
+        return {**arrays, "y": np.array([model.y0 for model in models]), "T": maps}
 
-    def _require_same_side(self, models: Sequence[LinearModel], times: Array) -> None:
-        """Raise `ConstraintError` if the independent coordinates stop moving between two points.
+    def require_same_side(self, maps: Array, times: Array) -> None:
+        """Raise `ConstraintError` if the independent coordinates stop between two close points.
 
         There, the basis of the velocities that belongs to the coordinates becomes infinite, and
-        changes its orientation.
+        changes its orientation. `maps` (N, nx, 2 d) are the maps T of the points.
         """
-        bases = []
-        for model in models:
-            assert model._all_states is not None
-            nv, d = len(model._all_states) // 2, len(model.A) // 2
-            bases.append(model._all_states[nv:, d:])
+        nv, d = maps.shape[1] // 2, maps.shape[2] // 2
+        bases = maps[:, nv:, d:]
         for index, (before, after) in enumerate(pairwise(bases)):
             if np.linalg.slogdet(before.T @ after)[0] > 0.0:
                 continue

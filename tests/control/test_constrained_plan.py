@@ -132,7 +132,7 @@ def test_two_arms_move_the_target_that_they_hold():
     assert max(off(robot, motion)) < 1e-9
     assert motion.residual.max() < 1e-6
     assert (motion.q[-1] == goal).all() and not motion.v[-1].any()
-    schedule = fflin.tvlqr(fflin.linearize_trajectory(robot, motion), sample=1.0)
+    schedule = fflin.tvlqr(fflin.linearize_trajectory(robot, motion), sample=5.0)
     flown = fflin.simulate(robot, schedule, q0=motion.q[0], engine="python")
     way = pin.difference(robot.model, flown.q[-1], goal)
     assert np.abs(way).max() < 1e-4
