@@ -65,8 +65,8 @@ _SAME_FIELD = 1e-6
 _EPS = float(np.finfo(float).eps)
 _POSITION_ROUNDING, _SUM_ROUNDING = 16.0 * _EPS, 1e3 * _EPS
 
-# Rates [SI units] of a robot with constraints that are below this fraction of the largest rate count
-# as zero.
+# Rates [SI units] of a robot with constraints below this fraction of the largest rate count as
+# zero.
 _HELD = 1e-6
 
 # Largest difference [SI units] between the first and the last state of a periodic motion.
