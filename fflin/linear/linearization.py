@@ -21,7 +21,7 @@ from fflin.dynamics.rnea import AccelerationDerivatives, Accelerations, Turning
 from fflin.dynamics.state import Actuation, StateMap
 from fflin.linear.aba_route import inertia_matrix
 from fflin.linear.check import certify
-from fflin.linear.constrained import Reducer, reduced_fields
+from fflin.linear.constrained import Reducer, independent_states, reduced_fields
 from fflin.linear.constrained_rest import RestSolver
 from fflin.linear.files import given
 from fflin.linear.model import LinearModel
@@ -452,16 +452,21 @@ class Linearizer:
         time = {"t": t} if state.varying else {}
         contact = self._accelerations.contact
         if self._reducer is not None and contact is not None:
-            whole = LinearModel(self._fields | made)
-            reduction = self._reducer.reduction(chart, q, v, nu, contact.space)
-            fields = reduced_fields(state, reduction, whole)
+            reduction = self._reducer.reduction(chart, q, nu, contact)
+            names = self._reducer.names
             if self._rest is not None and self._rest.waits:
-                self._rest.choose(reduction.kept, q, self._fields | self._reducer.names)
-            return LinearModel(
-                {**self._fields, "_computed": {}, **made, **fields}
-                | {"_inertia": partial(given, frozen(reduction.M))},
-                **time,
-            )
+                self._rest.choose(reduction.kept, q, self._fields | names)
+            slow = dict(self._fields["_computed"])
+            slow["x0"] = partial(independent_states, slow["x0"], reduction.kept)
+            fields = {
+                **self._fields,
+                **made,
+                **names,
+                **reduced_fields(reduction, ready.rest | made, made.get("C")),
+                "_computed": slow,
+                "_inertia": partial(given, frozen(reduction.M)),
+            }
+            return LinearModel(fields, **time)
         if state.varying:
             return LinearModel(self._fields | made, t=t)
         return LinearModel(self._fields | made)
