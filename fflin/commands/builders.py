@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from argparse import Namespace
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial, reduce
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import fflin
-from fflin.base.errors import InputError, UnknownNameError, located
+from fflin.base.errors import InputError, UnknownNameError, listed, located
 from fflin.base.names import joints_by_name, rates_by_name
 from fflin.commands import DONE, NO_ORBIT
 
@@ -79,11 +79,9 @@ def load_robot(arguments: Namespace) -> fflin.Robot:
 
     given = {
         name: value
-        for name in ("passive", "gravity", "orbit", "stiffness", "damping")
+        for name in ("passive", "gravity", "stiffness", "damping")
         if (value := getattr(arguments, name, None))
     }
-    if given.get("orbit") == NO_ORBIT:
-        given["orbit"] = None
     # `load` gets `passive` and the damping "urdf", because its warnings depend on them. All other
     # settings in `given` are applied after loading.
     first: dict[str, Any] = {}
@@ -106,6 +104,7 @@ def load_robot(arguments: Namespace) -> fflin.Robot:
                 f"--{name} is given for all joints and for single joints; give only one of them"
             )
         given[name] = for_all[0] if for_all else once(f"--{name}", given[name])
+    given |= _orbit_of(arguments, robot)
     inputs = getattr(arguments, "inputs", None)
     if inputs == "joints" and not robot.n:
         raise InputError(f"--inputs joints: '{robot.name}' has no joints")
@@ -244,6 +243,46 @@ def reference_of(arguments: Namespace) -> pin.SE3 | None:
     if "reference" in arguments and arguments.reference == "world":
         return pin.SE3.Identity()
     return None
+
+
+def _orbit_of(arguments: Namespace, robot: fflin.Robot) -> dict[str, object]:
+    """Return the field `orbit` of the robot; empty if no option changes the orbit.
+
+    --orbit changes the heights, and keeps the magnetic field of the orbit in the robot file.
+    """
+    changes: dict[str, object] = {}
+    for name in ("inclination", "field"):
+        value = getattr(arguments, name, None)
+        if value is not None:
+            changes[name] = None if value == NO_ORBIT else value
+    new = getattr(arguments, "orbit", None)
+    if new is None and not changes:
+        return {}
+    if new == NO_ORBIT:
+        why = "--orbit none removes the orbit, so this has no effect"
+        refuse(arguments, ("inclination", "field"), why)
+        return {"orbit": None}
+    old = robot.orbit
+    if new is None:
+        if old is None:
+            raise InputError(
+                f"'{robot.name}' is not in orbit, so {listed(f'--{name}' for name in changes)} "
+                "has no effect; add --orbit ALTITUDE"
+            )
+        new = _parts_of(old)
+    elif old and old.body == new["body"]:
+        kept = ("inclination", "field", "node_longitude")
+        new = {name: getattr(old, name) for name in kept if hasattr(old, name)} | new
+    return {"orbit": new | changes}
+
+
+def _parts_of(orbit: fflin.CircularOrbit | fflin.EllipticOrbit) -> dict[str, object]:
+    """Return the arguments of the class of an orbit that give the same orbit."""
+    parts = asdict(orbit)
+    # These follow from the altitude and the eccentricity.
+    parts.pop("mean_motion", None)
+    parts.pop("apogee", None)
+    return parts
 
 
 def linear_model(arguments: Namespace) -> tuple[fflin.Robot, fflin.LinearModel]:
@@ -828,9 +867,6 @@ def about_point(
         refuse(
             arguments, of_gain, "--controller replaces the regulator and its options"
         )
-        from fflin.tuning.files import in_time_of
-
-        lin = in_time_of(arguments.controller, lin)
         sign = -1.0 if arguments.negative_feedback else 1.0
         feedback = fflin.LinearController(arguments.controller, lin, sign=sign)
     else:

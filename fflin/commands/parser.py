@@ -257,6 +257,8 @@ FORMS: dict[str, Form] = {
     "grid": many(grid_axis, "JOINT=LO:HI:N"),
     "range": many(joint_range, "JOINT=LO:HI"),
     "orbit": one(orbit, "ALTITUDE|PERIGEE/APOGEE[:BODY]|none"),
+    "inclination": one(number, "I"),
+    "field": one(str, "FIELD"),
     "rpy": _ANGLES,
     "target-rpy": _ANGLES,
     "position": _AXES,

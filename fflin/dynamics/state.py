@@ -634,7 +634,8 @@ def _torquers(state: StateMap) -> list[tuple[int, int, Array]]:
     if torquers and not (state.field and state.field.magnetic):
         raise InputError(
             f"'{robot.name}' has magnetorquers but no magnetic field; give it an orbit with a "
-            "field, such as CircularOrbit(500e3, inclination=1.7, field='dipole')"
+            "field, such as CircularOrbit(500e3, inclination=1.7, field='dipole') or --orbit 500e3 "
+            "--inclination 1.7 --field dipole"
         )
     return torquers
 

@@ -288,6 +288,11 @@ def _following_law(title: str, policy: Following, robot: Robot) -> Law:
     """Convert a law that follows a trajectory, with one row of the tables for each sample."""
     lin = policy.lin
     path = ReferencePath(policy, robot)
+    if len(path.about_point.A) > len(policy.terms.A):
+        raise InputError(
+            f"outputs of '{robot.name}' have a delay, which C code of a law that follows a "
+            "trajectory does not support; export the law without follow, or leave out the delay"
+        )
     times = policy.sample_time * np.arange(policy.samples)
     rows = [path.terms(t) for t in times]
     u0 = np.array([row.u0 for row in rows])

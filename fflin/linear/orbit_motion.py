@@ -109,7 +109,7 @@ def linearize_orbit(
     if getattr(robot, "orbit", None) is None:
         raise InputError(
             f"'{getattr(robot, 'name', robot)}' is not in orbit; give it an orbit by "
-            "robot.replace(orbit=fflin.EllipticOrbit(perigee=..., apogee=...))"
+            "robot.replace(orbit=fflin.EllipticOrbit(perigee=..., apogee=...)) or --orbit"
         )
     assert robot.orbit is not None
     refuse_constraints(robot, "linear models over one orbit")
