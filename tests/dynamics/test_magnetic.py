@@ -370,4 +370,4 @@ def test_a_robot_file_contains_the_disturbance_of_the_field(tmp_path):
     assert robot.orbit.node_longitude == 0.5
     assert robot.disturbance["residual_dipole"][0].values == (0.01, 0.0, 0.02)
     assert robot.disturbance["field_scale"][0].values == (0.1,)
-    assert "0.01, 0, 0.02 A m^2 (base axes)" in " ".join(robot_info(robot))
+    assert "0.01, 0, 0.02 A m^2 (base axes)" in " ".join(robot_info(robot).split())
