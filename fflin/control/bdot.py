@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -151,7 +152,9 @@ class RateDamping(_MagneticLaw):
     _MEASURES_RATE: ClassVar[bool] = True
 
 
-def measured_field(robot: Robot, *, rate: bool) -> Command:
+def measured_field(
+    robot: Robot, *, rate: bool
+) -> Callable[[float, Array, Array], Array]:
     """Return a function of t, q and v for the vectors that a law of the magnetic field measures.
 
     With `rate`, they are the flux density (3,) [T] and the inertial angular velocity (3,) [rad/s],

@@ -594,7 +594,7 @@ def _magnetic_cases(form: BDotForm) -> Iterator[Case]:
                 b = np.zeros(3)
             omega = random.normal(size=3) * 10.0 ** random.uniform(-4, 0)
             y = np.concatenate((b, omega))
-            square = max(b @ b, TINY)
+            square = max(float(b @ b), TINY)
             vector = np.cross(b, omega) / square
             size = np.full(3, norm(b) * norm(omega) / square)
         yield Case(0, y, form.gain @ vector, gains @ size)
