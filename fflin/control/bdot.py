@@ -59,7 +59,7 @@ class _MagneticLaw(Policy):
             if self._MEASURES_RATE:
                 b, omega = np.split(vector, 2)
                 # Without a field, the vector is zero.
-                vector = np.cross(b, omega) / max(b @ b, TINY)
+                vector = np.cross(b, omega) / max(float(b @ b), TINY)
             u: Array = gains @ vector
             return u
 
