@@ -39,6 +39,7 @@ from fflin.commands.builders import (
     tuning_of,
     weights_of,
     with_errors,
+    with_welds,
 )
 
 if TYPE_CHECKING:
@@ -152,8 +153,9 @@ def export(arguments: Namespace) -> Report:
         law, robot = tuned_law(arguments.file, arguments.robot)
     else:
         law = kinds[kind_name].load(arguments.file)
-    if arguments.robot and robot is None:
-        robot = robot_of_design(fflin.load(arguments.robot), None, law)
+    if (arguments.robot or arguments.weld) and robot is None:
+        loaded = with_welds(fflin.load(arguments.robot or law.robot), arguments)
+        robot = robot_of_design(loaded, None, law)
     limits = None if arguments.limits == "none" else arguments.limits
     name, real = arguments.name, arguments.real
     folder = fflin.write_c(

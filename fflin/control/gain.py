@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, NamedTuple, Protocol
@@ -32,7 +33,7 @@ from fflin.control.optimal.riccati import Solution, rates_of
 from fflin.control.policy import Policy, System
 from fflin.dynamics.coordinates import frame_of
 from fflin.dynamics.state import StateMap, selection
-from fflin.linear.fit import require_same
+from fflin.linear.fit import require_same, require_same_constraints
 from fflin.linear.holding import wheel_notes
 from fflin.linear.model import ControlSystem, LinearModel, gain_map, state_space
 from fflin.robot.rotors import SPINNING
@@ -119,6 +120,10 @@ class Gain(ModelDesign):
         x0)``, or ``xi + dt H (x - x0)`` is the next xi of a sampled model.
     urdf_sha256 : str
         SHA-256 of the URDF of the robot that the gain was designed for, see `Robot`.
+    dependent : tuple of str (k,)
+    dependent_x0 : ndarray (k,)
+        For a robot with constraints: the states that the constraints determine, see `LinearModel`,
+        and their values at the operating point. The gain does not feed them back.
 
     Examples
     --------
@@ -153,8 +158,14 @@ class Gain(ModelDesign):
     # Files of earlier versions contain no delay.
     delay: Vector = field(default_factory=partial(np.zeros, 0))
     integrals: tuple[str, ...] = ()
+    dependent: tuple[str, ...] = ()
+    dependent_x0: Vector = field(default_factory=partial(np.zeros, 0))
     # The model for which the gain was designed; saved files do not contain it.
     _lin: LinearModel | None = field(default=None, repr=False, compare=False)
+    # With default weights: returns the gain whose bandwidth is divided by a factor.
+    _slower: Callable[[float], Gain] | None = field(
+        default=None, repr=False, compare=False
+    )
 
     def __post_init__(self) -> None:
         if not self.delay.size:
@@ -167,6 +178,11 @@ class Gain(ModelDesign):
             )
         states = self.regulated or self.state_names
         require_known("state", states, self.state_names)
+        if len(self.dependent) != len(self.dependent_x0):
+            raise InputError(
+                f"dependent_x0 has {len(self.dependent_x0)} values, expected one for each of the "
+                f"{len(self.dependent)} dependent states"
+            )
         if self.state_names[self._size :] != self.integrals:
             raise InputError(
                 f"the last states are not the integrals {listed(self.integrals)}"
@@ -472,12 +488,6 @@ def model_of(gain: Gain, robot: Robot, made: str, reference: pin.SE3) -> LinearM
     """
     from fflin.linear.linearization import linearize
 
-    if robot.constraints:
-        raise InputError(
-            f"'{robot.name}' has constraints, so its gain needs the linear model, which a file of "
-            "a gain does not contain; linearise the robot in Python and use "
-            "fflin.StateFeedback(lin, gain)"
-        )
     states = without_past(gain.model_states)
     if states != gain.model_states and not gain.delay.any():
         raise InputError(
@@ -488,10 +498,44 @@ def model_of(gain: Gain, robot: Robot, made: str, reference: pin.SE3) -> LinearM
     frame = frame_of(robot, gain.frame)
     state = StateMap(robot, reference=reference, frame=frame)
     count = len(states)
+    if robot.constraints or gain.dependent:
+        require_same_constraints(
+            made, robot, states=count, dependent=bool(gain.dependent)
+        )
+        return _constrained_model(gain, state, made)
     require_same(made, state, "state", states, gain.state_units[:count])
     require_same(made, state, "input", gain.input_names, gain.input_units)
     q, v = state.to_pinocchio(gain.x0[:count])
     return linearize(robot, q, v, gain.u0, frame=frame, reference=reference)
+
+
+def _constrained_model(gain: Gain, state: StateMap, made: str) -> LinearModel:
+    """Linearise a robot with constraints about the point of a gain, in the states of the gain.
+
+    Constraints without a placement hold their frames in the pose at this point.
+    """
+    from fflin.linear.linearization import linearize
+
+    states = without_past(gain.model_states)
+    units = dict(zip(states, gain.state_units, strict=False))
+    values = dict(zip(states, gain.x0.tolist(), strict=False))
+    values |= dict(zip(gain.dependent, gain.dependent_x0.tolist(), strict=True))
+    names = [name for name in state.names if name in values]
+    names += [name for name in values if name not in state.names]
+    known = dict(zip(state.names, state.units, strict=True))
+    units_of_all = tuple(units.get(name, known.get(name, "")) for name in names)
+    require_same(made, state, "state", tuple(names), units_of_all)
+    require_same(made, state, "input", gain.input_names, gain.input_units)
+    q, v = state.to_pinocchio(np.array([values[name] for name in state.names]))
+    return linearize(
+        state.robot,
+        q,
+        v,
+        gain.u0,
+        frame=state.frame,
+        reference=state.reference,
+        independent=states[: len(states) // 2],
+    )
 
 
 def sampled_for(gain: Gain, lin: LinearModel) -> LinearModel:
@@ -529,10 +573,17 @@ def make_gain(
     S = selection(part.state_names, lin.state_names)
     more: dict[str, object] = {}
     names: tuple[str, ...] = ()
+    if lin.dependent and lin._robot is not None:
+        state = StateMap(lin._robot, reference=lin.reference, frame=lin.frame)
+        x0 = dict(zip(state.names, state.read(lin.q, lin.v).tolist(), strict=True))
+        more = {
+            "dependent": lin.dependent,
+            "dependent_x0": np.array([x0[name] for name in lin.dependent]),
+        }
     if integrals is not None:
         names = integrals.names
         S = block_diag(S, np.eye(len(names)))
-        more = {
+        more |= {
             "A": integrals.A,
             "B": integrals.B,
             "x0": np.concatenate((lin.x0, np.zeros(len(names)))),

@@ -17,7 +17,7 @@ from fflin.analysis.reduction import regulated_part
 from fflin.base.errors import InputError, StabilizabilityError
 from fflin.base.process import in_one_thread
 from fflin.base.tables import folded
-from fflin.base.validation import Array, Indices, Vector, instance, number
+from fflin.base.validation import Array, Indices, Mask, Vector, instance, number
 from fflin.control.default_weights import pace_along
 from fflin.control.gain import ModelDesign
 from fflin.control.optimal import differential_riccati as riccati
@@ -142,9 +142,10 @@ class GainSchedule(Schedule):
         Description of the rule that set the weights.
     period : float
         Time [s] after which the gains repeat; 0 if they do not repeat.
-    loop_multipliers : ndarray (nx,)
+    loop_multipliers : ndarray (k,)
         Magnitudes of the characteristic multipliers of the closed loop over one period, the largest
-        first; empty if the gains do not repeat.
+        first; empty if the gains do not repeat. States that are not regulated are left out, unless
+        the regulated states depend on them.
     switches, switched_names
         Times [s] at which the independent coordinates of a robot with constraints change, and the
         names of the states after each change, as in `LinearTrajectory`. K, P, A and B are in the
@@ -186,7 +187,10 @@ class GainSchedule(Schedule):
         if self.period:
             lines.append(f"repeats after {self.period:.6g} s")
             if self.loop_multipliers.size:
-                lines[-1] += f"; closed loop: {multiplier_text(self.loop_multipliers)}"
+                loop = "closed loop"
+                if len(self.loop_multipliers) < len(self.state_names):
+                    loop = "closed loop of the regulated states"
+                lines[-1] += f"; {loop}: {multiplier_text(self.loop_multipliers)}"
         lines += self.partition.remarks()
         return folded(lines)
 
@@ -484,7 +488,7 @@ def tvlqr(
         )
     Q, R, _ = cost_weights(traj, Q, R, None)
     if periodic:
-        Q, left_out = _of_regulated(traj, Q)
+        Q, regulated, left_out = _of_regulated(traj, Q)
         rule += left_out
     cost = StateCost(traj, Q, about)
     at_end: Array = np.zeros_like(Q)  # replaced by the periodic solution
@@ -509,12 +513,14 @@ def tvlqr(
             K = np.concatenate((gains[::-1], gains[:1]))
             A, B = np.split(np.array([whole for _, whole in stages]), [len(Q)], axis=2)
             if periodic:
-                multipliers = loop_multipliers(A - B @ K[:-1])
+                multipliers = loop_multipliers(A - B @ K[:-1], regulated)
         else:
             if periodic:
                 t, P, maps = _periodic_back(traj, lambda times: at(times, 0))
                 at_end = P[-1]
-                multipliers = loop_multipliers(periodic_riccati.loop_factors(maps, P))
+                multipliers = loop_multipliers(
+                    periodic_riccati.loop_factors(maps, P), regulated
+                )
                 A, B = traj.matrices_at(t)
             else:
                 t, P, A, B = _solved_back(traj, at, at_end)
@@ -662,8 +668,11 @@ def asks_periodic(value: object, traj: LinearTrajectory, name: str = "Qf") -> bo
     return periodic
 
 
-def _of_regulated(traj: LinearTrajectory, Q: Array) -> tuple[Array, str]:
-    """Return Q with zero weight for states that are not regulated, and a text that names them."""
+def _of_regulated(traj: LinearTrajectory, Q: Array) -> tuple[Array, Mask, str]:
+    """Return Q with zero weight for states that are not regulated.
+
+    Further results are the mask (nx,) of the regulated states, and a text that names the others.
+    """
     lin = traj[0]
     kept = regulated_part(lin, None).state_names
     left_out = [name for name in lin.state_names if name not in kept]
@@ -671,8 +680,9 @@ def _of_regulated(traj: LinearTrajectory, Q: Array) -> tuple[Array, str]:
     Q = Q.copy()
     Q[rows] = 0.0
     Q[:, rows] = 0.0
+    regulated = np.array([name in kept for name in lin.state_names])
     text = f"; not regulated: {', '.join(left_out)}" if left_out else ""
-    return Q, text
+    return Q, regulated, text
 
 
 def periodic_end(
@@ -691,9 +701,12 @@ def periodic_end(
         )
 
 
-# Largest multiplier of a loop that counts as stable. States that are not regulated have the
+# Largest multiplier of a loop that counts as stable. States that are not regulated may have the
 # multiplier 1, with rounding errors.
 _LARGEST_MULTIPLIER = 1.001
+
+# Entries of transition matrices below this fraction of the largest one are rounding errors.
+_UNCOUPLED = 1e-12
 
 _UNSTABLE = "give other inputs, or zero weights for states that the inputs cannot hold"
 
@@ -760,8 +773,16 @@ def _swept(maps: Array, P: Array) -> Array:
     return np.array(values[::-1])
 
 
-def loop_multipliers(factors: Array) -> Array:
-    """Return the magnitudes (nx,) of the multipliers of a closed loop, the largest first."""
+def loop_multipliers(factors: Array, regulated: Mask) -> Array:
+    """Return the magnitudes (k,) of the multipliers of a closed loop, the largest first.
+
+    `factors` (N, nx, nx) are transition matrices, and `regulated` (nx,) marks the regulated states.
+    If these do not depend on the other states, the multipliers of the other states are left out.
+    """
+    inside = factors[:, regulated][:, :, regulated]
+    coupling = np.abs(factors[:, regulated][:, :, ~regulated]).max(initial=0.0)
+    if coupling <= _UNCOUPLED * np.abs(inside).max(initial=0.0):
+        factors = inside
     size: Array = np.sort(np.abs(multipliers_of(factors)))[::-1]
     return size
 

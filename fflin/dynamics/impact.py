@@ -1,6 +1,6 @@
 """Impacts: sudden changes of a robot by a grasp or a jammed joint, and the new velocities."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -11,10 +11,14 @@ from fflin.base.errors import InputError
 from fflin.base.tables import folded
 from fflin.base.validation import Array, FrozenArrays, dimension, instance, vector
 from fflin.base.validation import placement as checked_placement
-from fflin.dynamics.coordinates import refuse_constraints, refuse_elliptic
+from fflin.dynamics.closure import Closure
+from fflin.dynamics.constraints import Constraints
+from fflin.dynamics.coordinates import refuse_elliptic
 from fflin.dynamics.state import StateMap
+from fflin.robot.constraints import Constraint, checked_constraints
 from fflin.robot.joints import ROOT, by_joint, find_frame
 from fflin.robot.loading import body_alone
+from fflin.robot.outputs import ConstraintForce
 from fflin.robot.robot import Robot
 from fflin.robot.welding import joined, welded
 
@@ -38,7 +42,8 @@ class Impact(FrozenArrays):
         Total momentum before the impact: linear [N s], then angular [N m s] about the world's
         origin.
     momentum_after : ndarray (6,)
-        Total momentum after the impact, equal to `momentum` to machine precision.
+        Total momentum after the impact, equal to `momentum` to machine precision, unless a
+        constraint holds a frame in inertial space.
     event : str
         Short description of the event.
 
@@ -98,6 +103,10 @@ def jam(
     impact. G is the Jacobian that maps velocities of the jammed robot to velocities of the robot
     before the impact. Linear and angular momentum are conserved.
 
+    The constraints of the robot remain closed during the impact. If one of them holds a frame in
+    inertial space, its impulse changes the momentum. A constraint is removed if its frames are on
+    one body after the impact, because all joints of its loop are jammed.
+
     If a motor fails but its joint still moves freely, use ``robot.replace(passive=[joint])``
     instead of `jam`.
 
@@ -116,6 +125,8 @@ def jam(
 
     Raises
     ------
+    ConstraintError
+        If q or v violates a constraint of the robot.
     UnknownNameError
         If a name or pattern in `joints` matches no joint.
     InputError
@@ -137,7 +148,6 @@ def jam(
     (('joint_2', 'joint_3'), True)
     """
     state = StateMap(robot)
-    refuse_constraints(robot, "impacts of jammed joints")
     keys = [joints] if isinstance(joints, str) else joints
     if (
         not isinstance(keys, Sequence)
@@ -155,23 +165,75 @@ def jam(
         )
     q = robot.neutral() if q is None else robot.checked_configuration(q)
     v = np.zeros(robot.nv) if v is None else robot.checked_velocity(v)
+    if robot.constraints:
+        q, v = on_constraints(robot, q, v)
     at = {name: robot.joint(name).value(q) for name in named}
-    left = welded(robot, at)
-    hit = struck(left, [(robot, q, v)], "", f"{', '.join(at)} jammed")
+    looping = _without_rigid_loops(robot, at) if robot.constraints else robot
+    left = welded(looping, at)
+    hit, forces = struck(left, [(robot, q, v)], "", f"{', '.join(at)} jammed")
     stopped = [6 + robot.joint_names.index(name) for name in at]
+    change = -hit.impulse
+    if left.constraints:
+        change -= Constraints(looping).jacobian(q).T @ forces
     units = tuple(f"{robot.joint(name).force_unit} s" for name in at)
-    return replace(hit, impulse=-state.forces(hit.impulse)[stopped], _units=units)
+    return replace(hit, impulse=state.forces(change)[stopped], _units=units)
+
+
+def on_constraints(robot: Robot, q: Array, v: Array) -> tuple[Array, Array]:
+    """Return q (nq,) and v (nv,) on the constraints of a robot, or raise `ConstraintError`."""
+    closure = Closure(StateMap(robot))
+    q = closure.configuration(q)
+    return q, closure.velocity(q, v)
+
+
+def impulses_of(closure: Closure, forces: Array) -> list[Array]:
+    """Return the impulse (6,) on the frame of each constraint from the impulses of the rows."""
+    return [pair.selected.T @ forces[pair.rows] for pair in closure.constraints.pairs]
+
+
+def _without_rigid_loops(robot: Robot, stopped: Collection[str]) -> Robot:
+    """Return the robot without constraints whose frames are on one body if joints are stopped.
+
+    The result has no chosen independent coordinates, because fewer of them remain.
+    """
+    rigid = []
+    for item in robot.constraints:
+        if item.to is None:
+            continue
+        paths = [
+            set(robot.model.supports[find_frame(robot.model, name).joint])
+            for name in item.frames
+        ]
+        between = paths[0] ^ paths[1]
+        if all(_is_stopped(robot, index, stopped) for index in between):
+            rigid.append(item.title)
+    kept = tuple(item for item in robot.constraints if item.title not in rigid)
+    outputs = tuple(
+        output
+        for output in robot.outputs
+        if not (isinstance(output, ConstraintForce) and output.name in rigid)
+    )
+    return replace(robot, constraints=kept, outputs=outputs, independent=())
+
+
+def _is_stopped(robot: Robot, index: int, stopped: Collection[str]) -> bool:
+    """Return whether the joint with a Pinocchio index is stopped, or follows a stopped joint."""
+    name = robot.model.names[index]
+    leaders = {x.joint.name: x.leader.name for x in robot.followers}
+    return leaders.get(name, name) in stopped
 
 
 def struck(
     whole: Robot, parts: Sequence[tuple[Robot, Array, Array]], prefix: str, event: str
-) -> Impact:
+) -> tuple[Impact, Array]:
     """Return the impact that turns the robots in `parts` into the robot `whole`.
 
     Each part is (robot, q, v), with q and v just before the impact. The velocity just after the
     impact solves (13.1). For each part, the `impulse` of the result contains the vector
     M (v_before - v_after) in Pinocchio's order, which is minus the generalised impulse on the part.
     In `whole`, the joint names of the second part begin with `prefix`.
+
+    The second result is the impulse (rows,) of each row of the constraints of `whole`.
     """
     state = StateMap(whole)
     q = whole.neutral()
@@ -199,11 +261,19 @@ def struck(
             rows[:6] = pin.computeFrameJacobian(whole.model, data, q, frame, local)
         at += robot.nv
     spread = np.eye(whole.nv) if state.S is None else state.S
-    G = G @ spread
-    before = np.concatenate([own_v for *_, own_v in parts])
-    nu = np.linalg.solve(G.T @ M @ G, G.T @ (M @ before))
-    jump, v = before - G @ nu, spread @ nu
-    return Impact(
+    reduced = G @ spread
+    before: Array = np.concatenate([own_v for *_, own_v in parts])
+    momenta = reduced.T @ (M @ before)
+    v: Array = spread @ np.linalg.solve(reduced.T @ M @ reduced, momenta)
+    forces: Array = np.zeros(0)
+    if whole.constraints:
+        # Two orthogonal projections, the second on a part of the space of the first, are one
+        # projection on that part.
+        closure = Closure(state)
+        q = closure.configuration(q)
+        v, forces = closure.after_impact(q, v)
+    jump = before - G @ v
+    hit = Impact(
         robot=whole,
         q=q,
         v=v,
@@ -214,6 +284,7 @@ def struck(
         event=event,
         _before=parts[0],
     )
+    return hit, forces
 
 
 def inertia_at(robot: Robot, q: Array) -> Array:
@@ -243,9 +314,11 @@ class Capture(Impact):
 
     Attributes
     ----------
-    impulse : ndarray (6,)
-        Impulse of the payload on the robot, in the axes of the payload's frame: linear [N s], then
-        angular [N m s] about the origin of this frame.
+    impulse : ndarray (6 + 6 k,)
+        Impulse of the payload on the robot at the grasp, in the axes of the payload's frame: linear
+        [N s], then angular [N m s] about the origin of this frame. Then follows the impulse (6,) on
+        the `frame` of each of the k constraints in `hold`, as in `latch`. If constraints are
+        redundant, these impulses are not determinate, and the smallest ones are returned.
     payload : Robot
         The grasped payload as a separate robot. The configuration and velocity of the payload just
         before the impact are ``payload_q`` (nq,) and ``payload_v`` (nv,).
@@ -270,7 +343,7 @@ class Capture(Impact):
     @property
     def told(self) -> str:
         """One-line summary of the event, its impulse and the lost energy."""
-        force, torque = (np.linalg.norm(half) for half in np.split(self.impulse, 2))
+        force, torque = (np.linalg.norm(half) for half in np.split(self.impulse[:6], 2))
         return (
             f"{self.event}: impulse at the grasp {force:.4g} N s and {torque:.4g} N m s, "
             f"{self.energy_lost:.4g} J lost"
@@ -288,6 +361,7 @@ def capture(
     payload_q: Array | None = None,
     payload_v: Array | None = None,
     prefix: str = "payload",
+    hold: Constraint | Sequence[Constraint] = (),
 ) -> Capture:
     r"""Grasp a payload rigidly, instantly and permanently.
 
@@ -302,6 +376,10 @@ def capture(
     The solution projects the velocities just before the impact onto the motions that the rigid
     grasp permits. The projection is orthogonal with respect to the inertia matrix. The impact
     conserves linear and angular momentum.
+
+    The constraints of the robot and of a payload remain closed during the impact, and so do the
+    constraints in `hold`. Constraints of the payload are named PREFIX.NAME. If a constraint holds a
+    frame in inertial space, its impulse changes the momentum.
 
     Parameters
     ----------
@@ -325,6 +403,10 @@ def capture(
         The remaining entries are the joint rates of the payload.
     prefix : str
         Name of the payload's frame. The payload's joints and links are named PREFIX.NAME.
+    hold : Weld, Hinge, Spherical, or a sequence of them, optional
+        Constraints that close at the instant of the grasp, for example a second gripper or a latch.
+        They connect frames of the combined robot, such as `prefix` and PREFIX.NAME of the payload.
+        A constraint without a placement holds its frames in the pose that they have at q.
 
     Returns
     -------
@@ -334,6 +416,9 @@ def capture(
     ------
     UnknownNameError
         If the robot has no frame with the given name.
+    ConstraintError
+        If q, v or the payload violates a constraint, or the frames of `hold` are too far from their
+        placement.
     InputError
         If one of these conditions is true:
 
@@ -341,7 +426,6 @@ def capture(
         - the payload's inertia is not physically realisable;
         - the robot already has names with this prefix;
         - robot and payload have different gravity or orbits;
-        - robot or payload has constraints;
         - a wheel of the payload has momentum but no inertia.
     ModelError
         If the Pinocchio model of the robot or of the payload was modified after its creation.
@@ -361,7 +445,6 @@ def capture(
     (3, True)
     """
     instance("robot", robot, Robot, "a fflin.Robot").require_unchanged()
-    refuse_constraints(robot, "captures")
     refuse_elliptic(robot, "captures")
     if isinstance(payload, pin.Inertia):
         alone = body_alone(payload, prefix)
@@ -372,7 +455,6 @@ def capture(
         ).require_unchanged()
         # a copy, since the payload may be the same object as the robot
         other = replace(payload)
-        refuse_constraints(other, "payloads")
         _require_same_environment(robot, other)
     if other.stored_momentum:
         raise InputError(
@@ -386,17 +468,89 @@ def capture(
     )
     q = robot.neutral() if q is None else robot.checked_configuration(q)
     v = np.zeros(robot.nv) if v is None else robot.checked_velocity(v)
-    whole = joined(robot, frame, other, at, prefix)
+    holding = checked_constraints(hold)
+    if robot.constraints:
+        q, v = on_constraints(robot, q, v)
     joint, on = find_frame(robot.model, frame)
     data = robot.create_data()
     pin.forwardKinematics(robot.model, data, q)
     other_q, other_v = _beside(other, data.oMi[joint] * on * at, payload_q, payload_v)
+    if other.constraints:
+        other_q, other_v = on_constraints(other, other_q, other_v)
+    whole = _held(joined(robot, frame, other, at, prefix), other, prefix, holding)
     parts = [(robot, q, v), (other, other_q, other_v)]
-    hit = struck(whole, parts, prefix, f"{prefix} of {other.mass:.6g} kg caught")
-    of_impact = vars(hit) | {"impulse": hit.impulse[robot.nv : robot.nv + 6]}
+    hit, forces = struck(
+        whole, parts, prefix, f"{prefix} of {other.mass:.6g} kg caught"
+    )
+    impulse = hit.impulse[robot.nv : robot.nv + 6]
+    impulses = [impulse]
+    if whole.constraints:
+        closure = Closure(StateMap(whole))
+        impulses = [impulse + _impulse_on(prefix, closure, hit.q, forces)]
+        titles = [item.title for item in whole.constraints]
+        held = dict(zip(titles, impulses_of(closure, forces), strict=True))
+        impulses += [held[item.title] for item in holding]
+    of_impact = vars(hit) | {"impulse": np.concatenate(impulses)}
     return Capture(
         **of_impact, payload=other, payload_q=other_q, payload_v=other_v, prefix=prefix
     )
+
+
+def _held(
+    whole: Robot, payload: Robot, prefix: str, holding: Sequence[Constraint]
+) -> Robot:
+    """Return the robot `whole`, which has a payload, with more constraints.
+
+    These are the constraints of the payload, with the names of its frames in `whole`, and the
+    constraints `holding`.
+    """
+    of_payload = [_renamed(item, prefix) for item in payload.constraints]
+    if not (of_payload or holding):
+        return whole
+    constraints = [*whole.constraints, *of_payload, *holding]
+    return whole.replace(constraints=constraints, independent=[])
+
+
+def _renamed(constraint: Constraint, prefix: str) -> Constraint:
+    """Return a constraint of a payload, with the names that its frames have after the grasp."""
+    to = None if constraint.to is None else f"{prefix}.{constraint.to}"
+    return replace(
+        constraint,
+        frame=f"{prefix}.{constraint.frame}",
+        to=to,
+        name=f"{prefix}.{constraint.title}",
+    )
+
+
+def _impulse_on(prefix: str, closure: Closure, q: Array, forces: Array) -> Array:
+    """Return the impulse (6,) of constraints on a payload, in the axes of the payload's frame.
+
+    `forces` (rows,) are the impulses of the rows. A constraint between two frames of the payload
+    does not contribute.
+    """
+    model = closure.state.robot.model
+    data = model.createData()
+    pin.forwardKinematics(model, data, q)
+    joint, on = find_frame(model, prefix)
+    payload = data.oMi[joint] * on
+    total = pin.Force.Zero()
+    for pair, impulse in zip(
+        closure.constraints.pairs, impulses_of(closure, forces), strict=True
+    ):
+        item = pair.constraint
+        first = data.oMi[pair.first.joint] * pair.first.placement
+        wrench = payload.actInv(first).act(pin.Force(impulse))
+        if _is_part(item.frame, prefix):
+            total += wrench
+        if item.to is not None and _is_part(item.to, prefix):
+            total -= wrench
+    impulse_on_payload: Array = total.vector
+    return impulse_on_payload
+
+
+def _is_part(frame: str, prefix: str) -> bool:
+    """Return whether a frame of the combined robot is fixed to the payload or to its links."""
+    return frame == prefix or frame.startswith(f"{prefix}.")
 
 
 def _require_same_environment(robot: Robot, payload: Robot) -> None:

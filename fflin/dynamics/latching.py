@@ -7,7 +7,13 @@ import numpy as np
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, instance
 from fflin.dynamics.closure import Closure
-from fflin.dynamics.impact import Impact, inertia_at, momentum_of
+from fflin.dynamics.impact import (
+    Impact,
+    impulses_of,
+    inertia_at,
+    momentum_of,
+    on_constraints,
+)
 from fflin.dynamics.state import StateMap
 from fflin.robot.constraints import Constraint, checked_constraints
 from fflin.robot.robot import Robot
@@ -79,31 +85,24 @@ def latch(
         )
     q = robot.neutral() if q is None else robot.checked_configuration(q)
     v = np.zeros(robot.nv) if v is None else robot.checked_velocity(v)
-    before = (robot, q, v)
     if robot.constraints:
-        v = Closure(StateMap(robot)).velocity(q, v)
-    whole = robot.replace(constraints=[*robot.constraints, *closing])
-    state = StateMap(whole)
-    closure = Closure(state)
+        q, v = on_constraints(robot, q, v)
+    before = (robot, q, v)
+    whole = robot.replace(constraints=[*robot.constraints, *closing], independent=[])
+    closure = Closure(StateMap(whole))
     q = closure.configuration(q)
-    space = closure.tangent(q)
-    nu = state.velocities(v)
-    kept = closure.kept(space, q, nu)
-    jump = state.spread(nu - kept)
-    M = inertia_at(whole, q)
-    multipliers = np.linalg.lstsq(space.jacobian.T, state.forces(-(M @ jump)), None)[0]
-    pairs = closure.constraints.pairs[-len(closing) :]
-    impulses = [pair.selected.T @ multipliers[pair.rows] for pair in pairs]
+    after, forces = closure.after_impact(q, v)
+    impulses = impulses_of(closure, forces)[-len(closing) :]
     titles = ", ".join(item.title for item in closing)
-    v = state.spread(kept)
+    jump = v - after
     return Impact(
         robot=whole,
         q=q,
-        v=v,
+        v=after,
         impulse=np.concatenate(impulses),
-        energy_lost=0.5 * float(jump @ M @ jump),
+        energy_lost=0.5 * float(jump @ inertia_at(whole, q) @ jump),
         momentum=momentum_of(*before),
-        momentum_after=momentum_of(whole, q, v),
+        momentum_after=momentum_of(whole, q, after),
         event=f"{titles} latched",
         _before=before,
         _units=_UNITS * len(closing),

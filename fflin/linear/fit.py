@@ -49,8 +49,10 @@ def require_fit(
     reduced model, which lacks some states of the robot, is accepted.
     """
     made = f"the model was made for '{lin.robot}'"
-    _require_same_constraints(made, lin, robot)
     names = lin.robot_states
+    require_same_constraints(
+        made, robot, states=len(names), dependent=bool(lin.dependent)
+    )
     require_same(
         made, state, "state", names, lin.state_units[: len(names)], part=not whole
     )
@@ -60,18 +62,23 @@ def require_fit(
         require_same(made, state, "output", lin.output_names, lin.output_units)
 
 
-def _require_same_constraints(made: str, lin: LinearModel, robot: Robot) -> None:
-    """Raise `InputError` if only one of a model and a robot has constraints."""
-    count = len(lin.robot_states)
-    if lin.dependent and not robot.constraints:
+def require_same_constraints(
+    made: str, robot: Robot, *, states: int, dependent: bool
+) -> None:
+    """Raise `InputError` if only one of a design and a robot has constraints.
+
+    `made` is the beginning of the message. `states` is the number of states of the design, and
+    `dependent` whether constraints determine others.
+    """
+    if dependent and not robot.constraints:
         raise InputError(
-            f"{made} with constraints and has {count} independent states, but the given robot "
+            f"{made} with constraints and has {states} independent states, but the given robot "
             f"'{robot.name}' has no constraints; give the robot with its constraints, or make the "
             "model again for the free robot"
         )
-    if robot.constraints and not lin.dependent:
+    if robot.constraints and not dependent:
         raise InputError(
-            f"{made} without constraints and has {count} states, but the given robot "
+            f"{made} without constraints and has {states} states, but the given robot "
             f"'{robot.name}' has constraints and fewer independent states; make the model again "
             "for the given robot"
         )

@@ -208,7 +208,7 @@ class LinearTrajectory(Trajectory):
         maps = np.zeros((len(times), len(rows), len(rows)))
         for k, point in enumerate(zip(q, v, strict=True)):
             closed = linearizer.on_constraints(*point)
-            maps[k] = linearizer.reduction(*closed).T[rows]
+            maps[k] = linearizer.reduction(*closed, linearizer.independent).T[rows]
         return maps
 
     def matrices(self, t: float) -> tuple[Array, Array]:
@@ -470,13 +470,13 @@ def _partition(motion: Trajectory, independent: Sequence[str] | None) -> Partiti
     names = linearizer.prepared.map.names
     if not robot.constraints:
         return Partition(np.zeros(0), (names,))
+    if independent is not None:
+        linearizer.along(motion.q[:1], motion.v[:1], motion.u_base[:1], motion.t[:1])
+        return Partition(np.zeros(0), (linearizer.constrained_names["state_names"],))
     points = list[tuple[Array, Array]]()
     for t, *point in zip(motion.t.tolist(), motion.q, motion.v, strict=True):
         with located(f"at t = {t:g} s"):
             points.append(linearizer.on_constraints(*point))
-    if independent is not None:
-        picked = linearizer.reduction(*points[0]).kept
-        return Partition(np.zeros(0), (tuple(names[index] for index in picked),))
     motions = [linearizer.motions(*point) for point in points]
     return partition_of(motion.t, motions, names)
 

@@ -21,7 +21,13 @@ from fflin.dynamics.rnea import AccelerationDerivatives, Accelerations, Turning
 from fflin.dynamics.state import Actuation, StateMap
 from fflin.linear.aba_route import inertia_matrix
 from fflin.linear.check import certify
-from fflin.linear.constrained import Motions, Reducer, Reduction, reduced_fields
+from fflin.linear.constrained import (
+    Motions,
+    Reducer,
+    Reduction,
+    independent_states,
+    reduced_fields,
+)
 from fflin.linear.constrained_rest import RestSolver
 from fflin.linear.files import given
 from fflin.linear.model import LinearModel
@@ -407,22 +413,27 @@ class Linearizer:
         return make, (self.robot,)
 
     def _anywhere(self, q: Array, v: Array, u: Array, t: float) -> LinearModel:
-        state = self.prepared.map
+        ready = self.prepared
+        state = ready.map
         chart, made = self._in_all_states(q, v, u, t)
         time = {"t": t} if state.varying else {}
         contact = self._accelerations.contact
         if self._reducer is not None and contact is not None:
-            whole = LinearModel(self._fields | made)
-            nu = state.velocities(v)
-            reduction = self._reducer.reduction(chart, q, v, nu, contact.space)
-            fields = reduced_fields(state, reduction, whole)
+            reduction = self._reducer.reduction(chart, q, state.velocities(v), contact)
+            names = self._reducer.names
             if self._rest is not None and self._rest.waits:
-                self._rest.choose(reduction.kept, q, self._fields | self._reducer.names)
-            return LinearModel(
-                {**self._fields, "_computed": {}, **made, **fields}
-                | {"_inertia": partial(given, frozen(reduction.M))},
-                **time,
-            )
+                self._rest.choose(reduction.kept, q, self._fields | names)
+            slow = dict(self._fields["_computed"])
+            slow["x0"] = partial(independent_states, slow["x0"], reduction.kept)
+            fields = {
+                **self._fields,
+                **made,
+                **names,
+                **reduced_fields(reduction, ready.rest | made, made.get("C")),
+                "_computed": slow,
+                "_inertia": partial(given, frozen(reduction.M)),
+            }
+            return LinearModel(fields, **time)
         if state.varying:
             return LinearModel(self._fields | made, t=t)
         return LinearModel(self._fields | made)
@@ -488,24 +499,22 @@ class Linearizer:
                 A[k], B[k] = made["A"], made["B"]
         return A, B
 
-    def local_reduction(self, q: Array, v: Array) -> Reduction:
-        """Return the reduction to the best choice of coordinates at a closed point."""
-        motions = self.motions(q, v)
-        return motions.reduction(motions.best())
-
-    def reduction(self, q: Array, v: Array) -> Reduction:
-        """Return the reduction to the coordinates of this `Linearizer` at a closed point."""
-        assert self._reducer is not None
-        return self._reducer.of_motions(self.motions(q, v))
-
     def motions(self, q: Array, v: Array) -> Motions:
         """Return the motions that the constraints permit at a closed point."""
         assert self._closure is not None
-        assert self._reducer is not None
         with self._lock:
-            space = self._closure.tangent(q)
-            nu = self.prepared.map.velocities(v)
-            return self._reducer.motions(_REFERENCE_CHART, q, v, nu, space)
+            return Motions.at(self._closure, q, v)
+
+    def reduction(
+        self, q: Array, v: Array, independent: Sequence[str] | None = None
+    ) -> Reduction:
+        """Return the reduction to named coordinates at a closed point, by default the best ones."""
+        motions = self.motions(q, v)
+        if independent is None:
+            return motions.reduction(motions.best())
+        names = self.prepared.map.names
+        picked = np.array([names.index(name) for name in independent])
+        return motions.reduction(picked)
 
     def along(
         self, q: Array, v: Array, u: Array, t: Array | None = None

@@ -30,9 +30,10 @@ from fflin.dynamics.orbital import OrbitField
 from fflin.robot.equipment.assembly import turned_to
 from fflin.robot.inputs import Thruster, named_wheels
 from fflin.robot.joints import ROOT, find_frame
-from fflin.robot.orbit import CircularOrbit
+from fflin.robot.orbit import CircularOrbit, EllipticOrbit
 from fflin.robot.robot import Robot
 from fflin.view.constraints import constraint_marks
+from fflin.view.magnetorquers import rods
 from fflin.view.shapes import (
     PLAIN,
     Color,
@@ -476,25 +477,29 @@ class Page:
         )
         self.floor = np.array([*self.centre[:2], low[2]])
 
-    def html(self, mode: str, points: Array, **entries: object) -> str:
+    def html(
+        self,
+        mode: str,
+        points: Array,
+        times: Sequence[float] = (0.0,),
+        **entries: object,
+    ) -> str:
         """Return the HTML of the page, with a camera that shows all points (M, 3).
 
-        `entries` are added to the data that the scripts of the page read.
+        `times` are those of the frames of a motion [s]. `entries` are added to the data that the
+        scripts of the page read.
         """
         robot = self.robot
         nodes = self.nodes
         orbit = dict[str, object]()
-        # The page turns planet and stars at a constant rate, so it omits them in an elliptic orbit.
-        if self.scene == "space" and isinstance(robot.orbit, CircularOrbit):
+        if self.scene == "space" and robot.orbit:
             field = OrbitField(robot, frame_of(robot, self.frame))
             # The rows of "up" are the axes of the page in the orbital frame: x along the orbit, y
             # (upwards) away from the central body, and z opposite to the orbit normal.
             radial, along, normal = field.axes.T
-            far = robot.orbit.radius / robot.orbit.body_radius
-            rate = robot.orbit.mean_motion
             orbit = {
                 "up": [along.tolist(), radial.tolist(), (-normal).tolist()],
-                "orbit": {"body": robot.orbit.body, "distance": far, "rate": rate},
+                "orbit": _orbit(robot.orbit, times),
             }
         triads = [{"path": nodes[0], **_placed(pin.SE3.Identity())}]
         if self.tool:
@@ -532,6 +537,7 @@ class Page:
             "triads": triads,
             "nozzles": self.nozzles,
             "wheels": wheels,
+            "rods": rods(robot, nodes),
             "constraints": constraint_marks(robot, nodes, robot.constraints),
             "links": self.links,
             "title": robot.name,
@@ -566,6 +572,30 @@ class Page:
             "data": data,
         }
         return re.sub(r"{{(\w+)}}", lambda field: fields[field[1]], _asset("page.html"))
+
+
+def _orbit(
+    orbit: CircularOrbit | EllipticOrbit, t: Sequence[float]
+) -> dict[str, object]:
+    """Return the central body and, at times t (N,) [s], its direction and distance.
+
+    Distances are relative to the radius of the body. `angles` [rad] are those by which the orbital
+    frame has rotated since t = 0. A circular orbit has a constant rate [rad/s] instead.
+    """
+    if isinstance(orbit, CircularOrbit):
+        far = orbit.radius / orbit.body_radius
+        return {"body": orbit.body, "distance": far, "rate": orbit.mean_motion}
+    states = [orbit.at(time) for time in t]
+    start = orbit.at(0.0).angle
+    distances = np.array([state.radius for state in states]) / orbit.body_radius
+    angles = np.array([state.angle - start for state in states])
+    return {
+        "body": orbit.body,
+        "distance": float(distances[0]),
+        "farthest": float(distances.max()),
+        "distances": packed(distances),
+        "angles": packed(angles),
+    }
 
 
 def _placed(placement: pin.SE3) -> dict[str, list[float]]:

@@ -37,6 +37,7 @@ from fflin.simulation.plots import (
 )
 from fflin.simulation.report import DEGREES, STATES, THERE, TRUSTED, Curve, headline
 from fflin.view.constraints import Reaction, constraint_marks, reactions
+from fflin.view.magnetorquers import fluxes, magnetic_torque, moments, rods, scales
 from fflin.view.page import Drawing, Page, body_poses, encoded, packed, subtitle
 from fflin.view.shapes import carriers_of
 
@@ -56,6 +57,10 @@ REACTION = 0.4
 # The flight of a payload before its capture is integrated in steps of at most _STEP [s]. Within a
 # step, the phase of the payload's fastest oscillation changes by at most _SWING [rad].
 _STEP, _SWING = 0.05, 0.3
+
+# Lengths of the arrows of the magnetic field and of the moment of a magnetorquer at its limit,
+# relative to the robot's size. Both begin inside the robot, and must be longer than it.
+_FIELD, _MOMENT = 1.35, 1.0
 
 # Largest number of frames. More frames would enlarge the file without a visible effect.
 _MOST_FRAMES = 3000
@@ -104,6 +109,7 @@ def motion_page(
     t = motion.t[shown]
     state = StateMap(robot, reference=motion.reference, frame=frame)
     film = play_back(state, motion.q[shown], motion.u[shown])
+    flux = fluxes(state, t)
     goal = _goals(state, motion, shown) if target is None else target[None]
     goals = body_poses(robot, goal)
 
@@ -143,7 +149,7 @@ def motion_page(
     flown = flown or [robot] * max(1, len(motion.phases))
     names = [part_robot.name.replace("+", " + ") for part_robot in flown]
     about = [f"{subtitle(part_robot)}, {t[-1] - t[0]:.4g} s" for part_robot in flown]
-    corners = [frame_points(page, film)]
+    corners = [frame_points(page, film, flux)]
     for drawing, rows in ((page.drawing, goals), *held):
         corners += [drawing.points(poses) for poses in rows[:: max(1, len(rows) // 24)]]
     points = np.concatenate(corners)
@@ -152,15 +158,17 @@ def motion_page(
         # If the camera showed the whole of a long path, the robot would be only a dot.
         follow = bool(np.ptp(points, axis=0).max() > _FAR * page.size)
     if follow:
-        points = frame_points(page, film, follow=True)
+        points = frame_points(page, film, flux, follow=True)
     marked_goals = goals[:1] if motion.phases else goals
     return page.html(
         "motion",
         points,
+        t.tolist(),
         subtitle=about[0],
         verdict=headline(motion),
         **panel(robot, motion, shown, goal, predicted, off),
         **marks(page, film, marked_goals),
+        **_magnetic(page, state, film, motion.u[shown], flux),
         **_constraints(page, reactions(robot, motion, shown)),
         t=packed(t),
         speed=speed,
@@ -228,19 +236,26 @@ def _boxes(drawing: Drawing) -> list[list[float]]:
     return boxes
 
 
-def frame_points(page: Page, film: Playback, *, follow: bool = False) -> Array:
-    """Return points (M, 3) that the camera must show: corners of bodies, tips of force arrows.
+def frame_points(
+    page: Page, film: Playback, flux: Array | None = None, *, follow: bool = False
+) -> Array:
+    """Return points (M, 3) that the camera must show: corners of bodies, tips of arrows.
 
-    If `follow` is true, the displacement of the base from the first frame is subtracted.
+    The arrows are the force on the base and the magnetic field, if the flux density `flux` (N, 3)
+    has rows. If `follow` is true, the displacement of the base from the first frame is subtracted.
     """
     strongest = _strongest(film.force)
     reach = ARROW * page.size / strongest if strongest > THERE else 0.0
     points = []
     for index in np.unique(np.linspace(0, len(film.poses) - 1, 24).astype(int)):
         base = film.poses[index, 0, :3]
-        tip = base + reach * film.force[index]
+        tips = [base + reach * film.force[index]]
+        if flux is not None and len(flux):
+            along = flux[index] / max(_strongest(flux), np.finfo(float).tiny)
+            tips.append(base + _FIELD * page.size * along)
         shift = base - film.poses[0, 0, :3] if follow else np.zeros(3)
-        points.append(np.vstack((page.drawing.points(film.poses[index]), tip)) - shift)
+        corners = page.drawing.points(film.poses[index])
+        points.append(np.vstack((corners, *tips)) - shift)
     return np.concatenate(points)
 
 
@@ -282,6 +297,36 @@ def marks(page: Page, film: Playback, goals: Array) -> dict[str, object]:
             {**nozzle, "values": packed(film.thrust[:, k])}
             for k, nozzle in enumerate(page.nozzles)
             if np.abs(film.thrust).max(initial=0.0) > THERE
+        ],
+    }
+
+
+def _magnetic(
+    page: Page, state: StateMap, film: Playback, u: Array, flux: Array
+) -> dict[str, object]:
+    """Return the arrows of the magnetic field, and of moments and torque of magnetorquers."""
+    if not len(flux):
+        return {"field": None, "moments": []}
+    values = moments(state, u)
+    torque = magnetic_torque(state, film.poses, u, flux)
+    full = scales(page.robot, values)
+    return {
+        "field": {
+            "longest": _FIELD * page.size,
+            "values": packed(flux),
+            "torque": packed(torque),
+            "torqueLongest": ARROW * page.size,
+        },
+        "moments": [
+            {
+                **rod,
+                "longest": _MOMENT * page.size,
+                "most": most,
+                "values": packed(values[:, k]),
+            }
+            for k, (rod, most) in enumerate(
+                zip(rods(page.robot, page.nodes), full, strict=True)
+            )
         ],
     }
 

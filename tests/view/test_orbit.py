@@ -1,5 +1,7 @@
 """Pages of robots in orbit: the body that they circle is where it is, and turns with the orbit."""
 
+import base64
+
 import numpy as np
 import pytest
 
@@ -40,6 +42,23 @@ def test_the_messages_to_pages_are_complete(pages):
         assert "700 km over earth" in data["subtitle"]
     assert np.allclose(lvlh["up"], [[1, 0, 0], [0, 0, -1], [0, 1, 0]])
     assert np.allclose(hill["up"], [[0, 1, 0], [1, 0, 0], [0, 0, -1]])
+
+
+def test_an_elliptic_orbit_brings_the_direction_and_distance_of_the_earth(tmp_path):
+    orbit = fflin.EllipticOrbit(perigee=500e3, eccentricity=0.3, anomaly=0.4)
+    robot = fflin.load("cubesat", orbit=orbit)
+    motion = fflin.simulate(robot, duration=900.0, dt=30.0)
+    path = tmp_path / "elliptic.html"
+    fflin.visualize(robot, motion, html=path, open=False)
+    shown = page_data(path)["orbit"]
+    last = orbit.at(900.0)
+    for key, value in {
+        "distances": last.radius / orbit.body_radius,
+        "angles": last.angle - 0.4,
+    }.items():
+        values = np.frombuffer(base64.b64decode(shown[key]), dtype="<f4")
+        assert values[-1] == pytest.approx(value, rel=1e-6)
+    assert shown["farthest"] == pytest.approx(last.radius / orbit.body_radius)
 
 
 def look(watched, towards, up=(0, 1, 0)):

@@ -118,7 +118,7 @@ class Shooting:
             kept = np.broadcast_to(np.arange(nx), (len(q), nx))
             return Charts(kept, np.broadcast_to(np.eye(nx), (len(q), nx, nx)))
         reductions = [
-            self._linearizer.local_reduction(*point) for point in zip(q, v, strict=True)
+            self._linearizer.reduction(*point) for point in zip(q, v, strict=True)
         ]
         kept = np.array([reduction.kept for reduction in reductions])
         maps = np.array([reduction.T for reduction in reductions])

@@ -5,7 +5,7 @@
  * SHA-256 of the URDF: $sha256
  * Frame: $frame. Its axes:
  *   hybrid, lvlh, hill: torques and omega_b in base axes, forces and v_b in reference axes;
- *   local: all in base axes; world: all in reference axes.
+ *   local: all in base axes; world: all in reference axes.$dependent
  * Sample time: $sample_time
  * Numbers: $real
  *

@@ -1,5 +1,5 @@
-// What is fixed to the robot's bodies and has no shape in its URDF: axes, thrusters, wheels and
-// constraints.
+// What is fixed to the robot's bodies and has no shape in its URDF: axes, thrusters, wheels,
+// magnetorquers and constraints.
 
 const NOZZLE = "#c9d2e0", WHEEL = "#8fe0ff", CONSTRAINT = "#9be564";
 
@@ -50,6 +50,25 @@ function wheel({ position, quaternion, spins, path }, size, viewer) {
   return group;
 }
 
+// A magnetorquer: a core with its winding, seen through the body.
+function rod({ position, axis }, size) {
+  const length = 0.34 * size, radius = 0.009 * size;
+  const group = new THREE.Group(), core = seenThrough(MARKS.moment), winding = seenThrough(MARKS.moment);
+  core.opacity = 0.45;
+  winding.opacity = 0.6;
+  group.add(new THREE.Mesh(new THREE.CylinderGeometry(radius, radius, length, 16), core));
+  for (let k = -3; k <= 3; k++) {
+    const ring = new THREE.Mesh(new THREE.TorusGeometry(1.5 * radius, 0.45 * radius, 8, 24), winding);
+    ring.rotation.x = Math.PI / 2;
+    ring.position.y = 0.11 * k * length;
+    group.add(ring);
+  }
+  group.children.forEach((each) => { each.renderOrder = 5; });
+  group.position.set(...position);
+  group.quaternion.setFromUnitVectors(UP, new THREE.Vector3(...axis));
+  return group;
+}
+
 // A bolt for a weld, a ring with its pin along z for a hinge, a ball in its socket for a spherical.
 function constraint({ kind, position, quaternion, active }, size) {
   const r = 0.022 * size, group = new THREE.Group(), material = seenThrough(CONSTRAINT);
@@ -86,6 +105,7 @@ function makeEquipment(viewer, info) {
   info.triads.forEach((each, k) => add(each, `frame ${k}`, triad({ ...each, length: (k ? 0.12 : 0.3) * info.size })));
   info.nozzles.forEach((each, k) => add(each, `nozzle ${k}`, nozzle(each, info.size)));
   info.wheels.forEach((each, k) => add(each, `wheel ${k}`, wheel(each, info.size, viewer)));
+  info.rods.forEach((each) => add(each, `rod ${each.name}`, rod(each, info.size)));
   info.constraints.forEach((each, k) => add(each, `constraint ${k}`, constraint(each, info.size)));
   return (i) => shows.forEach((show) => show(i));
 }

@@ -14,7 +14,7 @@ function problem(message) {
   box.hidden = !message;
 }
 
-const GHOST = "#8fb4ff", HELD = "#b5926f", LINEAR = "#ff7fc8";
+const GHOST = "#8fb4ff", HELD = "#b5926f", LINEAR = "#ff7fc8", SHADOW = "#5a6a86";
 
 // The largest side of the box about points x, y, z, ...
 function extent(points) {
@@ -34,6 +34,27 @@ function constraintsOf({ constraints, reactions }) {
   return [...entries, { label: scale, colour: CONSTRAINT, paths: [["meshcat", "reactions"]] }];
 }
 
+// The entries of the magnetic field, and of moments and torque of magnetorquers.
+function magneticOf({ field, moments }) {
+  if (!field) return [];
+  const limits = [...new Set(moments.map(({ most }) => most))];
+  const full = limits.length > 1 ? "limit" : `${figure(limits[0], 2)} A m²`;
+  const paths = moments.flatMap(({ name, path }) => ["rod", "moment"].map((kind) => [...path, `${kind} ${name}`]));
+  const entries = [
+    { label: `magnetic field (longest: ${figure(1e6 * largest(field.values, 3), 2)} µT)`, colour: MARKS.field, paths: [["meshcat", "wrench", "field"]] },
+    { label: `magnetorquers (longest: ${full})`, colour: MARKS.moment, paths },
+  ];
+  const torque = largest(field.torque, 3);
+  if (!torque) return entries;
+  return [...entries, { label: `torque of magnetorquers (longest: ${figure(1e6 * torque, 2)} µN m)`, colour: MARKS.torque, paths: [["meshcat", "wrench", "magnetic torque"]] }];
+}
+
+// The checkbox of the shadow; a part of a revolution is too short for it.
+function shadowOf({ orbit, t }) {
+  if (!orbit || Math.abs(angleAt(orbit, t[t.length - 1]) - angleAt(orbit, t[0])) < 0.5) return [];
+  return [{ label: "day and night", title: "the sun is fixed in space, and the shadow of the planet falls on the robot", colour: SHADOW, off: true, act: "shadow" }];
+}
+
 // What is drawn beside the robot and can be seen; each can be switched off.
 function legendOf(info) {
   const entry = (label, colour, ...path) => ({ label, colour, paths: [["meshcat", ...path]] });
@@ -43,6 +64,7 @@ function legendOf(info) {
     ...Object.entries({ wheel: WHEEL, nozzle: NOZZLE }).filter(([kind]) => info[`${kind}s`].length).map(([kind, colour]) => (
       { label: kind === "wheel" ? "wheels" : "thrusters", colour, paths: info[`${kind}s`].map(({ path }, k) => [...path, `${kind} ${k}`]) })),
     ...constraintsOf(info),
+    ...magneticOf(info),
     ...info.arrows.map(({ kind, unit, values }) => entry(`${kind} on the base (longest: ${figure(largest(values, 3), 2)} ${unit})`, MARKS[kind], "wrench", kind)),
   ];
   const rest = info.rest === null ? "" : `, at rest from ${Number(info.rest.toPrecision(4))} s`;
@@ -51,21 +73,25 @@ function legendOf(info) {
   entries.push(...info.held.map((name) => entry(name, HELD, "held", name)));
   if (info.linear) entries.push({ ...entry("linear model", LINEAR, "linear"), dashed: true });
   // In the panel thrusters are named in their plot; a strip of pictures has none.
+  entries.push(...shadowOf(info));
   return [...entries, ...info.plumes.map(({ name, colour }) => ({ label: name, colour, strip: true }))];
 }
 
-function makeLegend(viewer, entries) {
+// `acts` are functions of entries that do more than show what is drawn at their paths.
+function makeLegend(viewer, entries, acts = {}) {
   const legend = document.getElementById("legend");
-  for (const { label, colour, paths = [], strip, dashed } of entries) {
+  for (const { label, title = "", colour, paths = [], strip, dashed, off, act } of entries) {
     const row = document.createElement("label"), check = document.createElement("input");
-    row.className = strip ? "strip" : "";
+    row.className = strip ? "strip" : off ? "option" : "";
+    row.title = title;
     const swatch = document.createElement("i");
     check.type = "checkbox";
-    check.checked = true;
+    check.checked = !off;
     swatch.style.setProperty("--swatch", colour);
     swatch.className = dashed ? "dashed" : "";
     const set = () => {
       for (const path of paths) viewer.set_property(path, "visible", check.checked);
+      if (act) acts[act](check.checked);
       viewer.set_dirty();
     };
     check.addEventListener("change", set);
@@ -87,7 +113,7 @@ function main() {
     console.warn(error);
     return;
   }
-  const { viewer, camera, turn } = stage;
+  const { viewer, camera, turn, shade } = stage;
   window.viewer = viewer;
   for (const command of info.commands) {
     try {
@@ -108,8 +134,11 @@ function main() {
   }
 
   info.t = floats(info.t);
+  decodeOrbit(info);
   for (const each of [...info.trails, ...info.followed, ...info.reactions]) each.points = floats(each.points);
   for (const each of [...info.arrows, ...info.plumes, ...info.reactions, ...info.readouts]) each.values = floats(each.values);
+  if (info.field) for (const key of ["values", "torque"]) info.field[key] = floats(info.field[key]);
+  for (const each of info.moments) each.values = floats(each.values);
   for (const each of info.constraints) each.active = floats(each.active);
   for (const plot of info.plots) for (const line of plot.lines) for (const key of ["values", "reference", "linear"]) line[key] = floats(line[key]);
   markFirst(info.plots);
@@ -149,7 +178,7 @@ function main() {
   fitPlots(panel);
   const again = () => window.dispatchEvent(new Event("resize"));
   window.addEventListener("resize", () => fitPlots(panel));
-  makeLegend(viewer, legendOf(info));
+  makeLegend(viewer, legendOf(info), { shadow: (on) => { shade(on); player.seek(player.state.time); } });
 
   const toggle = (text, title, pressed, act) => {
     const button = element("button", { title }, text);

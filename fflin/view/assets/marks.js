@@ -1,6 +1,6 @@
 // What is drawn about the robot: trails, forces, torques, reactions and plumes of thrusters.
 
-const MARKS = { tool: "#ff9d4d", base: "#7fe3c4", "centre of mass": "#7fe3c4", force: "#ffd166", torque: "#d58cff" };
+const MARKS = { tool: "#ff9d4d", base: "#7fe3c4", "centre of mass": "#7fe3c4", force: "#ffd166", torque: "#d58cff", field: "#f2ead0", moment: "#ff6f61" };
 
 // The largest length of the vectors of `size` entries in an array.
 function largest(values, size) {
@@ -143,6 +143,54 @@ function torqueArrow({ colour, values, longest, size }) {
   return group;
 }
 
+// The magnetic field at the base: an arrow as long as the field is strong, on its field line, which
+// is straight over the size of a robot and fades away from it.
+function fieldArrow({ values, longest, size }) {
+  const most = largest(values, 3), reach = 4 * size;
+  const group = new THREE.Group();
+  const pointer = arrow(MARKS.field, 0.009 * size, seenThrough(MARKS.field));
+  const line = new THREE.Mesh(new THREE.CylinderGeometry(0.0045 * size, 0.0045 * size, 2 * reach, 8, 1, true), new THREE.ShaderMaterial({
+    transparent: true, depthWrite: false, uniforms: { reach: { value: reach }, tint: { value: new THREE.Color(MARKS.field).convertSRGBToLinear() } },
+    vertexShader: `
+      varying float along; uniform float reach;
+      void main() {
+        along = abs(position.y) / reach;
+        gl_Position = projectionMatrix * modelViewMatrix * vec4(position, 1.0);
+      }`,
+    fragmentShader: `
+      varying float along; uniform vec3 tint;
+      void main() {
+        gl_FragColor = vec4(tint, 0.8 * pow(1.0 - along, 1.3));
+        #include <encodings_fragment>
+      }`,
+  }));
+  line.renderOrder = 3;
+  group.add(pointer, line);
+  group.show = (i) => {
+    const field = new THREE.Vector3().fromArray(values, 3 * i);
+    group.visible = field.length() > 0;
+    if (!group.visible) return;
+    pointer.setLength((longest * field.length()) / most);
+    group.quaternion.setFromUnitVectors(UP, field.normalize());
+  };
+  return group;
+}
+
+// The moment of a magnetorquer, along its rod; at its limit the arrow has its longest length.
+function momentArrow({ position, axis, values, longest, most, size }) {
+  const group = arrow(MARKS.moment, 0.012 * size, seenThrough(MARKS.moment));
+  const along = new THREE.Vector3(...axis);
+  group.position.set(...position);
+  group.show = (i) => {
+    const length = (longest * Math.abs(values[i])) / most;
+    group.visible = length > 0.01 * size;
+    if (!group.visible) return;
+    group.setLength(length);
+    group.quaternion.setFromUnitVectors(UP, along.clone().multiplyScalar(Math.sign(values[i])));
+  };
+  return group;
+}
+
 function plume({ position, direction, values, most, size, colour }) {
   const length = 0.48 * size, radius = 0.07 * size;
   const cone = new THREE.ConeGeometry(radius, length, 28, 12, true);
@@ -197,6 +245,12 @@ function makeMarks(viewer, info) {
   for (const each of info.arrows) {
     add(["meshcat", "wrench", each.kind], (each.kind === "force" ? forceArrow : torqueArrow)({ ...each, colour: MARKS[each.kind], size }));
   }
+  if (info.field) {
+    add(["meshcat", "wrench", "field"], fieldArrow({ ...info.field, size }));
+    const { torque, torqueLongest } = info.field;
+    if (largest(torque, 3) > 0) add(["meshcat", "wrench", "magnetic torque"], torqueArrow({ colour: MARKS.torque, values: torque, longest: torqueLongest, size }));
+  }
+  info.moments.forEach((each) => add([...each.path, `moment ${each.name}`], momentArrow({ ...each, size })));
   const most = strongest(info.reactions);
   info.reactions.forEach((each, k) => add(["meshcat", "reactions", `${k}`], reactionArrow({ ...each, most, size })));
   info.plumes.forEach((each, k) => add([...each.path, `plume ${k}`], plume({ ...each, size })));

@@ -58,8 +58,40 @@ function bodyUniforms(name) {
   return { ...Object.fromEntries(colours), land: { value: land }, clouds: { value: clouds } };
 }
 
+// The series of an elliptic orbit come as text.
+function decodeOrbit({ orbit, t }) {
+  if (!orbit || !orbit.angles) return;
+  orbit.t = t;
+  for (const key of ["angles", "distances"]) orbit[key] = floats(orbit[key]);
+}
+
+// A series at a time, linearly between its frames.
+function between({ t }, series, time) {
+  let low = 0, high = t.length - 1;
+  if (high < 1) return series[0];
+  while (high - low > 1) {
+    const middle = (low + high) >> 1;
+    if (t[middle] <= time) low = middle;
+    else high = middle;
+  }
+  const part = Math.min(1, Math.max(0, (time - t[low]) / (t[high] - t[low])));
+  return series[low] + part * (series[high] - series[low]);
+}
+
+// How far the orbit's axes have turned since t = 0 [rad], and the distance of the centre in radii.
+const angleAt = (orbit, time) => (orbit.rate !== undefined ? orbit.rate * time : orbit.t ? between(orbit, orbit.angles, time) : 0);
+const distanceAt = (orbit, time) => (orbit.t ? between(orbit, orbit.distances, time) : orbit.distance);
+
+// The part of the sun that is seen from the orbit, 0 in the shadow; the sun is half a degree wide.
+function sunlit(sun, distance) {
+  const along = -distance * sun.y; // of the centre, towards the sun
+  if (along < 0) return 1;
+  const miss = Math.sqrt(Math.max(distance * distance - along * along, 0)), edge = 0.00465 * along;
+  return THREE.MathUtils.smoothstep(miss, 1 - edge, 1 + edge);
+}
+
 function makeOrbitSky(renderer, sun, orbit, sky) {
-  const aside = Math.min(1.02 * Math.acos(1 / orbit.distance), Math.PI / 2);
+  const aside = Math.min(1.02 * Math.acos(1 / (orbit.farthest ?? orbit.distance)), Math.PI / 2);
   const uniforms = {
     ...bodyUniforms(orbit.body), sun: { value: sun }, distanceToCentre: { value: orbit.distance },
     aside: { value: aside }, turned: { value: 0 }, sky: { value: sky }, map: { value: null },
@@ -90,5 +122,9 @@ function makeOrbitSky(renderer, sun, orbit, sky) {
   }));
   dome.frustumCulled = false;
   dome.renderOrder = -20;
-  return { dome, turn: (angle) => { uniforms.turned.value = angle; } };
+  const turn = (angle, distance) => {
+    uniforms.turned.value = angle;
+    uniforms.distanceToCentre.value = distance;
+  };
+  return { dome, turn };
 }

@@ -5,6 +5,15 @@
 // Direction to the sun, in the axes of the screen.
 const SUN = [0.62, 0.62, 0.78];
 
+// Mirrors show lamps of the sky, which are darker in the shadow, but not dark.
+function dim(scene, lit) {
+  scene.traverse(({ material }) => {
+    if (!material || material.envMapIntensity === undefined) return;
+    material.userData.mirrors ??= material.envMapIntensity;
+    material.envMapIntensity = material.userData.mirrors * (0.4 + 0.6 * lit);
+  });
+}
+
 const upright = new THREE.Quaternion();
 const yUp = ([x, y, z]) => new THREE.Vector3(x, y, z).applyQuaternion(upright);
 
@@ -52,12 +61,25 @@ function makeStage(info) {
   const stars = space ? makeStars(orbit) : null;
   const below = orbit ? makeOrbitSky(renderer, towardsSun, orbit, sky.background) : null;
   // To a time [s]: the body and the stars go back as the orbit goes on.
+  const firstSun = towardsSun.clone(), screenNormal = new THREE.Vector3(0, 0, 1);
+  const [full, soft] = [sun.intensity, glow.intensity];
+  let dimmed = 1, fixed = false; // whether the sun goes back with the stars; else it stays, and lights the robot
   const turn = (time) => {
     if (!orbit) return;
-    const angle = (orbit.rate * time) % (2 * Math.PI);
-    below.turn(angle);
-    stars.material.uniforms.turned.value = angle;
+    const angle = angleAt(orbit, time) % (2 * Math.PI), distance = distanceAt(orbit, time);
+    below.turn(angle, distance);
+    const { turned, horizon } = stars.material.uniforms;
+    turned.value = angle;
+    horizon.value = -Math.sqrt(1 - distance ** -2);
+    towardsSun.copy(firstSun);
+    if (fixed) towardsSun.applyAxisAngle(screenNormal, angle);
+    const lit = fixed ? sunlit(towardsSun, distance) : 1;
+    sun.intensity = full * lit;
+    glow.intensity = soft * (0.6 + 0.4 * lit);
+    if (lit !== dimmed) dim(scene, lit);
+    dimmed = lit;
   };
+  const shade = (on) => { fixed = on; };
   if (orbit) scene.add(below.dome);
   if (space) scene.add(stars, makeVeil());
   else viewer.scene_tree.find(["Floor"]).object.add(makeFloor(info));
@@ -67,7 +89,7 @@ function makeStage(info) {
   viewer.set_object = (path, object) => { object.traverse(dress); setObject(path, object); };
   aim(new THREE.Vector3());
   viewer.animate();
-  return { viewer, turn, camera: makeCamera(viewer, info, aim) };
+  return { viewer, turn, shade, camera: makeCamera(viewer, info, aim) };
 }
 
 // Looked at from above, the ground is the background of all: a veil dims it.
