@@ -35,7 +35,7 @@ from fflin.control.policies import Deviation, Feedback, OutputSensing, StateFeed
 from fflin.control.policy import BoundLaw, Command, Noise
 from fflin.control.tracking import TrajectoryFeedback
 from fflin.control.trajectory_end import rest_or_fall, steady_regulator
-from fflin.control.tvlqr import StateCost, asks_steady, held_stages, tvlqr
+from fflin.control.tvlqr import asks_steady, held_stages, tvlqr
 from fflin.control.weights import Rule, Weight, sampled_cost, warn_of_integral, weight
 from fflin.dynamics.outputs import Measuring
 from fflin.dynamics.state import StateMap
@@ -479,7 +479,6 @@ def _along(traj: LinearTrajectory, horizon: Horizon, cost: Cost) -> TrajectoryMp
     traj.refuse_switches("predictive controllers")
     schedule = tvlqr(traj, Q, R, Qf, dt, weights=weights)
     Q, R = schedule.Q, schedule.R  # with default weights, if none are given
-    state_cost = StateCost(traj, Q, 0)
     state = StateMap(traj.robot, frame="local")
 
     def limited_state(lin: LinearModel, v: Array) -> Array:
@@ -493,7 +492,7 @@ def _along(traj: LinearTrajectory, horizon: Horizon, cost: Cost) -> TrajectoryMp
     # Along the trajectory: sample k ends at knot k + 1.
     follows = TrajectoryFeedback(traj, schedule)
     models = along(traj.resampled(dt), traj.partition)
-    for k, (total, transition) in enumerate(held_stages(traj, dt, state_cost, R)):
+    for k, (total, transition) in enumerate(held_stages(traj, dt, Q, R)):
         K = schedule.K[k]
         P = schedule.P[k + 1]
         lin = models[k + 1]

@@ -788,15 +788,16 @@ def loop_multipliers(factors: Array, regulated: Mask) -> Array:
 
 
 def held_stages(
-    traj: LinearTrajectory, dt: float, state_cost: StateCost, R: Array
+    traj: LinearTrajectory, dt: float, Q: Array | StateCost, R: Array
 ) -> Iterator[tuple[Array, Array]]:
     """Yield the cost matrix and the transition matrix of each sample, first sample first."""
+    state_cost = Q if isinstance(Q, StateCost) else StateCost(traj, Q, 0)
     nx = len(traj.state_names)
     n = nx + len(R)
     for steps, whole in transitions(traj, dt):
         total, transition = np.zeros((n, n)), np.eye(n)
-        Q = state_cost.in_steps(steps)
-        for cost, step in zip(_held_costs(steps, Q, R), steps.maps, strict=True):
+        costs = _held_costs(steps, state_cost.in_steps(steps), R)
+        for cost, step in zip(costs, steps.maps, strict=True):
             total += transition.T @ cost @ transition
             transition[:nx] = step @ transition
         yield total, whole
