@@ -458,7 +458,7 @@ def robot_of_design(
     These inputs are the thrusters and magnetorquers. The base force is omitted without thrusters.
     If `allocate` is None, they are allocated under two conditions: the thrusters can produce every
     wrench on the base, or the magnetorquers every moment, and `law` commands a base torque or is
-    None.
+    None. If only magnetorquers rotate the base, default weights for a slow loop are added.
     """
     if allocate is None:
         from fflin.control.authority import (
@@ -487,7 +487,13 @@ def robot_of_design(
     if fflin.Thruster in kinds:
         wanted.append(fflin.BaseForce)
     missing = [kind() for kind in wanted if kind not in kinds]
-    return robot.replace(inputs=(*missing, *others))
+    design = robot.replace(inputs=(*missing, *others))
+    only_magnetic = kinds <= {fflin.Magnetorquer, fflin.JointTorque}
+    if only_magnetic and robot.orbit and not robot.weights:
+        from fflin.control.magnetic_weights import magnetic_weights
+
+        return design.replace(weights=magnetic_weights(robot))
+    return design
 
 
 def designed(

@@ -55,7 +55,8 @@ _ALLOCATED = (
 
 _MAGNETIC = (
     "allocation: magnetorquers realise the part of tau_b across the magnetic field, in `fflin "
-    "simulate --gain` too; simulate several orbits to see whether the loop is stable"
+    "simulate --gain` too; without given weights, the loop is as slow as the orbit, because a "
+    "faster loop is unstable; simulate several orbits to see whether the loop is stable"
 )
 
 _NOT_ALLOCATED = (
