@@ -28,7 +28,7 @@ def test_the_weights_of_the_bundled_satellite_are_rounded_default_weights():
     given = fflin.load("cubesat_magnetic").weights["bryson"]
     assert {*given} == {*default}
     for name, value in default.items():
-        assert given[name] == pytest.approx(value, rel=0.02)
+        assert given[name] == pytest.approx(value, rel=0.03)
 
 
 def test_given_weights_and_other_actuators_have_no_default_weights_for_slow_loops():
@@ -52,7 +52,7 @@ def test_all_satellites_of_a_campaign_acquire_their_attitude():
         {"q_b": (-0.5, 0.5), "omega_b": (-0.09, 0.09)},
         v0=np.zeros(6),
         runs=96,
-        duration=3.5 * robot.orbit.period,
+        duration=20000.0,
         dt=5.0,
         limits="urdf",
     )
