@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
     from fflin.base.figures import CurveStyle
     from fflin.base.validation import Array
+    from fflin.commands.phases import PhaseStart
     from fflin.dynamics.coordinates import Frame
 
 T = TypeVar("T")
@@ -569,6 +570,19 @@ def gain_of(
         raise UnknownNameError(message) from None
 
 
+def _phase_of(robot: fflin.Robot, arguments: Namespace) -> PhaseStart | None:
+    """Return the start at the end of the motion of --after, or None without this option."""
+    if not getattr(arguments, "after", None):
+        return None
+    from fflin.commands.phases import start_after
+
+    names = ("joint", "rpy", "position", "velocity")
+    along = ("offset", "trajectory", "schedule", "periodic")
+    refuse(arguments, (*names, *along), "the start is the end of the motion of --after")
+    # This also defines the placements of constraints that have none yet.
+    return start_after(robot, arguments.after)
+
+
 def loop_of(
     robot: fflin.Robot, arguments: Namespace
 ) -> tuple[fflin.Policy | None, dict[str, Any]]:
@@ -582,6 +596,7 @@ def loop_of(
         },
         "limits": limits_of_options(arguments),
     }
+    arguments.phase = _phase_of(robot, arguments)
     if not arguments.controller:
         refuse(
             arguments,
@@ -757,6 +772,8 @@ def start_of(
     With --relative-equilibrium, the given base pose is relative to `reference`, or by default to
     the pose of this equilibrium.
     """
+    if arguments.phase is not None:
+        return arguments.phase.q, arguments.phase.v
     point, number = robot.point, arguments.relative_equilibrium
     # omit the base pose of the point, because the pose `about` below replaces it
     if number:

@@ -240,6 +240,13 @@ def simulate(arguments: Namespace) -> Report:
         interrupted = motion.stopped
     text = motion_report(motion)
     record = motion_record(motion)
+    if arguments.phase is not None and (impact := arguments.phase.impact):
+        record["impact"] = {
+            "event": impact.event,
+            "impulse": impact.impulse,
+            "energy_lost": impact.energy_lost,
+        }
+        text += f"\n{folded([f'impact at the start: {impact.told}'])}"
     record["margins"], line = _margins_of(policy, settings)
     if line:
         text += f"\n{folded([line])}"
