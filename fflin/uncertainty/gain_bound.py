@@ -154,12 +154,15 @@ def _with_groups(log_d: Array, channels: Channels) -> Array:
 
 def _largest(M: Values, scaling: Scaling) -> tuple[float, Array, Array]:
     """Return the largest eigenvalue for a scaling, and its derivatives by log d and h."""
-    d, h = np.exp(scaling.log_d), scaling.h
-    X = d[:, None] * M / d
-    turned = h[:, None] * X
-    form = X.conj().mT @ X + 1j * (turned - turned.conj().mT)
+    h = scaling.h
+    ratios = scaling.log_d[:, None] - scaling.log_d
+    # A step of the line search can be too long.
+    with np.errstate(all="ignore"):
+        X = np.exp(ratios) * M
+        turned = h[:, None] * X
+        form = X.conj().mT @ X + 1j * (turned - turned.conj().mT)
     if not np.isfinite(form).all():
-        return math.inf, np.zeros(len(d)), np.zeros(len(d))
+        return math.inf, np.zeros(len(h)), np.zeros(len(h))
     sizes, vectors = np.linalg.eigh(form)
     at = int(sizes[:, -1].argmax())
     X, v = X[at], vectors[at][:, -1]
