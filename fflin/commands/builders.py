@@ -502,9 +502,12 @@ def designed(
 
 def tuning_of(
     arguments: Namespace,
-) -> tuple[fflin.Robot, object, fflin.Structure, list[fflin.Goal], dict[str, Any]]:
+) -> tuple[
+    fflin.Robot, object, fflin.Structure, list[fflin.Goal], dict[str, Any], bool
+]:
     """Return the robot, plant, structure, goals and settings of a search.
 
+    The last result is True if the law commands a wrench that other inputs of the robot produce.
     The options --law, --goal and --vary replace the entries of the table [tune] of the robot file.
     All names are checked.
     """
@@ -549,7 +552,7 @@ def tuning_of(
             )
         plant = fflin.uncertain(design, given["vary"])
         settings["q"] = lin.q
-    return design, plant, structure, goals, settings
+    return design, plant, structure, goals, settings, design is not robot
 
 
 def tuned_law(
