@@ -129,7 +129,7 @@ def test_wrong_entries_are_refused_in_one_line(satellite):
 
 @pytest.mark.exhaustive
 def test_the_report_says_that_thrusters_produce_the_torque_of_the_law():
-    command = "tune inspector --output base --starts 1 --goal".split()
+    command = ["tune", "inspector", "--output", "base", "--starts", "1", "--goal"]
     options = ["margin disk=0.5", "--law", "pd shared=true", "--inputs", "inspector"]
     _, text, _ = run(*command, *options)
     assert "fflin.Allocation" in text
