@@ -5,5 +5,5 @@ This package imports every other package of fflin; no other package imports it.
 
 DONE, FELL_SHORT, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 
-# Value of --orbit that removes the orbit of a robot file.
+# Value of --orbit and --field that removes the orbit or the field of a robot file.
 NO_ORBIT = "none"

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from argparse import Namespace
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial, reduce
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import fflin
-from fflin.base.errors import InputError, UnknownNameError, located
+from fflin.base.errors import InputError, UnknownNameError, listed, located
 from fflin.base.names import joints_by_name, rates_by_name
 from fflin.commands import DONE, NO_ORBIT
 
@@ -80,11 +80,9 @@ def load_robot(arguments: Namespace) -> fflin.Robot:
 
     given = {
         name: value
-        for name in ("passive", "gravity", "orbit", "stiffness", "damping")
+        for name in ("passive", "gravity", "stiffness", "damping")
         if (value := getattr(arguments, name, None))
     }
-    if given.get("orbit") == NO_ORBIT:
-        given["orbit"] = None
     # `load` gets `passive` and the damping "urdf", because its warnings depend on them. All other
     # settings in `given` are applied after loading.
     first: dict[str, Any] = {}
@@ -107,6 +105,7 @@ def load_robot(arguments: Namespace) -> fflin.Robot:
                 f"--{name} is given for all joints and for single joints; give only one of them"
             )
         given[name] = for_all[0] if for_all else once(f"--{name}", given[name])
+    given |= _orbit_of(arguments, robot)
     inputs = getattr(arguments, "inputs", None)
     if inputs == "joints" and not robot.n:
         raise InputError(f"--inputs joints: '{robot.name}' has no joints")
@@ -247,6 +246,46 @@ def reference_of(arguments: Namespace) -> pin.SE3 | None:
     return None
 
 
+def _orbit_of(arguments: Namespace, robot: fflin.Robot) -> dict[str, object]:
+    """Return the field `orbit` of the robot; empty if no option changes the orbit.
+
+    --orbit changes the heights, and keeps the magnetic field of the orbit in the robot file.
+    """
+    changes: dict[str, object] = {}
+    for name in ("inclination", "field"):
+        value = getattr(arguments, name, None)
+        if value is not None:
+            changes[name] = None if value == NO_ORBIT else value
+    new = getattr(arguments, "orbit", None)
+    if new is None and not changes:
+        return {}
+    if new == NO_ORBIT:
+        why = "--orbit none removes the orbit, so this has no effect"
+        refuse(arguments, ("inclination", "field"), why)
+        return {"orbit": None}
+    old = robot.orbit
+    if new is None:
+        if old is None:
+            raise InputError(
+                f"'{robot.name}' is not in orbit, so {listed(f'--{name}' for name in changes)} "
+                "has no effect; add --orbit ALTITUDE"
+            )
+        new = _parts_of(old)
+    elif old and old.body == new["body"]:
+        kept = ("inclination", "field", "node_longitude")
+        new = {name: getattr(old, name) for name in kept if hasattr(old, name)} | new
+    return {"orbit": new | changes}
+
+
+def _parts_of(orbit: fflin.CircularOrbit | fflin.EllipticOrbit) -> dict[str, object]:
+    """Return the arguments of the class of an orbit that give the same orbit."""
+    parts = asdict(orbit)
+    # These follow from the altitude and the eccentricity.
+    parts.pop("mean_motion", None)
+    parts.pop("apogee", None)
+    return parts
+
+
 def linear_model(arguments: Namespace) -> tuple[fflin.Robot, fflin.LinearModel]:
     """Return the robot, and its linear model about the operating point in the arguments."""
     if not (arguments.equilibrium or arguments.relative_equilibrium):
@@ -364,7 +403,7 @@ def models_along(
     """
     if getattr(arguments, "periodic", None):
         return _models_of_period(arguments, robot or load_robot(arguments), prefix)
-    refuse(arguments, ("motion",), "without --periodic N, this has no effect")
+    refuse(arguments, ("motion", "period"), "without --periodic N, this has no effect")
     if arguments.trajectory is None:
         raise InputError(
             "neither --trajectory FILE nor --periodic N is given; give one of them"
@@ -392,7 +431,13 @@ def _models_of_period(
     states = (robot.point, robot.target) if prefix else (robot.point,)
     q, _ = state_of(robot, arguments, *states, prefix=prefix)
     motion = arguments.motion or "held"
-    return fflin.linearize_orbit(robot, q, motion=motion, steps=arguments.periodic)
+    return fflin.linearize_orbit(
+        robot,
+        q,
+        motion=motion,
+        steps=arguments.periodic,
+        period=arguments.period,
+    )
 
 
 def with_welds(robot: fflin.Robot, arguments: Namespace) -> fflin.Robot:
@@ -458,9 +503,12 @@ def designed(
 
 def tuning_of(
     arguments: Namespace,
-) -> tuple[fflin.Robot, object, fflin.Structure, list[fflin.Goal], dict[str, Any]]:
+) -> tuple[
+    fflin.Robot, object, fflin.Structure, list[fflin.Goal], dict[str, Any], bool
+]:
     """Return the robot, plant, structure, goals and settings of a search.
 
+    The last result is True if the law commands a wrench that other inputs of the robot produce.
     The options --law, --goal and --vary replace the entries of the table [tune] of the robot file.
     All names are checked.
     """
@@ -505,7 +553,7 @@ def tuning_of(
             )
         plant = fflin.uncertain(design, given["vary"])
         settings["q"] = lin.q
-    return design, plant, structure, goals, settings
+    return design, plant, structure, goals, settings, design is not robot
 
 
 def tuned_law(
@@ -615,7 +663,7 @@ def loop_of(
         return tracking, settings
     refuse(
         arguments,
-        ("offset", "hold", "motion"),
+        ("offset", "hold", "motion", "period"),
         "without --trajectory FILE or --periodic N, this has no effect",
     )
     if (law := detumbling_law(arguments)) is not None:
@@ -839,9 +887,6 @@ def about_point(
         refuse(
             arguments, of_gain, "--controller replaces the regulator and its options"
         )
-        from fflin.tuning.files import in_time_of
-
-        lin = in_time_of(arguments.controller, lin)
         sign = -1.0 if arguments.negative_feedback else 1.0
         feedback = fflin.LinearController(arguments.controller, lin, sign=sign)
     else:
@@ -926,7 +971,11 @@ def along(robot: fflin.Robot, arguments: Namespace) -> fflin.TrajectoryFeedback:
         schedule = fflin.tvlqr(models, Qf=end, sample=arguments.sample, weights=weights)
         return fflin.TrajectoryFeedback(models, schedule)
     designed = "the file of --schedule already contains the trajectory and the design of its gains"
-    refuse(arguments, ("trajectory", "hold", "periodic", "motion", *_WEIGHTS), designed)
+    refuse(
+        arguments,
+        ("trajectory", "hold", "periodic", "period", "motion", *_WEIGHTS),
+        designed,
+    )
     schedule = fflin.GainSchedule.load(arguments.schedule)
     refuse(arguments, regulator if schedule.period else (*regulator, *start), why)
     return fflin.TrajectoryFeedback(schedule.trajectory(robot), schedule)

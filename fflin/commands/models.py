@@ -130,6 +130,7 @@ def info(arguments: Namespace) -> Report:
             {"type": output.WORD, **asdict(output)} for output in robot.outputs
         ],
         "limits": limits,
+        "orbit": asdict(robot.orbit) if robot.orbit else None,
         "notes": notes,
         **constraints,
     }
@@ -212,7 +213,7 @@ def linearize(arguments: Namespace) -> Report:
         if arguments.dt is not None:
             along = along.discretize(arguments.dt)
         return _report_along(along, path)
-    refuse(arguments, ("motion",), "without --periodic N, this has no effect")
+    refuse(arguments, ("motion", "period"), "without --periodic N, this has no effect")
     _, lin = linear_model(arguments)
     if arguments.dt is not None:
         lin = lin.discretize(arguments.dt)
@@ -362,6 +363,9 @@ def analyze(arguments: Namespace) -> Report:
 
     example: fflin analyze servicer_7dof --stiffness panel_left=100 --output joints
     """
+    if arguments.periodic:
+        return _analysis_of_period(arguments)
+    refuse(arguments, ("motion", "period"), "without --periodic N, this has no effect")
     _, lin = linear_model(arguments)
     moved = fflin.controllability(lin)
     shown = fflin.observability(lin)
@@ -382,6 +386,25 @@ def analyze(arguments: Namespace) -> Report:
     text = "\n\n".join([", ".join(head), *sections])
     files = {arguments.plot: lambda path: fflin.plot_modes(lin_modes, path)}
     return Report(lin.robot, result, text, files)
+
+
+def _analysis_of_period(arguments: Namespace) -> Report:
+    """Return the report of controllability, observability and multipliers over one period."""
+    why = "this option is for one model, but --periodic gives many"
+    refuse(arguments, ("plot",), why)
+    along = models_along(arguments)
+    moved = fflin.controllability(along)
+    shown = fflin.observability(along)
+    head = [_rank(moved, "controllable"), _rank(shown, "observable")]
+    parts = {"inputs": str(moved), "motion": str(along), "outputs": str(shown)}
+    sections = (f"{title}\n{'-' * len(title)}\n{text}" for title, text in parts.items())
+    result = {
+        "controllability": moved,
+        "observability": shown,
+        "multipliers": along.multipliers,
+    }
+    text = "\n\n".join([", ".join(head), *sections])
+    return Report(along.robot.name, result, text)
 
 
 def _rank(ranks: fflin.Controllability | fflin.Observability, adjective: str) -> str:

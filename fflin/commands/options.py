@@ -17,10 +17,11 @@ _POSE = "joint rpy position velocity"
 _TARGET = "target-joint target-rpy target-position target-velocity"
 _INPUTS = "effort equilibrium tilt relative-equilibrium"
 _SYSTEM = (
-    "lock weld independent xacro orbit stiffness damping gravity passive inputs output"
+    "lock weld independent xacro orbit inclination field stiffness damping gravity passive inputs "
+    "output"
 )
 _TRAJECTORY = "trajectory hold strict"
-_PATH = f"{_TRAJECTORY} periodic motion"
+_PATH = f"{_TRAJECTORY} periodic period motion"
 _WEIGHTS = "weights q r bryson sample reduce wheel-speeds"
 _SCENE = "scene tool follow"
 _PICTURES = f"png gif times {_SCENE} fps speed"
@@ -47,7 +48,7 @@ OPTIONS: dict[str, dict[str, str]] = {
     "view": {
         "": "ROBOT",
         POINT: _POSE,
-        ROBOT: "lock weld xacro orbit",
+        ROBOT: "lock weld xacro orbit inclination field",
         OUTPUT: f"frame {_SCENE} no-open port",
     },
     "linearize": {
@@ -62,7 +63,7 @@ OPTIONS: dict[str, dict[str, str]] = {
         TRAJECTORY: _PATH,
         OUTPUT: "tolerance plot",
     },
-    "analyze": {**_AT_POINT, OUTPUT: "plot"},
+    "analyze": {**_AT_POINT, TRAJECTORY: "periodic period motion", OUTPUT: "plot"},
     "modes": {**_AT_POINT, OUTPUT: "plot html"},
     "equilibrium": {**_AT_POINT, OUTPUT: "output-file"},
     "sensitivity": {**_AT_POINT, "derivatives": "dt top only", OUTPUT: "output-file"},
@@ -145,12 +146,14 @@ DESCRIPTIONS = {
 # {command: options that its short help lists}. For a command without an entry, the short help lists
 # all options.
 COMMON = {
+    "uncertain": "joint vary lock stiffness damping passive inputs output output-file",
+    "info": "joint rpy position velocity lock orbit stiffness passive inputs output",
     "linearize": "joint rpy position velocity effort equilibrium time frame reference inputs dt "
     "for trajectory periodic output-file plot",
     "check": "joint rpy position velocity effort equilibrium frame reference inputs trajectory "
     "tolerance plot",
     "analyze": "joint rpy velocity equilibrium relative-equilibrium orbit stiffness inputs output "
-    "frame plot",
+    "frame periodic plot",
     "modes": "joint rpy velocity equilibrium relative-equilibrium orbit stiffness inputs output "
     "frame plot html",
     "equilibrium": "joint rpy velocity tilt relative-equilibrium orbit stiffness gravity passive "
@@ -225,7 +228,11 @@ ABOUT: dict[str, str] = {
     "xacro": "value of an argument of a xacro file",
     "orbit": "circular orbit at an altitude [m], or elliptic orbit with the heights [m] of perigee "
     "and apogee, above a central body: earth (default), moon, mars ... The world is then the "
-    "orbital frame. `none` removes the orbit of a robot file",
+    "orbital frame. Inclination and magnetic field are those of the orbit in robot.toml, if it has "
+    "the same central body. `none` removes the orbit of a robot file",
+    "inclination": "inclination of the orbit [rad], on which the magnetic field depends",
+    "field": "magnetic field of the orbit, for magnetorquers: dipole, tilted_dipole (which rotates "
+    "with the earth) or none",
     "stiffness": "stiffness of a joint [N m/rad|N/m], or one value for all joints",
     "damping": "damping of a joint [N m s/rad|N s/m], or one value for all joints. With `urdf` as "
     "VALUE, the damping in the URDF is used",
@@ -241,10 +248,14 @@ ABOUT: dict[str, str] = {
     "trajectory": f"use the trajectory in FILE: {_SAVED} or .csv; see "
     "fflin.Trajectory.load. --frame states the axes in which FILE gives base velocities and "
     "wrenches. The default of --frame is the frame named in FILE or, if there is none, local",
+    "analyze periodic": "for a robot in orbit: analyse the linear models at N + 1 knots of one "
+    "period, about a periodic motion that --motion selects",
     "periodic": "for a robot in orbit: use the linear models at N + 1 knots of one period, about a "
     "periodic motion that --motion selects. --joint, --rpy and --position define where the robot "
     "rests, relative to the axes `lvlh`. In a simulation, --target-joint, --target-rpy and "
     "--target-position define it",
+    "period": "time [s] after which the models of --periodic repeat; by default the period of the "
+    "orbit. The field of a tilted dipole repeats if the ground track does",
     "motion": "periodic motion of --periodic: at rest in the orbital frame and held by the inputs "
     "(held, default), or without inputs (free)",
     "time": "time of the model [s], for a robot whose model depends on time: in an elliptic orbit, "

@@ -48,6 +48,8 @@ class Compensator(EstimatingDesign):
         Name of the robot, and SHA-256 of its URDF.
     slow_bias : str
         Note on an estimated bias that settles more than ten times slower than the loop, or empty.
+    pace : str
+        Note on the disk margin of the loop, if default weights were made slower for it, or empty.
 
     Examples
     --------
@@ -67,6 +69,7 @@ class Compensator(EstimatingDesign):
     # Files of earlier versions do not contain E.
     E: Array = field(default_factory=lambda: np.zeros((0, 0)))
     slow_bias: str = ""
+    pace: str = ""
 
     def _report(self) -> str:
         """Return the report with the sizes and the poles of the closed loop."""
@@ -91,6 +94,8 @@ class Compensator(EstimatingDesign):
         notes = list(added_notes(self.state_names))
         if self.slow_bias:
             notes.append(self.slow_bias)
+        if self.pace:
+            notes.append(self.pace)
         return notes
 
     def _head(self) -> str:

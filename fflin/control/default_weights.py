@@ -84,6 +84,8 @@ class Pace(NamedTuple):
     hold: float = 0.0  # [s], hold time of the inputs; 0 if they are continuous
     # [rad], largest permitted product of mode frequency and hold time
     held: float = _HELD
+    slower: float = 1.0  # factor by which the bandwidth of the loop is divided
+    most: float = math.inf  # [rad/s], largest bandwidth
 
 
 def pace_of(lin: LinearModel) -> Pace:
@@ -120,13 +122,29 @@ def default_weights(
             "the default weights require; give Q and R"
         )
     pace = pace._replace(bandwidth=max(pace.bandwidth, _OF_FALL * _rate_of_fall(lin)))
+    to_velocities = np.linalg.inv(N)
+    weights = _within_limits(lin, to_velocities, pace, momenta)
+    if pace.slower == 1.0:
+        return weights
+    bandwidth = weights[3]
+    slower = pace._replace(most=bandwidth / pace.slower)
+    return _within_limits(lin, to_velocities, slower, momenta)
+
+
+def _within_limits(
+    lin: LinearModel, to_velocities: Array, pace: Pace, momenta: Mapping[str, float]
+) -> Weights:
+    """Return the weights of a pace, whose bandwidth is reduced as the limits require.
+
+    `to_velocities` (m, m) maps the rates of the coordinates to the velocities of the model.
+    """
     damping = _damping(lin)
-    w = pace.bandwidth
+    w = min(pace.bandwidth, pace.most)
     passes = _PASSES if damping.any() else 1
     for _ in range(passes):
         before = w
         M = lin.M + damping / w
-        Q, R, rule, w, terms = _of_inertia(lin, M, np.linalg.inv(N), pace, momenta)
+        Q, R, rule, w, terms = _of_inertia(lin, M, to_velocities, pace, momenta)
         if _NOT_ENOUGH in rule or w > 0.97 * before:
             break
     return Q, R, rule, w, terms
@@ -207,6 +225,7 @@ def _of_inertia(
     if pace.hold:
         fastest = float(modal.frequencies[-1])
         sampling = Limit(pace.held / (pace.hold * fastest), "the sampling time")
+    sampling = min(sampling, Limit(pace.most, "the disk margin"))
     damped = bool((lin.M != M).any())
     # In A of a free mass at rest, only the rates of the coordinates depend on the velocities.
     # Springs, dampers, gravity or a motion at the operating point add terms to A. Then velocities

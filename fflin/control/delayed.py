@@ -37,9 +37,13 @@ def law_with_memory(
     x = [states.index(name) for name in measured]
     z = [i for i in range(len(states)) if i not in x]
     K_x, K_z, B_z = K[:, x], K[:, z], B[z]
+    from_x = A[np.ix_(z, x)]
+    # Commands and lags do not depend on the robot, but rounding may couple them in a sampled model.
+    commands = [states[i] not in integrals for i in z]
+    from_x[commands] = 0.0
     return System(
         A[np.ix_(z, z)] - B_z @ K_z,
-        A[np.ix_(z, x)] - B_z @ K_x,
+        from_x - B_z @ K_x,
         -K_z,
         -K_x,
         dt,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, NamedTuple, Protocol
@@ -161,6 +162,10 @@ class Gain(ModelDesign):
     dependent_x0: Vector = field(default_factory=partial(np.zeros, 0))
     # The model for which the gain was designed; saved files do not contain it.
     _lin: LinearModel | None = field(default=None, repr=False, compare=False)
+    # With default weights: returns the gain whose bandwidth is divided by a factor.
+    _slower: Callable[[float], Gain] | None = field(
+        default=None, repr=False, compare=False
+    )
 
     def __post_init__(self) -> None:
         if not self.delay.size:

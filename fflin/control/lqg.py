@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import compress
 
 import numpy as np
@@ -13,10 +14,16 @@ from fflin.base.validation import Array, instance
 from fflin.control.compensator import Compensator
 from fflin.control.estimator import DISTURBANCE, Estimator
 from fflin.control.gain import Gain, neutral_poles
+from fflin.control.linear_controller import OutputFeedback
+from fflin.control.margins import disk_margin_of
 from fflin.control.multirate import MultirateCompensator, MultirateEstimator
+from fflin.control.multirate_feedback import MultirateFeedback
 from fflin.control.optimal.riccati import rates_of
+from fflin.control.policy import Policy
 from fflin.control.rejection import rejection
+from fflin.control.slower_weights import LEAST_DISK, is_late, slowed
 from fflin.dynamics.state import selection
+from fflin.linear.model import LinearModel
 
 # A mode belongs to biases if they have more than this fraction of its participation. A note appears
 # if such a mode is slower than the loop by more than the factor _SLOW.
@@ -54,6 +61,13 @@ def lqg(
     If limits change the commands of a compensator that integrates, rejects disturbances or has
     delayed inputs, the filter uses the limited inputs, and the integrals are corrected as in
     `StateFeedback`.
+
+    The filter reduces the margins of the loop. If inputs have delays or lags, or sensors have their
+    own sampling times or delays, the default weights of `lqr` are made slower here until the disk
+    margin of the whole loop is 2/3, which is a gain margin of 6 dB. The report of the compensator
+    then states the factor and the margin. If a loop that is four times slower has a smaller margin,
+    the gain is not changed, and the report states the margin. Weights from the user are not
+    changed.
 
     The compensator of a `MultirateEstimator` has matrices for each sample of the period. It uses
     the measurements of every sensor when they arrive, and is flown by `MultirateFeedback`.
@@ -93,11 +107,56 @@ def lqg(
     0.1
     """
     instance("gain", gain, Gain, "a Gain, as fflin.lqr returns it")
+    kinds = (Estimator, MultirateEstimator)
+    instance("estimator", estimator, kinds, "an Estimator, as fflin.kalman returns it")
+    first = _compensator(gain, estimator, zero_error)
+    slower = gain._slower
+    late = isinstance(estimator, MultirateEstimator) or is_late(gain)
+    if slower is None or not late:
+        return first
+    lin = gain._lin
+    assert lin is not None  # since the gain was designed for a model
+
+    def redesign(factor: float) -> Compensator | MultirateCompensator:
+        return _compensator(slower(factor), estimator, zero_error)
+
+    def margin_of(compensator: Compensator | MultirateCompensator) -> float | None:
+        return _disk_margin(lin, compensator)
+
+    compensator, change = slowed(first, redesign, margin_of)
+    if change is None:
+        return first
+    pace = f"the default weights of the gain: {change}"
+    if change.disk < LEAST_DISK:
+        smaller = " or a smaller disturbance_noise" if estimator.disturbances else ""
+        pace += f"; a larger W{smaller} of kalman raises it"
+    return replace(compensator, pace=pace)
+
+
+def _disk_margin(
+    lin: LinearModel, compensator: Compensator | MultirateCompensator
+) -> float | None:
+    """Return the disk margin at the inputs of a model with a compensator, or None."""
+    policy: Policy
+    try:
+        if isinstance(compensator, MultirateCompensator):
+            policy = MultirateFeedback(lin, compensator)
+        else:
+            policy = OutputFeedback(lin, compensator)
+    except InputError:  # the model has no robot
+        return None
+    return disk_margin_of(policy, lin)
+
+
+def _compensator(
+    gain: Gain,
+    estimator: Estimator | MultirateEstimator,
+    zero_error: Sequence[str] | None,
+) -> Compensator | MultirateCompensator:
+    """Return the compensator of `lqg`, whatever the margins of its loop."""
     if isinstance(estimator, MultirateEstimator):
         return _multirate(gain, estimator, zero_error)
-    e = instance(
-        "estimator", estimator, Estimator, "an Estimator, as fflin.kalman returns it"
-    )
+    e = estimator
     names = require_estimated(gain, e)
     require_one_integrator(gain.integrals, e.disturbances)
     S = selection(names, e.state_names)

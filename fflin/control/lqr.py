@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -21,6 +22,7 @@ from fflin.control import integral
 from fflin.control.default_weights import pace_of
 from fflin.control.gain import Gain, Integrals, cautions, make_gain
 from fflin.control.integral import Integrated
+from fflin.control.margins import disk_margin_of
 from fflin.control.optimal.riccati import (
     Riccati,
     Solution,
@@ -29,9 +31,11 @@ from fflin.control.optimal.riccati import (
     solved,
     structured,
 )
+from fflin.control.slower_weights import is_late, slowed
 from fflin.control.weights import (
     Rule,
     Weight,
+    are_default,
     cost_weights,
     integrated,
     rule_weights,
@@ -79,9 +83,12 @@ def lqr(
     centre of mass and 0.3 rad of each joint. Without springs, gravity and such limits, the
     bandwidths do not depend on the root frame of the URDF. If the model is continuous, each input
     has a phase margin of at least 60 deg and tolerates any gain factor above one half. A sampled
-    regulator has smaller margins; see ``gain.margins``. With springs or gravity, the controllable
-    modes decay as fast as without them (10.8). ``gain.weights`` states the bandwidth, decay rate
-    and damping of the loop, and lists any modes that still decay more slowly.
+    regulator has smaller margins; see ``gain.margins``. If inputs have delays or lags, default
+    weights are made slower until the disk margin of the loop is 2/3, which is a gain margin of
+    6 dB, but at most four times; ``gain.weights`` then states the factor and the margin. With
+    springs or gravity, the controllable modes decay as fast as without them (10.8).
+    ``gain.weights`` states the bandwidth, decay rate and damping of the loop, and lists any modes
+    that still decay more slowly.
 
     If no input pushes the base, its position and velocity are not regulated. Such inputs are, for
     example, a base torque or reaction wheels, with or without joint torques. Of a model with
@@ -188,8 +195,72 @@ def lqr(
         wheel_speeds=wheel_speeds,
         integral_action=integral_action,
     )
+    if Q is None and not isinstance(integral_action, Mapping):
+        gain = _with_margin(gain, lin, weights, wheel_speeds, integral_action)
     _caution(gain)
     return gain
+
+
+def _with_margin(
+    gain: Gain,
+    lin: LinearModel,
+    weights: Rule | None,
+    wheel_speeds: bool | None,
+    integral_action: Integrated | None,
+) -> Gain:
+    """Return a gain with default weights, made slower if its delays require it.
+
+    A gain of a model without delays and lags is returned unchanged, as is a gain with other
+    weights.
+    """
+    if not are_default(lin, weights):
+        return gain
+    redesign = partial(
+        _slower,
+        lin=lin,
+        weights=weights,
+        wheel_speeds=wheel_speeds,
+        integral_action=integral_action,
+    )
+    if not is_late(gain):
+        return replace(gain, _slower=redesign)
+    design, change = slowed(gain, redesign, _disk_margin)
+    if change is None:
+        return replace(gain, _slower=redesign)
+    return replace(
+        design,
+        weights=f"{design.weights}; {change}",
+        _slower=partial(redesign, since=change.factor),
+    )
+
+
+def _disk_margin(gain: Gain) -> float | None:
+    lin = gain._lin
+    assert lin is not None  # since the gain was just designed
+    return disk_margin_of(gain, lin)
+
+
+def _slower(
+    factor: float,
+    lin: LinearModel,
+    weights: Rule | None,
+    wheel_speeds: bool | None,
+    integral_action: Integrated | None,
+    since: float = 1.0,
+) -> Gain:
+    """Return a regulator with default weights, whose bandwidth is divided by ``since * factor``.
+
+    The regulator without these factors has already given all warnings.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FflinWarning)
+        return regulator(
+            lin,
+            weights=weights,
+            wheel_speeds=wheel_speeds,
+            integral_action=integral_action,
+            slower=since * factor,
+        )
 
 
 def _caution(gain: Gain) -> None:
@@ -207,15 +278,18 @@ def regulator(
     weights: Rule | None = None,
     wheel_speeds: bool | None = None,
     integral_action: Integrated | None = None,
+    slower: float = 1.0,
 ) -> Gain:
     """Return the same gain as `lqr`, without the warnings about margins and thrusters.
 
-    Other designs contain such a gain as a part, for example as their terminal cost.
+    Other designs contain such a gain as a part, for example as their terminal cost. The bandwidth
+    of default weights is divided by `slower`; their margin with delays is not examined.
     """
     lin = at_fixed_point(lin)
     rule = "as given"
     if Q is None and R is None and N is None:
-        Q, R, N, rule = rule_weights(lin, weights, pace_of(lin), wheel_speeds)
+        nominal = pace_of(lin)._replace(slower=slower)
+        Q, R, N, rule = rule_weights(lin, weights, nominal, wheel_speeds)
     elif weights is not None or Q is None or R is None:
         raise InputError(
             "give either both Q and R, or only weights='urdf' or 'identity'"

@@ -179,6 +179,27 @@ def _lagging(policy: Policy | Gain, lin: LinearModel) -> LinearModel:
 
 
 @in_one_thread
+def disk_margin_of(
+    policy: Policy | Gain,
+    lin: LinearModel,
+    delay: float | None = None,
+    sample: float | None = None,
+) -> float | None:
+    """Return the disk margin for changes of all inputs at once; 0 if the loop is unstable.
+
+    The result is None if the policy is not linear about a point, if its loop has no margins, or if
+    the loop has so many states that the computation would take long.
+    """
+    try:
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            closed = closed_loop(policy, lin, delay, sample)
+            if closed.states > _MOST_STATES or closed.harmonics > _MOST_HARMONICS:
+                return None
+            return closed.disk_margin()
+    except (InputError, np.linalg.LinAlgError):
+        return None
+
+
 def margins_at_once(
     policy: Policy, delay: float | None, sample: float | None
 ) -> GainMargins | None:
@@ -196,13 +217,8 @@ def margins_at_once(
         lin = lin.generator
         if lin is None:
             return None
-    try:
-        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            closed = closed_loop(policy, lin, delay, sample)
-            if closed.states > _MOST_STATES or closed.harmonics > _MOST_HARMONICS:
-                return None
-            disk = closed.disk_margin()
-    except (InputError, np.linalg.LinAlgError):
+    disk = disk_margin_of(policy, lin, delay, sample)
+    if disk is None:
         return None
     return GainMargins(disk, disk_gain(disk), disk_phase(disk))
 
@@ -247,10 +263,10 @@ def laws_in_loop(
         )
     if not outputs:
         return laws
-    return _with_sensors(laws, lin)
+    return with_sensors(laws, lin)
 
 
-def _with_sensors(laws: list[System], lin: LinearModel) -> list[System]:
+def with_sensors(laws: list[System], lin: LinearModel) -> list[System]:
     """Return laws of outputs in series with the sensors of the model's robot."""
     if lin._robot is None:
         if len(laws) > 1:

@@ -185,6 +185,8 @@ class MultirateCompensator(_Periodic):
         Signals of the compensator. The inputs of the compensator are the outputs of the model.
     robot, urdf_sha256 : str
         Name of the robot, and SHA-256 of its URDF.
+    pace : str
+        Note on the disk margin of the loop, as in `Compensator`.
 
     Examples
     --------
@@ -203,6 +205,7 @@ class MultirateCompensator(_Periodic):
     E: Array
     y0: Vector
     u0: Vector
+    pace: str = ""
 
     @property
     def samples(self) -> int:
@@ -212,15 +215,22 @@ class MultirateCompensator(_Periodic):
     def _report(self) -> str:
         """Return the report with the sizes and the slowest decay."""
         parts = [folded([self._summary(), self._head()])]
-        if notes := added_notes(self.state_names):
+        if notes := self._notes():
             parts.append(folded(notes))
         return "\n\n".join(parts)
+
+    def _notes(self) -> list[str]:
+        """Return notes on estimated disturbances and biases, and on the pace of the loop."""
+        notes = list(added_notes(self.state_names))
+        if self.pace:
+            notes.append(self.pace)
+        return notes
 
     def _html_parts(self) -> list[str]:
         return [
             html.paragraph(self._summary()),
             html.paragraph(self._head()),
-            *(html.paragraph(note) for note in added_notes(self.state_names)),
+            *(html.paragraph(note) for note in self._notes()),
         ]
 
     def _head(self) -> str:

@@ -457,6 +457,20 @@ def rule_weights(
     return (*sampled_cost(whole, lin.dt, Q, R, delay=delays), rule)
 
 
+def are_default(lin: LinearModel, given: Rule | None) -> bool:
+    """Return whether the rule "urdf" sets all weights: neither `given` nor the robot sets any."""
+    if not isinstance(given, Mapping):
+        given = {"rule": given}
+    sources = [given]
+    if given.get("rule") is None:
+        sources.append(lin.weights)
+    rules = {source["rule"] for source in sources if source.get("rule")}
+    single = ("q", "r", "bryson")
+    return rules <= {"urdf"} and not any(
+        source.get(part) for source in sources for part in single
+    )
+
+
 def integrated(lin: LinearModel, given: Rule | None) -> Any:
     """Return the integrated signals of `given` or of the robot's weights, or None."""
     own = given.get("integral") if isinstance(given, Mapping) else None

@@ -70,7 +70,7 @@ def refuse_orbit(robot: Robot, what: str) -> None:
     if getattr(robot, "orbit", None):
         raise InputError(
             f"{what} are defined only without an orbit, but '{robot.name}' is in orbit; remove the "
-            "orbit with robot.replace(orbit=None)"
+            "orbit with robot.replace(orbit=None) or --orbit none"
         )
 
 

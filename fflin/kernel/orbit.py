@@ -16,7 +16,7 @@ from collections import namedtuple
 
 from fflin.kernel import vectors as vec
 from fflin.kernel.bodies import add_column, at_parent, joint_axis, stored_momentum
-from fflin.kernel.tree import FIELD, INERTIA, PLACE, REALS, Struct
+from fflin.kernel.tree import FIELD, INERTIA, LANED, PLACE, REALS, Struct
 from fflin.kernel.vectors import called, load
 
 # Offsets in `Orbit.now`.
@@ -31,7 +31,10 @@ _KEPLER_STEPS = 80
 
 
 class Orbit(
-    namedtuple("Orbit", "outwards normal mean_motion ellipse latitude dipole now")
+    namedtuple(
+        "Orbit",
+        "outwards normal mean_motion ellipse latitude dipole pole distortion residual now",
+    )
 ):
     """Orbit of the simulated robot.
 
@@ -39,8 +42,16 @@ class Orbit(
     - `mean_motion` (1,) [rad/s].
     - `ellipse` (3,): eccentricity, and mean and true anomaly [rad] at t = 0; empty in a circular
       orbit.
-    - `latitude` (1,): argument of latitude [rad] at t = 0. `dipole` (3,) [T]: the amplitudes of
-      `dynamics.magnetic.MagneticField`; zero without a magnetic field.
+    - `latitude` (1,): argument of latitude u [rad] at t = 0.
+    - `dipole` (3,) [T]: amplitudes of the magnetic flux density (radial sin u, level cos u, polar)
+      of the part of a dipole along the rotation axis, away from the central body, along the orbit
+      and along the orbit normal, at a distance of one semi-major axis; zero without a field.
+    - `pole` (5,): for a tilted dipole, the amplitude [T] of the other part, the longitude [rad] of
+      its pole from the ascending node at t = 0, the angular velocity [rad/s] of the central body,
+      and sine and cosine of the inclination; otherwise empty.
+    - `distortion` (9,): columns of the matrix that multiplies the magnetic field, because the true
+      field differs from the model; empty without a difference.
+    - `residual` (3,) [A m^2]: residual dipole in base axes; empty without one.
     - `now` (11,): k [1/s^2], theta' [rad/s], theta'' [rad/s^2], the angle [rad] by which the
       orbital frame has rotated since t = 0, the magnetic flux density (3,) [T] in the axes of the
       orbital frame, the derivative (3,) of these three numbers, and the derivative of k [1/s^3].
@@ -48,7 +59,7 @@ class Orbit(
     """
 
 
-ORBIT = Struct(Orbit, REALS)
+ORBIT = Struct(Orbit, REALS, {LANED: "distortion residual"})
 
 
 def write_now(orbit, t):
@@ -63,13 +74,56 @@ def write_now(orbit, t):
         _write_ellipse(orbit, t)
     r, z = vec.get3(orbit.outwards, 0), vec.get3(orbit.normal, 0)
     along = vec.cross(z, r)
-    cosine, sine = vec.cosine_and_sine(orbit.latitude[0] + n * t)
+    rate = orbit.now[RATE]
+    cosine, sine = vec.cosine_and_sine(orbit.latitude[0] + orbit.now[ANGLE])
     radial, level, polar = vec.get3(orbit.dipole, 0)
     flux = vec.plus(vec.times(r, radial * sine), vec.times(along, level * cosine))
-    vec.put3(orbit.now, FLUX, vec.plus(flux, vec.times(z, polar)))
-    change = vec.times(r, n * radial * cosine)
-    change = vec.minus(change, vec.times(along, n * level * sine))
+    flux = vec.plus(flux, vec.times(z, polar))
+    change = vec.times(r, rate * radial * cosine)
+    change = vec.minus(change, vec.times(along, rate * level * sine))
+    vec.put3(orbit.now, FLUX, flux)
     vec.put3(orbit.now, FLUX_CHANGE, change)
+    if len(orbit.pole) > 0:
+        _add_tilt(orbit, t)
+    if len(orbit.ellipse) > 0:
+        _scale_flux(orbit)
+
+
+@called
+def _add_tilt(orbit, t):
+    """Add the magnetic field of the part of a dipole across the rotation axis at time t [s]."""
+    r, z = vec.get3(orbit.outwards, 0), vec.get3(orbit.normal, 0)
+    along = vec.cross(z, r)
+    amplitude, longitude, spin = vec.get3(orbit.pole, 0)
+    i_sine, i_cosine = orbit.pole[3], orbit.pole[4]
+    cosine, sine = vec.cosine_and_sine(orbit.latitude[0] + orbit.now[ANGLE])
+    x, y = vec.cosine_and_sine(longitude + spin * t)
+    # Components of the unit vector (x, y, 0) away from the central body, along the orbit and along
+    # the orbit normal, and their derivatives.
+    rate = orbit.now[RATE]
+    outer = cosine * x + sine * i_cosine * y
+    level = cosine * i_cosine * y - sine * x
+    polar = -i_sine * y
+    outer_change = rate * level + spin * (sine * i_cosine * x - cosine * y)
+    level_change = spin * (sine * y + cosine * i_cosine * x) - rate * outer
+    polar_change = -spin * i_sine * x
+    flux = vec.plus(vec.times(r, -2.0 * outer), vec.times(along, level))
+    flux = vec.plus(flux, vec.times(z, polar))
+    vec.add3(orbit.now, FLUX, vec.times(flux, amplitude))
+    change = vec.plus(vec.times(r, -2.0 * outer_change), vec.times(along, level_change))
+    change = vec.plus(change, vec.times(z, polar_change))
+    vec.add3(orbit.now, FLUX_CHANGE, vec.times(change, amplitude))
+
+
+def _scale_flux(orbit):
+    """Scale the magnetic field to the distance in an elliptic orbit, by (a / r)^3."""
+    n = orbit.mean_motion[0]
+    scale = orbit.now[STRENGTH] / (n * n)
+    flux = vec.times(vec.get3(orbit.now, FLUX), scale)
+    growth = orbit.now[STRENGTH_CHANGE] / orbit.now[STRENGTH]
+    change = vec.times(vec.get3(orbit.now, FLUX_CHANGE), scale)
+    vec.put3(orbit.now, FLUX, flux)
+    vec.put3(orbit.now, FLUX_CHANGE, vec.plus(change, vec.times(flux, growth)))
 
 
 @called
@@ -129,15 +183,39 @@ def spin_at(orbit, q):
     return vec.times(normal_at(orbit, q), orbit.now[RATE])
 
 
+def model_flux_at(orbit, q):
+    """Return the magnetic flux density [T] of the model, without its errors, in base axes."""
+    return vec.across(vec.axes_of(q), vec.get3(orbit.now, FLUX))
+
+
 def flux_at(orbit, q):
     """Return the magnetic flux density [T] in base axes."""
-    return vec.across(vec.axes_of(q), vec.get3(orbit.now, FLUX))
+    return _true_vector(orbit, q, FLUX)
 
 
 def flux_rate_at(orbit, q, nu):
     """Return the time derivative [T/s] of the magnetic flux density in base axes."""
-    change = vec.across(vec.axes_of(q), vec.get3(orbit.now, FLUX_CHANGE))
+    change = _true_vector(orbit, q, FLUX_CHANGE)
     return vec.plus(change, vec.cross(flux_at(orbit, q), vec.get3(nu, 0)))
+
+
+def _true_vector(orbit, q, at):
+    """Return a vector of the true magnetic field in base axes; `now[at]` is the model's vector."""
+    axes = vec.axes_of(q)
+    vector = vec.get3(orbit.now, at)
+    result = vec.across(axes, vector)
+    if len(orbit.distortion) > 0:
+        columns = vec.get_columns(orbit.distortion, 0)
+        result = vec.across(axes, vec.product(columns, vector))
+    return result
+
+
+@called
+def add_residual_torque(work, orbit, q, to):
+    """Add the torque (3,) of the residual dipole, in base axes, to `work` from `to` on."""
+    if len(orbit.residual) > 0:
+        dipole = vec.get3(orbit.residual, 0)
+        vec.add3(work, to, vec.cross(dipole, flux_at(orbit, q)))
 
 
 def from_inertial_axes(orbit, a):

@@ -12,7 +12,7 @@ from scipy.linalg import expm
 
 from fflin.base.errors import EquilibriumError, InputError
 from fflin.base.process import in_one_thread
-from fflin.base.validation import Array, ArrayLike, count
+from fflin.base.validation import Array, ArrayLike, count, positive
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.coordinates import refuse_constraints
 from fflin.dynamics.integrators import DEFAULT_INTEGRATOR
@@ -21,7 +21,9 @@ from fflin.dynamics.state_rows import moving_error
 from fflin.linear.linear_trajectory import LinearTrajectory, along
 from fflin.linear.linearization import Linearizer
 from fflin.linear.trajectory import Trajectory
+from fflin.robot.inputs import has_magnetorquers
 from fflin.robot.joints import ROOT
+from fflin.robot.orbit import TILTED_DIPOLE
 from fflin.robot.outputs import FullState
 from fflin.robot.robot import Robot
 
@@ -47,6 +49,7 @@ def linearize_orbit(
     *,
     motion: str = "held",
     steps: int = 200,
+    period: float | None = None,
 ) -> LinearTrajectory:
     r"""Linearise a robot over one period of its orbit, about a periodic motion.
 
@@ -72,6 +75,11 @@ def linearize_orbit(
           the forced pitch motion of a satellite in an elliptic orbit.
     steps : int
         Number of intervals between the knots of one period.
+    period : float, optional
+        Time [s] after which the magnetic field repeats in the orbital frame; by default the period
+        of the orbit. If the orbit is elliptic, it must be a multiple of that period. Only fields
+        for magnetorquers need another period, such as a tilted dipole, which rotates with the
+        earth. Its field repeats if the ground track of the orbit does.
 
     Returns
     -------
@@ -82,8 +90,8 @@ def linearize_orbit(
     Raises
     ------
     InputError
-        If the robot is not in orbit or has constraints, `motion` is unknown, or a free motion needs
-        too many steps.
+        If the robot is not in orbit or has constraints, `motion` is unknown, a free motion needs
+        too many steps, or the field of magnetorquers does not repeat after one period.
     EquilibriumError
         If the inputs cannot hold the robot, the wheels gain momentum in every period, or no free
         periodic motion is found near q.
@@ -101,22 +109,37 @@ def linearize_orbit(
     if getattr(robot, "orbit", None) is None:
         raise InputError(
             f"'{getattr(robot, 'name', robot)}' is not in orbit; give it an orbit by "
-            "robot.replace(orbit=fflin.EllipticOrbit(perigee=..., apogee=...))"
+            "robot.replace(orbit=fflin.EllipticOrbit(perigee=..., apogee=...)) or --orbit"
         )
     assert robot.orbit is not None
     refuse_constraints(robot, "linear models over one orbit")
     if not isinstance(motion, str) or motion not in ("held", "free"):
         raise InputError(f"motion is {motion!r}, expected 'held' or 'free'")
     steps = count("steps", steps, 8)
-    times = np.linspace(0.0, robot.orbit.period, steps + 1)
+    period = _checked_period(robot, period)
+    times = np.linspace(0.0, period, steps + 1)
     q0 = robot.neutral() if q is None else robot.checked_configuration(q).copy()
     problem = _Problem(robot)
     if not q0[:3].any() and not problem.pushes:
         q0 = problem.centred(q0)
     path = problem.held(q0, times) if motion == "held" else problem.free(q0, times)
-    period = robot.orbit.period
     knots = times, path.q, path.v, path.u
     return along(Trajectory(robot, *knots, hold="smooth", period=period))
+
+
+def _checked_period(robot: Robot, period: float | None) -> float:
+    """Return the period [s] of the models; refuse a field that rotates without a given period."""
+    orbit = robot.orbit
+    assert orbit is not None
+    if period is not None:
+        return positive("period", period, "s")
+    if orbit.field == TILTED_DIPOLE and has_magnetorquers(robot.inputs):
+        raise InputError(
+            f"the tilted dipole of '{robot.name}' rotates with the earth, so that its field does "
+            f"not repeat after one orbit of {orbit.period:.6g} s; give period=, after which the "
+            "ground track repeats, or design with field='dipole'"
+        )
+    return orbit.period
 
 
 class _Path(NamedTuple):

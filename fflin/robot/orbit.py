@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import KW_ONLY, asdict, dataclass, fields
 from functools import lru_cache
-from typing import Any, ClassVar, NamedTuple, TypeAlias, TypeVar
+from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 from fflin.base import html
 from fflin.base.errors import FflinWarning, InputError, require_known
@@ -36,13 +36,34 @@ BODIES = {
 
 # Moments [T m^3] of the centred dipoles that are used as magnetic fields: mu_0 / (4 pi) times the
 # magnetic dipole moment. The earth's moment is (29.73 uT) (6371.2 km)^3, with the dipole terms of
-# IGRF-14 in 2025. The dipole is along the rotation axis, and points south.
+# IGRF-14 in 2025. The dipole points south.
 DIPOLES = {"earth": 29.73e-6 * 6371.2e3**3}
+
+
+class MagneticPole(NamedTuple):
+    """Place where the axis of a dipole leaves the northern hemisphere, and its motion."""
+
+    colatitude: float  # angle [rad] from the rotation axis of the body
+    longitude: float  # geographic longitude [rad], positive eastwards
+    rate: float  # angular velocity [rad/s] of the body relative to inertial space
+
+
+# Dipole terms g10, g11 and h11 [nT] of IGRF-14 in 2025, from which the pole follows, and the
+# angular velocity of the earth of WGS 84.
+_G10, _G11, _H11 = -29350.0, -1410.3, 4545.5
+MAGNETIC_POLES = {
+    "earth": MagneticPole(
+        math.atan2(math.hypot(_G11, _H11), -_G10), math.atan2(-_H11, -_G11), 7.292115e-5
+    )
+}
 
 # Function of time [s] and of the position (3,) [m] of the origin of the orbital frame from the
 # centre of the central body, which returns the magnetic flux density (3,) [T]. Both vectors are in
 # equatorial inertial axes: x towards the ascending node, z along the north pole.
 MagneticField: TypeAlias = Callable[[float, Array], ArrayLike]
+
+# Names of the fields that are not functions.
+DIPOLE, TILTED_DIPOLE = "dipole", "tilted_dipole"
 
 # If an altitude over the earth is below this value [m], it was probably given in km.
 _LOWEST = 80e3
@@ -86,16 +107,21 @@ class CircularOrbit:
         field depends on it.
     argument_of_latitude : float
         Angle [rad] at t = 0 along the orbit, measured from the ascending node.
-    field : {"dipole"} or callable, optional
+    field : {"dipole", "tilted_dipole"} or callable, optional
         Magnetic field for inputs of the type `Magnetorquer`. "dipole" is the field of a dipole
-        along the rotation axis of the earth. A function of the time t [s] and of the position (3,)
-        [m] of the origin of the orbital frame from the centre of the body returns the flux density
-        (3,) [T]. Both vectors are in inertial axes with x towards the ascending node and z towards
-        the north pole. By default, there is no field.
+        along the rotation axis of the earth. "tilted_dipole" is the field of a dipole through the
+        geomagnetic poles, which rotates with the earth. A function of the time t [s] and of the
+        position (3,) [m] of the origin of the orbital frame from the centre of the body returns the
+        flux density (3,) [T]. Both vectors are in inertial axes with x towards the ascending node
+        and z towards the north pole. By default, there is no field.
+    node_longitude : float
+        Geographic longitude [rad] of the ascending node at t = 0, positive eastwards; only the
+        tilted dipole depends on it.
 
     Attributes
     ----------
-    altitude, mean_motion, body, mu, body_radius, inclination, argument_of_latitude, field
+    altitude, mean_motion, body, mu, body_radius, inclination, argument_of_latitude, field,
+    node_longitude
         The parameters; omitted parameters are computed from the others.
     radius : float
         Radius of the orbit [m].
@@ -130,6 +156,7 @@ class CircularOrbit:
     inclination: float = 0.0
     argument_of_latitude: float = 0.0
     field: str | MagneticField | None = None
+    node_longitude: float = 0.0
 
     def __post_init__(self) -> None:
         mu, ground = _central_body(self.body, self.mu, self.body_radius)
@@ -167,6 +194,7 @@ class CircularOrbit:
                 -ONE_ROTATION,
                 ONE_ROTATION,
             ),
+            "node_longitude": _longitude(self.node_longitude),
         }
         _check_field(self.field, self.body)
         for name, value in known.items():
@@ -184,10 +212,7 @@ class CircularOrbit:
 
     def to_json(self) -> str:
         """Return the orbit as JSON text; a field that is a function is left out."""
-        parts = asdict(self)
-        if callable(self.field):
-            parts["field"] = None
-        return json.dumps(parts)
+        return _json_text(self)
 
     @classmethod
     def from_json(cls, text: str) -> CircularOrbit:
@@ -195,12 +220,8 @@ class CircularOrbit:
         return _restored(cls, text, "mean_motion")
 
     def _repr_html_(self) -> str:
-        field = self.field if isinstance(self.field, str) else "function"
-        rows = {
-            "argument of latitude at t = 0": f"{_degrees(self.argument_of_latitude)}",
-            "magnetic field": "none" if self.field is None else field,
-        }
-        return _card(self, rows)
+        latitude = _degrees(self.argument_of_latitude)
+        return _card(self, {"argument of latitude at t = 0": latitude})
 
     def __str__(self) -> str:
         return (
@@ -213,6 +234,13 @@ def _degrees(angle: float) -> str:
     return f"{math.degrees(angle):.6g} deg"
 
 
+def _field_text(field: str | MagneticField | None) -> str:
+    """Return a magnetic field as text."""
+    if field is None:
+        return "none"
+    return field if isinstance(field, str) else "function"
+
+
 def _card(orbit: CircularOrbit | EllipticOrbit, rows: Mapping[str, str]) -> str:
     """Return a card for notebooks; `rows` are facts that only this type of orbit has."""
     facts = {
@@ -220,6 +248,7 @@ def _card(orbit: CircularOrbit | EllipticOrbit, rows: Mapping[str, str]) -> str:
         "mean motion": f"{orbit.mean_motion:.6g} rad/s",
         "inclination": _degrees(orbit.inclination),
         **rows,
+        "magnetic field": _field_text(orbit.field),
     }
     table = html.table([["", ""], *([*fact] for fact in facts.items())], "ll")
     return html.card(type(orbit).__name__, str(orbit).partition(", ")[0], table)
@@ -276,11 +305,10 @@ class EllipticOrbit:
     eccentricity : float, optional
         Eccentricity e of the orbit, 0 <= e < 1, instead of the apogee.
     inclination : float
-        Angle [rad] between the orbital plane and the equator, 0 to pi. The gravity gradient does
-        not depend on it.
+        Angle [rad] between the orbital plane and the equator, 0 to pi; only the magnetic field
+        depends on it.
     argument_of_perigee : float
-        Angle [rad] from the ascending node to the perigee. The gravity gradient does not depend on
-        it.
+        Angle [rad] from the ascending node to the perigee; only the magnetic field depends on it.
     anomaly : float
         True anomaly [rad] at t = 0: the angle from the perigee to the robot.
     body : str
@@ -288,10 +316,13 @@ class EllipticOrbit:
         requires `mu` and `body_radius`.
     mu, body_radius : float, optional
         Gravitational parameter [m^3/s^2] and radius [m] of the central body.
+    field, node_longitude
+        Magnetic field and longitude of the ascending node, as in `CircularOrbit`.
 
     Attributes
     ----------
     perigee, apogee, eccentricity, inclination, argument_of_perigee, anomaly, body, mu, body_radius
+    field, node_longitude
         The parameters; omitted parameters are computed from the others.
     semi_major_axis : float
         Semi-major axis [m].
@@ -304,7 +335,7 @@ class EllipticOrbit:
     ------
     InputError
         If apogee and eccentricity are both given or both omitted, an angle is out of range, the
-        orbit is not an ellipse, or it is below the surface.
+        orbit is not an ellipse, it is below the surface, or the field is not valid.
     UnknownNameError
         If the central body is unknown.
 
@@ -319,9 +350,6 @@ class EllipticOrbit:
     1800.0
     """
 
-    # The magnetic field along an elliptic orbit is not known.
-    field: ClassVar[None] = None
-
     perigee: float
     apogee: float = _FOLLOWS
     eccentricity: float = _FOLLOWS
@@ -331,6 +359,8 @@ class EllipticOrbit:
     body: str = "earth"
     mu: float = _FOLLOWS
     body_radius: float = _FOLLOWS
+    field: str | MagneticField | None = None
+    node_longitude: float = 0.0
 
     def __post_init__(self) -> None:
         mu, ground = _central_body(self.body, self.mu, self.body_radius)
@@ -375,7 +405,9 @@ class EllipticOrbit:
             "eccentricity": e,
             "mu": mu,
             "body_radius": ground,
+            "node_longitude": _longitude(self.node_longitude),
         }
+        _check_field(self.field, self.body)
         for name, value in known.items():
             object.__setattr__(self, name, value)
         if not math.isfinite(nearest / (1.0 - e)):
@@ -426,8 +458,8 @@ class EllipticOrbit:
         )
 
     def to_json(self) -> str:
-        """Return the orbit as JSON text."""
-        return json.dumps(asdict(self))
+        """Return the orbit as JSON text; a field that is a function is left out."""
+        return _json_text(self)
 
     @classmethod
     def from_json(cls, text: str) -> EllipticOrbit:
@@ -453,6 +485,14 @@ class EllipticOrbit:
 
 Orbit: TypeAlias = CircularOrbit | EllipticOrbit
 _Kind = TypeVar("_Kind", CircularOrbit, EllipticOrbit)
+
+
+def _json_text(orbit: Orbit) -> str:
+    """Return an orbit as JSON text; a field that is a function is left out."""
+    parts = asdict(orbit)
+    if callable(orbit.field):
+        parts["field"] = None
+    return json.dumps(parts)
 
 
 def _restored(kind: type[_Kind], text: str, derived: str) -> _Kind:
@@ -547,14 +587,19 @@ def _angle(name: str, value: object, least: float, most: float) -> float:
     return angle
 
 
+def _longitude(value: object) -> float:
+    """Return a geographic longitude [rad], or raise `InputError`."""
+    return _angle("node_longitude", value, -ONE_ROTATION, ONE_ROTATION)
+
+
 def _check_field(field: object, body: str) -> None:
     """Raise `InputError` if a magnetic field is neither known nor a function nor None."""
     if field is None or callable(field):
         return
-    if not isinstance(field, str) or field != "dipole":
+    if not isinstance(field, str) or field not in (DIPOLE, TILTED_DIPOLE):
         raise InputError(
-            f"field is {field!r}, expected 'dipole' or a function of time [s] and position [m] "
-            "that returns the flux density (3,) [T]"
+            f"field is {field!r}, expected 'dipole', 'tilted_dipole' or a function of time [s] and "
+            "position [m] that returns the flux density (3,) [T]"
         )
     if body not in DIPOLES:
         raise InputError(

@@ -20,6 +20,7 @@ from fflin.robot.inputs import BaseForce, BaseTorque, Thruster
 from fflin.robot.joints import ROOT, Joint
 
 if TYPE_CHECKING:
+    from fflin.robot.orbit import Orbit
     from fflin.robot.robot import Robot
 
 LIMIT_UNITS = "limits in rad, N m and rad/s, or in m, N and m/s for prismatic joints"
@@ -61,7 +62,7 @@ def robot_info(robot: Robot, at_point: str = "") -> str:
     head = f"{robot.name}: {', '.join(counts)}, mass {robot.mass:.6g} kg"
     head += f"\nfrom {robot.urdf or 'a Pinocchio model'}"
     if robot.orbit:
-        head += f"\n{folded([str(robot.orbit)])}"
+        head += f"\n{folded(_orbit_lines(robot.orbit))}"
     tree = joint_table(robot)
     limits = ""
     if any(cell != "." for row in tree[1:] for cell in row[3:]):
@@ -77,6 +78,16 @@ def robot_info(robot: Robot, at_point: str = "") -> str:
             "\n".join(("warnings", *(_indented(note, "    ") for note in robot.notes)))
         )
     return "\n\n".join(filter(None, parts))
+
+
+def _orbit_lines(orbit: Orbit) -> list[str]:
+    """Return lines about an orbit and, if it has one, about its magnetic field."""
+    lines = [str(orbit)]
+    if orbit.field is not None:
+        field = orbit.field if isinstance(orbit.field, str) else "function"
+        angle = math.degrees(orbit.inclination)
+        lines.append(f"magnetic field {field}, inclination {angle:.6g} deg")
+    return lines
 
 
 def joint_table(robot: Robot) -> list[list[str]]:

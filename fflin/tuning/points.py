@@ -46,12 +46,15 @@ class Points:
         Further models, of which the search adds the worst ones.
     corners : int
         Number of candidates that are corners; these come first.
+    lft : LFT, optional
+        Continuous model as a function of the uncertain parameters, if the law is continuous.
     """
 
     nominal: LinearModel
     fixed: tuple[Point, ...]
     candidates: tuple[Point, ...] = ()
     corners: int = 0
+    lft: LFT | None = None
 
 
 def points_of(
@@ -129,7 +132,8 @@ def _of_ranges(
         Point(_sampled(lft, row, dt, delays), plant.values(row)) for row in rows
     )
     first = Point((lin.A, lin.B, lin.C, lin.D))
-    return Points(lin, (first,), candidates, len(corners))
+    whole = lft if dt is None else None
+    return Points(lin, (first,), candidates, len(corners), whole)
 
 
 def _sampled(

@@ -19,10 +19,11 @@ from fflin.tuning.curves import GoalLoops
 from fflin.tuning.goals import Goal
 from fflin.tuning.hinf import hinf
 from fflin.tuning.law import Law
-from fflin.tuning.loop import require_plain_sensors
+from fflin.tuning.loop import sensor_delays, with_delayed_outputs
 from fflin.tuning.plant import Plant, Signals, plant_of, signals_of
 from fflin.tuning.points import Point, Points, points_of
 from fflin.tuning.problem import Case, Measure, Problem
+from fflin.tuning.robust import UncertainLoop
 from fflin.tuning.search import Minimum, Term, minimise
 from fflin.tuning.starts import searched, stabilised
 from fflin.tuning.structures import Structure, Structured
@@ -107,7 +108,8 @@ def tune(
         If one of these conditions is true:
 
         - a signal of a goal or of the structure does not exist;
-        - a measured output has a `delay`, or a `sample` other than `dt`;
+        - a measured output has a `sample` other than `dt`, or a `delay` that is not a multiple of
+          `dt`;
         - a model holds only at one time, as in an elliptic orbit;
         - no start reaches a stable loop, for example because no law can move an unstable pole;
         - the variance of a goal is infinite, because noise reaches its output without a lag.
@@ -169,7 +171,7 @@ class _Task:
         self.signals: Signals = signals_of(lin)
         self.structured = Structured(structure, self.signals)
         measured, commanded = self.structured.used
-        require_plain_sensors(lin, measured, "tune")
+        self.delays = sensor_delays(lin, measured)
         self.measures = [
             Measure(
                 goal,
@@ -201,9 +203,10 @@ class _Task:
     def plant(self, point: Point) -> Plant:
         """Return the plant of a model."""
         used = self.used
-        more = len(point.matrices[0]) + len(point.matrices[2]) - len(used)
+        matrices = with_delayed_outputs(point.matrices, self.delays)
+        more = len(matrices[0]) + len(matrices[2]) - len(used)
         used = np.append(used, np.zeros(max(more, 0), bool))
-        return plant_of(point.matrices, self.lin.dt, used)
+        return plant_of(matrices, self.lin.dt, used)
 
     def problem(self) -> Problem:
         """Return the problem of the models that are chosen."""
@@ -339,6 +342,9 @@ class _Task:
         worst = self.worst(problem, minimum.x, distinct)
         law = problem.law(minimum.x)
         level = self._soft_level([found.value for found in worst])
+        uncertain = None
+        if self.points.lft is not None:
+            uncertain = UncertainLoop(self.points.lft, law, self.used)
         goals = []
         for index, (found, measure) in enumerate(
             zip(worst, self.measures, strict=True)
@@ -352,6 +358,10 @@ class _Task:
                 where = found.piece.where
             hard = measure.goal.hard
             active = is_active(found.value, hard, level)
+            bound = math.nan
+            if uncertain is not None:
+                largest = max(found.value, 0.0 if math.isnan(check) else check)
+                bound = uncertain.bound(measure.goal, measure.ends, largest)
             goals.append(
                 GoalValue(
                     measure.goal.label,
@@ -362,6 +372,7 @@ class _Task:
                     dict(found.point.parameters),
                     active,
                     self._least(measure.goal),
+                    bound,
                 )
             )
         values = problem.values(minimum.x)[0].tolist()

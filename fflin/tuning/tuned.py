@@ -12,7 +12,7 @@ import numpy as np
 from fflin.base import html
 from fflin.base.figures import Figure
 from fflin.base.record import write_record
-from fflin.base.tables import cut, folded, grid, width
+from fflin.base.tables import counted, cut, folded, grid, width
 from fflin.base.validation import Array
 from fflin.base.writing import as_path
 from fflin.control.linear_controller import LinearController
@@ -49,6 +49,10 @@ class GoalValue:
     least : float
         Least value of all linear controllers for the nominal model, from `hinf`, within 1 %. NaN if
         `hinf` does not accept the goal, or slycot is not installed.
+    bound : float
+        Upper bound of the value over the whole ranges of an `Uncertain`, from the structured
+        singular value; infinite if no bound was found. NaN for goals that are not gains, for
+        sampled laws, and for plants without ranges.
 
     Examples
     --------
@@ -67,6 +71,7 @@ class GoalValue:
     parameters: Mapping[str, float]
     active: bool
     least: float = math.nan
+    bound: float = math.nan
 
     @property
     def worst(self) -> float:
@@ -164,15 +169,17 @@ class Tuned(LinearController):
             html.paragraph(self._verdict()),
             html.table(self._goal_rows(), "llrrrr"),
         ]
+        parts += [html.paragraph(line) for line in self._range_lines()]
         parts.append(html.table(self._parameter_rows(), "lrl"))
         return html.result_card(self, *parts)
 
     def _verdict(self) -> str:
         """Return whether the goals hold, and what limits them."""
         if self.met:
+            models = counted(self.examined, "model")
             return (
-                f"{self.lin.robot}: all goals hold at {_counted(self.examined)}; the largest value "
-                f"is {self.factor:.4g} of its limit"
+                f"{self.lin.robot}: all goals hold at {models}; the largest value is "
+                f"{self.factor:.4g} of its limit"
             )
         names = [goal.label for goal in self.goals if not goal.met]
         text = (
@@ -232,6 +239,34 @@ class Tuned(LinearController):
             lines.append(f"model {number}: {', '.join(values)}")
         return lines
 
+    def _range_lines(self) -> list[str]:
+        """Return what is known of the values between the examined models of an `Uncertain`."""
+        if self.examined == len(self.points):
+            return []
+        if self.dt:
+            return [
+                "the values hold at the examined models; a bound over the whole ranges requires a "
+                "continuous law"
+            ]
+        finite = [
+            f"{goal.label} {goal.bound:.4g}"
+            for goal in self.goals
+            if math.isfinite(goal.bound)
+        ]
+        without = [goal.label for goal in self.goals if not math.isfinite(goal.bound)]
+        lines = []
+        if finite:
+            lines.append(
+                "upper bounds of the values over the whole ranges, by the structured singular "
+                f"value: {', '.join(finite)}; a bound above 1 does not certify its goal"
+            )
+        if without:
+            lines.append(
+                f"not certified over the whole ranges: {', '.join(without)}; between the examined "
+                "models, the values can be larger"
+            )
+        return lines
+
     def _parameter_rows(self) -> list[list[str]]:
         """Return the table of the parameters."""
         rows = [["parameter", "value", "unit"]]
@@ -244,9 +279,9 @@ class Tuned(LinearController):
         finite = [value for value in self.starts if math.isfinite(value)]
         near = sum(value <= 1.01 * min(finite) for value in finite) if finite else 0
         search = (
-            f"{len(self.starts)} starts, of which {near} reached the best value within 1 %; "
-            f"stationarity {self.stationarity:.1e}; "
-            f"{_counted(len(self.points))} in the search, {_counted(self.examined)} examined"
+            f"{counted(len(self.starts), 'start')}, of which {near} reached the best value within "
+            f"1 %; stationarity {self.stationarity:.1e}; "
+            f"{counted(len(self.points), 'model')} in the search, {self.examined} examined"
         )
         rows = cut(self._fitting_rows(), "see goals")
         goals = grid(rows, "llrrrr"[: len(rows[0])])
@@ -262,6 +297,8 @@ class Tuned(LinearController):
             if math.isfinite(goal.least):
                 least = f"the least value of all linear controllers is {goal.least:.4g}"
                 parts.append(folded([f"{goal.label}: {least}"]))
+        if lines := self._range_lines():
+            parts.append(folded(lines))
         return "\n\n".join((*parts, parameters, folded([search])))
 
     def record(self) -> dict[str, object]:
@@ -282,6 +319,7 @@ class Tuned(LinearController):
                 "met": goal.met,
                 "active": goal.active,
                 "least": goal.least,
+                "bound": goal.bound,
                 "frequency": goal.frequency,
                 "parameters": goal.parameters,
             }
@@ -310,10 +348,6 @@ class Tuned(LinearController):
         """
         record = record_of_law(self) | {"parameters": dict(self.parameters)}
         write_record(as_path(path), record, checksummed=self.lin.verified)
-
-
-def _counted(number: int) -> str:
-    return "1 model" if number == 1 else f"{number} models"
 
 
 def matrices_of(law: Law, dt: float) -> tuple[Array, Array, Array, Array, float]:

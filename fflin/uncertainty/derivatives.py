@@ -4,20 +4,33 @@ The inertia matrix M and the inverse dynamics (RNEA) are linear in the ten dynam
 each body. So the derivative of M with respect to one of these parameters is equal to M of another
 robot. In that robot, this parameter is 1 and all other parameters are 0. Likewise, the derivative
 of RNEA is equal to RNEA of that robot.
+
+A change F of the generalised forces changes the accelerations by -M^-1 F. If the robot has
+constraints, it changes the accelerations and the constraint forces by `HeldForces.response` times
+F. The rows of all derivatives of accelerations are then followed by the rows of the derivatives of
+constraint forces.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError
 from fflin.base.rotation import skew
-from fflin.base.validation import Array
+from fflin.base.validation import Array, Indices
 from fflin.dynamics.aba import Aba
-from fflin.dynamics.coordinates import LINEAR, PIN_ANGULAR, Chart, ReferenceChart
+from fflin.dynamics.closure import closure_of
+from fflin.dynamics.coordinates import (
+    ANGULAR,
+    LINEAR,
+    PIN_ANGULAR,
+    Chart,
+    ReferenceChart,
+)
 from fflin.dynamics.integrators import held_derivatives, held_exponential
 from fflin.dynamics.orbital import GravityGradient
 from fflin.dynamics.rnea import AccelerationDerivatives, Accelerations, Inertia
@@ -29,6 +42,7 @@ from fflin.linear.state_equations import assemble, output_equations
 from fflin.robot.joints import ROOT
 from fflin.robot.outputs import CenterOfMass, Momentum
 from fflin.robot.robot import Robot
+from fflin.uncertainty.held_forces import HeldForces
 from fflin.uncertainty.parameters import Parameter
 
 WEIGH = (CenterOfMass, Momentum)
@@ -39,6 +53,8 @@ _STEP = 2e-3
 # fraction of A, rounding errors dominate the finite differences. In this case, errors of dA are
 # divided by the derivative that would change A by this fraction in a step. The same applies to B.
 _LEAST = 1e-6
+# Pinocchio's solver has relative errors of 1e-11 if rows of the constraints are redundant.
+_LEAST_OF_REDUNDANT = 1e-3
 
 _LOCAL = pin.ReferenceFrame.LOCAL
 _E = np.eye(3)
@@ -59,6 +75,17 @@ _OF_BODIES = np.linalg.inv([body.toDynamicParameters() for body in _BODIES]).rou
 # Spatial inertia (6, 6) per unit of each of the ten dynamic parameters. As in Pinocchio, linear
 # rows come before angular rows.
 UNITS = np.tensordot(_OF_BODIES, [body.matrix() for body in _BODIES], 1)
+
+
+class _Rates(NamedTuple):
+    """Accelerations, and their derivatives by the state and the inputs, in base axes.
+
+    The rows of the accelerations are followed by the rows of the constraint forces.
+    """
+
+    c: Array  # (.., 6 + n + r)
+    slopes: Array  # (.., 6 + n + r, 12 + 2 n)
+    by_u: Array  # (.., 6 + n + r, nu)
 
 
 class ModelDerivatives:
@@ -94,9 +121,25 @@ class ModelDerivatives:
         self._inverse, slopes, by_u = (
             np.empty((nv, size)) for size in (nv, state.nx, nu)
         )
-        accelerations = Accelerations(state, actuation, data)
+        closure = closure_of(state)
+        accelerations = Accelerations(state, actuation, data, closure)
         self._rates = accelerations.rates(lin.q, lin.v, self._nu, self._u, slopes, by_u)
         Inertia(state, data).invert(lin.q, self._inverse)
+        # A change F of the generalised forces changes the accelerations, and then the constraint
+        # forces, by `_response` F.
+        self._response: Array = -self._inverse
+        self._held: HeldForces | None = None
+        # Indices of the states of the model, and map from these to all states.
+        self._kept: Indices = np.arange(state.nx)
+        self._all_states: Array = np.eye(state.nx)
+        if closure is not None and accelerations.contact is not None:
+            contact = accelerations.contact
+            self._held = HeldForces(closure, contact, lin.q, self._inverse)
+            self._response = self._held.response
+            names = [state.names.index(name) for name in lin.state_names]
+            self._kept = np.array(names, dtype=np.intp)
+            assert lin._all_states is not None
+            self._all_states = lin._all_states
         # The accelerations do not depend on the position and linear velocity of the base, so both
         # are set to zero; see `Accelerations`.
         self._q, self._v = lin.q.copy(), lin.v.copy()
@@ -109,52 +152,69 @@ class ModelDerivatives:
 
     def over(self, parameters: Sequence[Parameter]) -> tuple[Array, ...]:
         """Return dA, dB, dC, dD, df0 and dy0 (P, ..), one entry for each of P parameters."""
-        # Row i of `rates` belongs to parameter i. An additional last row contains zeros. `assemble`
+        # Row i of `total` belongs to parameter i. An additional last row contains zeros. `assemble`
         # is an affine function of `rates`. For the row of zeros, it returns the constant part of
         # A, B and f0. This constant part is subtracted below.
         state = self._state
         ready = self._ready
         count = len(parameters) + 1
         nv = len(self._nu)
-        A = np.zeros((count, state.nx, state.nx))
-        B = np.zeros((count, state.nx, len(self._u)))
-        c, gravity = np.zeros((count, nv)), np.zeros((count, 3))
-        rates = AccelerationDerivatives(c, A[:, nv:], B[:, nv:], gravity)
+        total = self._zeros(count)
         for joint in self._joints:
             rows = [row for row, one in enumerate(parameters) if joint in one.bodies]
             changes = np.array([parameters[row].bodies[joint] for row in rows]).reshape(
                 -1, 10
             )
-            for part, of_bodies in zip(rates, self._of_bodies, strict=True):
+            for part, of_bodies in zip(total, self._of_bodies, strict=True):
                 part[rows] += np.tensordot(changes, of_bodies[joint - ROOT], 1)
         for row, one in enumerate(parameters):
             if not one.bodies:
-                for part, of_force in zip(rates, self._over_force(one), strict=True):
+                for part, of_force in zip(total, self._over_force(one), strict=True):
                     part[row] = of_force
-        of_outputs = self._output_derivatives(parameters, rates)
+        of_outputs = self._output_derivatives(parameters, total)
+        A: Array = np.zeros((count, state.nx, state.nx))
+        B: Array = np.zeros((count, state.nx, len(self._u)))
+        A[:, nv:], B[:, nv:] = total.slopes[:, :nv], total.by_u[:, :nv]
+        gravity = np.zeros((count, 3))
+        rates = AccelerationDerivatives(total.c[:, :nv], A[:, nv:], B[:, nv:], gravity)
         nu, u = (np.broadcast_to(x, (count, len(x))) for x in (self._nu, self._u))
         f0 = assemble(
             ready.actuation, self._chart, nu, u, rates, A, moving=ready.moving
         )
         A, B, f0 = (array[:-1] - array[-1] for array in (A, B, f0))
+        C, D, y0 = np.split(of_outputs, (state.nx, -1), axis=2)
+        if self._held is not None:
+            kept, all_states = self._kept, self._all_states
+            A, B, f0 = A[:, kept] @ all_states, B[:, kept], f0[:, kept]
+            C = C @ all_states
         if self.lin.dt:
             driven = np.column_stack((self._source.B, self._source.f0))
             given = np.concatenate((B, f0[..., None]), axis=2)
-            A[:], held = held_derivatives(self._source.A, driven, self.lin.dt, A, given)
-            B[:], f0[:] = held[..., :-1], held[..., -1]
-        C, D, y0 = np.split(of_outputs, (state.nx, -1), axis=2)
+            A, held = held_derivatives(self._source.A, driven, self.lin.dt, A, given)
+            B, f0 = held[..., :-1], held[..., -1]
         return A, B, C, D, f0, y0[..., 0]
 
+    def _zeros(self, *count: int) -> _Rates:
+        """Return zero derivatives with the leading axes `count`."""
+        rows = len(self._response)
+        return _Rates(
+            np.zeros((*count, rows)),
+            np.zeros((*count, rows, self._state.nx)),
+            np.zeros((*count, rows, len(self._u))),
+        )
+
     def _output_derivatives(
-        self, parameters: Sequence[Parameter], rates: AccelerationDerivatives
+        self, parameters: Sequence[Parameter], rates: _Rates
     ) -> Array:
         """Return the matrix [dC, dD, dy0] of each parameter (P, ny, ..), by (12.2a).
 
         Row i of `rates` contains the derivatives of the accelerations with respect to parameter i.
-        Only outputs that depend on masses or accelerations have nonzero rows.
+        Only outputs that depend on masses or accelerations have nonzero rows. The columns of C are
+        those of all states of the robot.
         """
         lin = self.lin
-        width = lin.C.shape[1] + lin.D.shape[1] + 1
+        nv, x0 = len(self._nu), np.zeros(self._state.nx)
+        width = self._state.nx + lin.D.shape[1] + 1
         derivatives = np.zeros((len(parameters), len(lin.C), width))
         rows = [
             lin.output_names.index(name)
@@ -172,9 +232,7 @@ class ModelDerivatives:
         data = changed_robot.create_data()
         point = (lin.q, lin.v, self._nu, self._u)
 
-        def g(
-            parameter: Parameter, by_parameter: Sequence[Array], change: float
-        ) -> Array:
+        def g(parameter: Parameter, by_parameter: _Rates, change: float) -> Array:
             """Return g of (12.2a), the mass times [C, D, y0], after a change of a parameter.
 
             `by_parameter` contains the derivatives of the accelerations. The accelerations are
@@ -182,13 +240,25 @@ class ModelDerivatives:
             for any step.
             """
             change_bodies(model, self.robot.model, parameter, change)
-            extrapolated = [
-                value + change * derivative
-                for value, derivative in zip(self._rates, by_parameter, strict=True)
-            ]
-            accelerations = AccelerationDerivatives(*extrapolated)
+            changes = _Rates(*(change * part for part in by_parameter))
+            accelerations = AccelerationDerivatives(
+                self._rates.c + changes.c[:nv],
+                self._rates.slopes + changes.slopes[:nv],
+                self._rates.by_u + changes.by_u[:nv],
+                self._rates.gravity,
+            )
+            contact = None
+            if self._held is not None:
+                contact = self._held.changed(*(part[nv:] for part in changes))
             equations = output_equations(
-                sensing, actuation, data, self._chart, accelerations, lin.x0, point
+                sensing,
+                actuation,
+                data,
+                self._chart,
+                accelerations,
+                x0,
+                point,
+                contact,
             )
             matrix: Array = np.column_stack(
                 (equations["C"], equations["D"], equations["y0"])
@@ -201,7 +271,7 @@ class ModelDerivatives:
 
         m = pin.computeTotalMass(self.robot.model)
         for index, parameter in enumerate(parameters):
-            by_parameter = [part[index] for part in rates]
+            by_parameter = _Rates(*(part[index] for part in rates))
             h = 1.0
             if parameter.bodies:
                 h = 1.0 / (self.fraction(parameter.bodies) or 1.0)
@@ -221,7 +291,11 @@ class ModelDerivatives:
                 f"'{one.name}' is not a parameter of a link or body; only such parameters can be "
                 "checked, for example 'base.mass'"
             )
-        lin = self.lin
+        lin, least = self.lin, _LEAST
+        if self._held is not None:
+            self._held.require_no_mimic_joints()
+            if self._held.is_redundant:
+                least = _LEAST_OF_REDUNDANT
         step = _STEP / self.fraction(one.bodies)
 
         def matrices(steps: float) -> tuple[Array, Array]:
@@ -230,10 +304,12 @@ class ModelDerivatives:
             change_bodies(model, self.robot.model, one, steps * step)
             changed = replace(self.robot, model=model)
             state = StateMap(changed, reference=lin.reference, frame=lin.frame)
-            route = aba_route(Aba(state), lin.q, lin.v, lin.u0, moving=lin.moving)
+            A, B, _ = aba_route(Aba(state), lin.q, lin.v, lin.u0, moving=lin.moving)
+            if self._held is not None:
+                A, B = A[self._kept] @ self._all_states, B[self._kept]
             if lin.dt:
-                return held_exponential(*route[:2], lin.dt)
-            return route[:2]
+                return held_exponential(A, B, lin.dt)
+            return A, B
 
         dA, dB, *_ = self.over([one])
         two_before = matrices(-2.0)
@@ -246,27 +322,24 @@ class ModelDerivatives:
             difference = (
                 two_before[i] - 8.0 * one_before[i] + 8.0 * one_after[i] - two_after[i]
             ) / (12.0 * step)
-            least = _LEAST * np.abs(nominal[i]).max() / step
-            size = max(np.abs(difference).max(), least)
-            worst = max(worst, float(np.abs(difference - exact).max() / size))
+            nominal_size = np.abs(nominal[i]).max(initial=0.0)
+            largest = np.abs(difference).max(initial=0.0)
+            size = max(largest, least * nominal_size / step)
+            error = float(np.abs(difference - exact).max(initial=0.0))
+            if error:
+                worst = max(worst, error / size)
         return worst
 
     @cached_property
-    def _of_bodies(self) -> AccelerationDerivatives:
-        """Derivatives (bodies, 10, ..) of `_rates` with respect to the dynamic parameters.
+    def _of_bodies(self) -> _Rates:
+        """Derivatives (bodies, 10, ..) of the accelerations by the dynamic parameters.
 
-        `_rates` contains the accelerations and their derivatives with respect to state and inputs.
         The bodies are in the order of Pinocchio's joints.
         """
-        rates = self._rates
-        by_state, by_u = self._by_inertia(rates.slopes), self._by_inertia(rates.by_u)
-        count = by_u.shape[:2]
-        derivatives = AccelerationDerivatives(
-            np.zeros((*count, len(self._inverse))),
-            by_state,
-            by_u,
-            np.zeros((*count, 3)),
-        )
+        rates, nv = self._rates, len(self._nu)
+        derivatives = self._zeros(len(self._joints), 10)
+        derivatives.slopes[:] = self._by_inertia(rates.slopes)
+        derivatives.by_u[:] = self._by_inertia(rates.by_u)
         if self._v.any() or rates.c.any():
             # In the model `lone`, only one body has an inertia. For this model, RNEA returns F_p of
             # (12.1) for this body. The derivatives of RNEA are the derivatives of F_p with respect
@@ -287,13 +360,15 @@ class ModelDerivatives:
                 ):
                     kept.append(np.tensordot(_OF_BODIES, values, 1))
             F, F_q, F_nu, F_turn = map(np.array, forces)
-            derivatives.c[:] = -F @ self._inverse
-            for body, at in np.ndindex(count):
-                F_q[body, at] += self._by_acceleration(derivatives.c[body, at])
-            derivatives.by_q_m[:] -= self._inverse @ F_q
-            derivatives.by_nu[:] -= self._inverse @ F_nu
-            derivatives.by_turn[:] -= self._inverse @ F_turn
-        derivatives.by_nu[..., LINEAR] = 0.0
+            # RNEA does not depend on the linear velocity of the base.
+            F_nu[..., LINEAR] = 0.0
+            derivatives.c[:] = F @ self._response.T
+            derivatives.slopes[..., ANGULAR] += self._response @ F_turn
+            derivatives.slopes[..., 6:nv] += self._response @ F_q
+            derivatives.slopes[..., nv:] += self._response @ F_nu
+            for body, at in np.ndindex(derivatives.c.shape[:2]):
+                change = self._by_acceleration(derivatives.c[body, at])
+                derivatives.slopes[body, at, :, :nv] += change
         return derivatives
 
     def fraction(self, changes: Mapping[int, Array]) -> float:
@@ -301,12 +376,12 @@ class ModelDerivatives:
 
         `changes` is {Pinocchio joint: change (10,) of the dynamic parameters of the joint's body}.
         """
-        of_bodies = self._by_inertia(np.eye(len(self._inverse)))
-        total = sum(
-            np.tensordot(change, of_bodies[at - ROOT], 1)
-            for at, change in changes.items()
-        )
-        return float(np.abs(np.linalg.eigvals(total)).max())
+        J = self._jacobians()
+        total = np.zeros_like(self._inverse)
+        for joint, change in changes.items():
+            columns = J[joint - ROOT]
+            total += columns.T @ np.tensordot(change, UNITS, 1) @ columns
+        return float(np.abs(np.linalg.eigvals(self._inverse @ total)).max())
 
     def _jacobians(self) -> Array:
         """Return the Jacobians (bodies, 6, 6 + n) of the joints, in the axes of the joints."""
@@ -318,13 +393,14 @@ class ModelDerivatives:
         return np.array([self._state.columns(J) for J in full])
 
     def _by_inertia(self, given: Array) -> Array:
-        """Return the products (bodies, 10, 6 + n, k) of -M^-1 M_p and a given matrix (6 + n, k).
+        """Return the products (bodies, 10, .., k) of -M^-1 M_p and a given matrix (6 + n, k).
 
-        M_p is the derivative of M with respect to a dynamic parameter p of a body.
+        M_p is the derivative of M with respect to a dynamic parameter p of a body. With
+        constraints, `_response` replaces -M^-1.
         """
         J = self._jacobians()
         forces = UNITS @ (J @ given)[:, None]
-        return np.asarray(-(J @ self._inverse).mT[:, None] @ forces)
+        return np.asarray((self._response @ J.mT)[:, None] @ forces)
 
     def _rnea_derivatives(self, model: pin.Model) -> tuple[Array, ...]:
         """Return the generalised forces that RNEA computes, and their derivatives.
@@ -351,32 +427,41 @@ class ModelDerivatives:
         )
 
     def _by_acceleration(
-        self, c: Array, pushed: pin.StdVec_Force | None = None
+        self, change: Array, pushed: pin.StdVec_Force | None = None
     ) -> Array:
-        """Return the derivative of RNEA with respect to q_m at zero velocity.
+        """Return derivatives (.., 6 + n) of accelerations by displacements of q.
 
-        RNEA is computed for the accelerations `c` and the external wrenches `pushed`.
+        They follow from a `change` of the accelerations (and of the constraint forces), and from
+        a change `pushed` of the external wrenches, because M and the Jacobians depend on q.
         """
-        model = self.robot.model
+        model, state, nv = self.robot.model, self._state, len(self._nu)
         at_rest = np.zeros_like(self._v)
-        given = (self._q, at_rest, self._state.spread(c))
-        more = () if pushed is None else (pushed,)
+        c = state.spread(change[:nv])
+        wrenches = pushed
+        if self._held is not None:
+            wrenches = self._held.wrenches(change[nv:], pushed)
+        more = () if wrenches is None else (wrenches,)
+        given = (self._q, at_rest, c)
         by_q = pin.computeRNEADerivatives(model, self._data, *given, *more)[0]
-        return self._state.project(by_q)[:, 6:]
+        F = np.zeros((nv, nv))
+        F[:, 6:] = state.project(by_q)[:, 6:]
+        if self._held is None:
+            return np.asarray(self._response @ F)
+        F -= self._held.turning(change[nv:])
+        return np.asarray(self._response @ F + self._held.by_row_rates(c))
 
-    def _over_force(self, one: Parameter) -> AccelerationDerivatives:
-        """Return the derivatives of `_rates` with respect to a parameter that changes no body.
+    def _over_force(self, one: Parameter) -> _Rates:
+        """Return the derivatives of the accelerations by a parameter that changes no body.
 
-        `_rates` contains the accelerations and their derivatives with respect to state and inputs.
         The parameter changes a spring, a damper or the wrench of an input.
         """
         state = self._state
         u = self._u
-        size = len(self._inverse)
-        F: Array = np.zeros(size)
-        B = np.zeros_like(self._rates.by_u)
-        F_q: Array = np.zeros((size, size - 6))
-        F_nu = np.zeros((size, size))
+        nv = len(self._nu)
+        F = np.zeros(nv)
+        B = np.zeros((nv, len(u)))
+        F_q, F_nu = np.zeros((nv, nv)), np.zeros((nv, nv))
+        pushed: pin.StdVec_Force | None = None
         if (joint := one.joint) >= 0:
             at = 6 + joint
             moved = (
@@ -386,7 +471,7 @@ class ModelDerivatives:
                 one.by_stiffness * moved
                 + one.by_damping * state.velocities(self._v)[at]
             )
-            F_q[at, joint], F_nu[at, at] = one.by_stiffness, one.by_damping
+            F_q[at, at], F_nu[at, at] = one.by_stiffness, one.by_damping
         if one.wrench:
             joint, column, wrench = one.wrench
             B[:, column] = self._jacobians()[joint - ROOT].T @ wrench
@@ -394,17 +479,14 @@ class ModelDerivatives:
             if u[column]:
                 pushed = pin.StdVec_Force(self.robot.model.njoints, pin.Force.Zero())
                 pushed[joint] = pin.Force(wrench * u[column])
-                F_q = self._by_acceleration(np.zeros(size), pushed)
-        derivatives = AccelerationDerivatives(
-            -self._inverse @ F,
-            np.zeros((size, 2 * size)),
-            self._inverse @ B,
-            np.zeros(3),
-        )
-        if derivatives.c.any():
-            F_q = F_q + self._by_acceleration(derivatives.c)
-        derivatives.by_q_m[:] = -self._inverse @ F_q
-        derivatives.by_nu[:] = -self._inverse @ F_nu
+        response = self._response
+        derivatives = self._zeros()
+        derivatives.c[:] = response @ F
+        derivatives.by_u[:] = -response @ B
+        derivatives.slopes[:] = response @ np.hstack((F_q, F_nu))
+        if derivatives.c.any() or pushed is not None:
+            change = self._by_acceleration(derivatives.c, pushed)
+            derivatives.slopes[:, :nv] += change
         return derivatives
 
 

@@ -14,7 +14,6 @@ from fflin.base.tables import folded, grid
 from fflin.base.validation import Array, FrozenArrays, instance, numbers, shaped, whole
 from fflin.base.writing import as_path
 from fflin.control.gain import Gain, gain_matrix
-from fflin.dynamics.coordinates import refuse_constraints
 from fflin.linear.files import record_of
 from fflin.linear.model import LinearModel, refuse_delayed, refuse_frozen
 from fflin.uncertainty.derivatives import ModelDerivatives
@@ -246,7 +245,14 @@ class Sensitivity:
         -------
         dict
             Largest differences {parameter: difference}, relative to the derivatives. Differences
-            of about 1e-9 are expected, which is the accuracy of the finite differences.
+            of about 1e-9 are expected, which is the accuracy of the finite differences, or of about
+            1e-7 if constraints are redundant.
+
+        Raises
+        ------
+        InputError
+            If `names` is not a list, or a parameter is not of a link or body; or if the robot has
+            both constraints and mimic joints, which Pinocchio's derivatives do not support.
         """
         if names is None:
             names = [name for name, one in self.parameters.items() if one.bodies]
@@ -366,7 +372,9 @@ def sensitivity(lin: LinearModel) -> Sensitivity:
     The inertia matrix M and the inverse dynamics (RNEA) are linear in the dynamic parameters of the
     bodies. Therefore the equations of the linear model can be differentiated exactly. For example,
     the derivative of :math:`M^{-1}` with respect to a parameter p is
-    :math:`(M^{-1})_p = -M^{-1} M_p M^{-1}`; see docs/derivation.md.
+    :math:`(M^{-1})_p = -M^{-1} M_p M^{-1}`; see docs/derivation.md. If the robot has constraints,
+    the derivatives are those of the model in its independent states, at rest or in motion, and
+    include the forces in the loops.
 
     Parameters
     ----------
@@ -398,7 +406,6 @@ def sensitivity(lin: LinearModel) -> Sensitivity:
         raise InputError(
             "the model was loaded from a file, which contains no robot; linearise the robot again"
         )
-    refuse_constraints(robot, "sensitivities")
     refuse_frozen(lin, "sensitivity")
     if lin.delay.any():
         refuse_delayed(lin, "sensitivity")

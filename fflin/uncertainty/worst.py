@@ -23,11 +23,13 @@ from fflin.control.optimal.disk import Loop, largest_scaled_gain
 from fflin.control.optimal.largest_gain import ACCURACY, gain_crossings, largest_gain
 from fflin.control.policy import Policy
 from fflin.dynamics.state import selection
+from fflin.uncertainty import gain_bound
 from fflin.uncertainty.lagging import with_lags_of_loop
 from fflin.uncertainty.lft import LFT
 from fflin.uncertainty.sampled_loops import (
     DISK,
     OUTPUTS,
+    PeriodicLoops,
     SampledLaw,
     SampledLoops,
     acting_part,
@@ -54,13 +56,15 @@ _ROUNDING = 1e-9
 # Function that returns a criterion for each row of deltas; larger values are worse.
 Figure: TypeAlias = Callable[[Array], Array]
 
-# slycot is used only for models with at most this number of signals in z. Its run time grows with
-# the fifth power of the number of signals.
+# Scalings are searched only for models with at most this number of signals in z. The run time of
+# slycot grows with the fifth power of the number of signals.
 _SIGNALS = 24
 # The search over frequency begins with a grid of _LOOK frequencies. The bound of an interval is
 # computed at _INSIDE frequencies. A step of the search divides one interval, or calls slycot for
 # it. The search takes at most _DIVISIONS steps.
 _LOOK, _INSIDE, _DIVISIONS = 120, 5, 100
+# Distances of further frequencies from a resonance, in widths of its peak.
+_WIDTHS = (0.0, -1.0, 1.0)
 # The search ends when the largest bound of an interval is at most this factor times the largest
 # bound at a single frequency.
 _NEAR = 1.01
@@ -91,7 +95,8 @@ class Worst(html.Reported):
     Attributes
     ----------
     damping : Found
-        Least damping ratio of a pole.
+        Least damping ratio of a pole. The poles of a periodic law are those of one period, with the
+        smallest of their possible frequencies.
     margin : Found
         Least disk margin at the inputs; 0 if a loop is unstable. For policies and sampled gains, it
         has the best scaling of the inputs, as in `margins`. For a continuous `Gain`, the inputs are
@@ -247,7 +252,8 @@ def _sampled_loops(
 ) -> tuple[SampledLoops, Callable[[], list[Figures]]]:
     """Return the loops of a sampled law, and a function that returns the criteria as above."""
     kept = judged_states(lft, measured_signals(lft, law), law.regulated)
-    loops = SampledLoops(part_of(lft, kept), law)
+    kind = PeriodicLoops if len(law.systems) > 1 else SampledLoops
+    loops = kind(part_of(lft, kept), law)
 
     def figures(kind: str) -> Figures:
         return Figures(
@@ -529,6 +535,8 @@ def _safe(loops: Loops) -> float:
     If all ranges are scaled by less than the returned factor, all loops are stable.
     """
     lft = loops.lft
+    if not lft.repeats.any():
+        return np.inf  # no parameter has an effect
     F = loops.matrices(np.zeros(len(loops.lft.repeats)))[0]
     poles = np.linalg.eigvals(F)
 
@@ -536,7 +544,8 @@ def _safe(loops: Loops) -> float:
         inner = 1j * w[:, None, None] * np.eye(len(F)) - F
         return (lft.C1 - lft.D12 @ loops.K) @ np.linalg.solve(inner, lft.B1) + lft.D11
 
-    rates = np.concatenate((np.abs(poles), np.abs(poles.imag)))
+    sides = [np.abs(poles.imag) + width * poles.real for width in _WIDTHS]
+    rates = np.concatenate((np.abs(poles), *sides))
     largest = largest_bound(
         response, lft.D11, rates[rates > 0.0], lft.repeats.astype(int)
     )
@@ -634,11 +643,17 @@ def largest_bound(
 def _scalings(Z: Array, blocks: Array) -> list[Scaling]:
     """Return trial scalings (d, g) for Z.
 
-    The first scaling is from `perron`. If `blocks` is not empty and slycot is installed, the second
-    is from slycot's AB13MD. For a Z with one complex entry, a formula replaces AB13MD.
+    The first scaling is from `perron`. If `blocks` is not empty, the second one minimises the bound
+    locally for real deltas, and slycot's AB13MD adds a third if it is installed. For a Z with one
+    complex entry, a formula replaces both.
     """
     none: Array = np.zeros(len(Z))
     scalings: list[Scaling] = [(perron(Z)[:, 0], none)]
+    if 1 < len(Z) <= _SIGNALS and len(blocks):
+        start = gain_bound.Scaling(np.log(scalings[0][0]), none)
+        found, _ = gain_bound.improved(Z[None], start, len(Z), none[:0], 0.0)
+        d = np.exp(found.log_d)
+        scalings.append((d, found.h * d**2))
     if len(Z) == 1 and len(blocks) and Z[0, 0].imag:
         return [*scalings, (none + 1.0, np.abs(Z[0]) ** 2 / (2.0 * Z[0].imag))]
     try:

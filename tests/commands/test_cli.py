@@ -718,7 +718,7 @@ def test_short_help_fits_a_screen_and_full_help_has_every_option():
 
 def test_options_that_repeat_a_robot_file_are_in_one_group():
     repeated = {"lock", "xacro", "orbit", "stiffness", "damping", "gravity", "passive"}
-    repeated |= {"inputs", "output", "weld", "independent"}
+    repeated |= {"inputs", "output", "weld", "independent", "inclination", "field"}
     (parsers,) = cli._parser("")._subparsers._group_actions
     for name in (
         "linearize",

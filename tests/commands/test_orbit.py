@@ -21,6 +21,45 @@ def test_the_robot_file_of_a_magnetic_satellite_is_short():
     assert len(robot.urdf.with_name(f"{SATELLITE}.toml").read_text().splitlines()) <= 25
 
 
+def orbit_of(*options):
+    """Return the orbit of the magnetic satellite with options of the command line."""
+    code, out, _ = run("info", SATELLITE, *options, "--json")
+    assert code == 0
+    return json.loads(out)["orbit"]
+
+
+def test_another_altitude_keeps_the_magnetic_field_of_the_robot_file():
+    orbit = orbit_of("--orbit", "600e3")
+    shown = orbit["altitude"], orbit["inclination"], orbit["field"]
+    assert shown == (600e3, 1.7, "dipole")
+    changed = orbit_of(
+        "--orbit", "600e3", "--inclination", 0.9, "--field", "tilted_dipole"
+    )
+    assert (changed["inclination"], changed["field"]) == (0.9, "tilted_dipole")
+    turned = orbit_of("--inclination", 0.9)
+    assert (turned["altitude"], turned["field"]) == (500e3, "dipole")
+    ellipse = orbit_of("--orbit", "500e3/900e3")
+    assert (ellipse["apogee"], ellipse["field"]) == (900e3, "dipole")
+    assert orbit_of("--orbit", "400e3:mars", "--inputs", "base")["field"] is None
+    assert orbit_of("--orbit", "none", "--inputs", "base") is None
+    assert "magnetic field dipole, inclination 97.4028 deg" in run("info", SATELLITE)[1]
+
+
+def test_a_magnetic_field_needs_an_orbit():
+    error = refused("info", "cubesat", "--field", "dipole")
+    assert "is not in orbit, so --field has no effect; add --orbit" in error
+    error = refused("info", SATELLITE, "--orbit", "none", "--field", "dipole")
+    assert "--orbit none removes the orbit" in error
+    assert "--field dipole" in refused("linearize", SATELLITE, "--field", "none")
+
+
+def test_controllability_and_observability_over_a_period():
+    code, out, _ = run("analyze", SATELLITE, "--periodic", 8)
+    assert code == 0 and out.startswith("analyze: not controllable (6/12), observable")
+    assert "--periodic N" in refused("analyze", SATELLITE)
+    assert "without --periodic" in refused("analyze", "cubesat", "--motion", "free")
+
+
 def test_linearize_at_a_time():
     code, out, _ = run("linearize", "cubesat", *ELLIPSE, "--time", 1800)
     assert code == 0 and "at t = 1800 s" in " ".join(out.split())
@@ -159,5 +198,8 @@ def test_errors_of_periodic_models():
     assert "remove --trajectory" in refused("tvlqr", SATELLITE, *both)
     assert "neither --trajectory" in refused("tvlqr", SATELLITE)
     assert "without --periodic" in refused("linearize", SATELLITE, "--motion", "free")
+    assert "without --periodic" in refused("linearize", SATELLITE, "--period", 60)
+    short = refused("linearize", SATELLITE, "--periodic", 8, "--period", 60)
+    assert "differs from the field one period later" in short
     wrong = refused("tvlqr", SATELLITE, "--periodic", 8, "--sample", 60)
     assert "59.75766345816693" in wrong

@@ -7,7 +7,7 @@ from scipy.linalg import block_diag, solve_continuous_are, solve_discrete_are
 import fflin
 from fflin.control.optimal import differential_riccati as riccati
 from fflin.control.optimal import periodic_riccati
-from fflin.control.tvlqr import held_stages
+from fflin.control.tvlqr import held_stages, loop_multipliers
 from tests.support.orbits import in_ellipse, in_orbit
 from tests.support.robots import free_body
 
@@ -164,10 +164,23 @@ def test_states_that_no_input_pushes_are_not_regulated():
     assert "not regulated: r_b.x" in schedule.weights
     rows = [3, 4, 5, 9, 10, 11]
     assert not schedule.K[:, :, rows].any()
-    # The six multipliers of the translation are 1; all others are stable.
-    assert schedule.loop_multipliers[5] == pytest.approx(1.0, abs=1e-6)
-    assert schedule.loop_multipliers[6] < 0.1
-    assert "repeats after" in str(schedule)
+    # The six multipliers of the translation are 1; the attitude does not depend on it.
+    closed = schedule.A - schedule.B @ schedule.K[:-1]
+    total = np.linalg.multi_dot(closed[::-1])
+    size = np.sort(np.abs(np.linalg.eigvals(total)))[::-1]
+    assert size[:6] == pytest.approx(np.ones(6), abs=1e-4)
+    assert len(schedule.loop_multipliers) == 6
+    assert schedule.loop_multipliers[0] == pytest.approx(size[6], rel=1e-4)
+    assert schedule.loop_multipliers[0] < 0.1
+    assert "closed loop of the regulated states: largest" in str(schedule)
+
+
+def test_multipliers_of_states_on_which_the_regulated_states_depend_are_kept():
+    regulated = np.array([True, False])
+    apart_from_it = np.array([[[0.5, 0.0], [3.0, 1.0]]] * 3)
+    coupled = apart_from_it.swapaxes(1, 2)
+    np.testing.assert_allclose(loop_multipliers(apart_from_it, regulated), [0.125])
+    np.testing.assert_allclose(loop_multipliers(coupled, regulated), [1.0, 0.125])
 
 
 @pytest.mark.exhaustive

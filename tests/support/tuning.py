@@ -41,3 +41,25 @@ def least_gain(matrices, structure=None, starts=3, steps=300, seed=1):
     problem = problem_of(matrices, structure)
     best, _ = searched(problem, starts, steps, seed)
     return float(np.exp(best.objective)), problem.law(best.x)
+
+
+def of_sweep(policy, matrices, frequencies):
+    """Gains of the loop from (torque, error of q_b) to (q_b, command), (n, 2, 2, 3, 3)."""
+    A, B, C, _ = matrices
+    law = policy.system
+    n, nz, nu, ny = len(A), len(law.A), B.shape[1], 3
+    loop = np.block([[A + B @ law.D @ C, B @ law.C], [law.B @ C, law.A]])
+    noise = np.vstack((B @ law.D[:, :ny], law.B[:, :ny]))
+    drive = np.hstack((np.vstack((B, np.zeros((nz, nu)))), noise))
+    read = np.block([[C[:ny], np.zeros((ny, nz))], [law.D @ C, law.C]])
+    through = np.zeros((ny + nu, nu + ny))
+    through[ny:, nu:] = law.D[:, :ny]
+    # The torque does not move the position of the base, whose poles are at zero.
+    kept = np.abs(drive).sum(axis=1) > 0.0
+    for _ in range(n):
+        kept |= (np.abs(loop[:, kept]) > 1e-12 * np.abs(loop).max()).any(axis=1)
+    loop, drive, read = loop[np.ix_(kept, kept)], drive[kept], read[:, kept]
+    inner = 1j * frequencies[:, None, None] * np.eye(len(loop)) - loop
+    responses = read @ np.linalg.solve(inner, drive.astype(complex)) + through
+    blocks = responses.reshape(-1, 2, 3, 2, 3).transpose(0, 1, 3, 2, 4)
+    return np.linalg.norm(blocks, 2, axis=(3, 4))
