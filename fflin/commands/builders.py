@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
     from fflin.base.figures import CurveStyle
     from fflin.base.validation import Array
+    from fflin.commands.phases import PhaseStart
     from fflin.dynamics.coordinates import Frame
 
 T = TypeVar("T")
@@ -508,9 +509,12 @@ def designed(
 
 def tuning_of(
     arguments: Namespace,
-) -> tuple[fflin.Robot, object, fflin.Structure, list[fflin.Goal], dict[str, Any]]:
+) -> tuple[
+    fflin.Robot, object, fflin.Structure, list[fflin.Goal], dict[str, Any], bool
+]:
     """Return the robot, plant, structure, goals and settings of a search.
 
+    The last result is True if the law commands a wrench that other inputs of the robot produce.
     The options --law, --goal and --vary replace the entries of the table [tune] of the robot file.
     All names are checked.
     """
@@ -555,7 +559,7 @@ def tuning_of(
             )
         plant = fflin.uncertain(design, given["vary"])
         settings["q"] = lin.q
-    return design, plant, structure, goals, settings
+    return design, plant, structure, goals, settings, design is not robot
 
 
 def tuned_law(
@@ -620,6 +624,19 @@ def gain_of(
         raise UnknownNameError(message) from None
 
 
+def _phase_of(robot: fflin.Robot, arguments: Namespace) -> PhaseStart | None:
+    """Return the start at the end of the motion of --after, or None without this option."""
+    if not getattr(arguments, "after", None):
+        return None
+    from fflin.commands.phases import start_after
+
+    names = ("joint", "rpy", "position", "velocity")
+    along = ("offset", "trajectory", "schedule", "periodic")
+    refuse(arguments, (*names, *along), "the start is the end of the motion of --after")
+    # This also defines the placements of constraints that have none yet.
+    return start_after(robot, arguments.after)
+
+
 def loop_of(
     robot: fflin.Robot, arguments: Namespace
 ) -> tuple[fflin.Policy | None, dict[str, Any]]:
@@ -633,6 +650,7 @@ def loop_of(
         },
         "limits": limits_of_options(arguments),
     }
+    arguments.phase = _phase_of(robot, arguments)
     if not arguments.controller:
         refuse(
             arguments,
@@ -808,6 +826,8 @@ def start_of(
     With --relative-equilibrium, the given base pose is relative to `reference`, or by default to
     the pose of this equilibrium.
     """
+    if arguments.phase is not None:
+        return arguments.phase.q, arguments.phase.v
     point, number = robot.point, arguments.relative_equilibrium
     # omit the base pose of the point, because the pose `about` below replaces it
     if number:
@@ -873,9 +893,6 @@ def about_point(
         refuse(
             arguments, of_gain, "--controller replaces the regulator and its options"
         )
-        from fflin.tuning.files import in_time_of
-
-        lin = in_time_of(arguments.controller, lin)
         sign = -1.0 if arguments.negative_feedback else 1.0
         feedback = fflin.LinearController(arguments.controller, lin, sign=sign)
     else:

@@ -13,6 +13,8 @@ from fflin.base.errors import EquilibriumError, InputError
 from fflin.base.validation import Array, instance
 from fflin.control.loops import Loop, Sample, StateMeasuring, Step
 from fflin.control.policy import Command, Noise, OutputForm, Policy, Reference
+from fflin.control.sensed_laws import sensed
+from fflin.control.sensors import timing_of_robot
 from fflin.control.trajectory_end import resting_end
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.coordinates import Frame
@@ -256,7 +258,8 @@ class Following(Policy):
         """Return the command of the law for a robot."""
         self._require_fit(robot)
         path = ReferencePath(self, robot)
-        windup = (lambda _: self.terms.E) if self.terms.E.size else None
+        correction = path.about_point.E
+        windup = (lambda _: correction) if correction.size else None
         return Loop(
             path.state,
             self.sample_time,
@@ -265,6 +268,7 @@ class Following(Policy):
             self._noise_for(path),
             measures_state=not self.senses_outputs,
             windup=windup,
+            has_sensors=self.senses_outputs,
         )
 
     def _noise_for(self, path: ReferencePath) -> Noise | None:
@@ -297,6 +301,24 @@ def _with_inputs_of(lin: LinearModel, trajectory: Trajectory) -> Trajectory:
     )
 
 
+def _with_delays(terms: Sample, law: Following, state: StateMap) -> Sample:
+    """Return a law in series with the delays of the sensors of a robot.
+
+    The delays act on the differences of measured and planned outputs. So a late measurement is
+    compared with the reference at the time of the measurement.
+    """
+    if not law.senses_outputs:
+        return terms
+    late = sensed([terms], timing_of_robot(state, law.sample_time))
+    if len(late) > 1:
+        raise InputError(
+            f"outputs of '{state.robot.name}' have a sample other than {law.sample_time:g} s, the "
+            "sample time of the law, which follow does not support; leave out sample of these "
+            "outputs"
+        )
+    return late[0]
+
+
 class ReferencePath:
     """Reference of a law for a robot: the sample matrices and the measurements at each time."""
 
@@ -313,12 +335,12 @@ class ReferencePath:
         terms = law.terms
         if not law.senses_outputs:
             terms = terms._replace(B=terms.B @ self.S, D=terms.D @ self.S)
-        self._about_point = terms
+        self.about_point = _with_delays(terms, law, state)
 
     @property
     def sizes(self) -> tuple[int, int]:
         """Number of states of the law, and of its measured values."""
-        nz, ny = self._about_point.B.shape
+        nz, ny = self.about_point.B.shape
         return nz, ny
 
     def at(self, t: float) -> tuple[Step, Measuring | StateMeasuring, Array]:
@@ -345,5 +367,5 @@ class ReferencePath:
         if self._aba is not None:
             a = self._aba.acceleration(q, v, u)
         y = np.asarray(measure(x, q, v, a))
-        terms = self._about_point._replace(u0=self.law.feedforward(t), y0=y)
+        terms = self.about_point._replace(u0=self.law.feedforward(t), y0=y)
         return terms, measure, x

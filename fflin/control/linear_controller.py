@@ -25,6 +25,7 @@ from fflin.base.validation import (
 )
 from fflin.base.writing import RECORDS, as_path, check_ending, reason
 from fflin.control.compensator import Compensator
+from fflin.control.law_files import in_time_of_file
 from fflin.control.loops import NOT_CORRECTED
 from fflin.control.policies import LinearLaw, OutputSensing
 from fflin.control.policy import (
@@ -73,7 +74,8 @@ class LinearController(OutputSensing, LinearLaw):
         must use all of them, in order. If the controller has no dt, the model's dt is used.
     lin : LinearModel
         Continuous or sampled model. The controller acts on deviations from the operating point of
-        this model.
+        this model. For the file of a `Tuned` law, a continuous model is sampled with the delay of
+        the law.
     sign : {1, -1}
         Sign of the feedback: 1 for positive feedback, -1 for a controller that was designed for
         negative feedback, ``u - u0 = -K (y - y0)``.
@@ -121,6 +123,8 @@ class LinearController(OutputSensing, LinearLaw):
     anti_windup: ArrayLike | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
+        if isinstance(self.system, str | Path) and isinstance(self.lin, LinearModel):
+            self.lin = in_time_of_file(as_path(self.system), self.lin)
         self.lin = lin = held_if_possible(about_point(self.lin))
         if number("sign", self.sign) not in (1.0, -1.0):
             raise InputError(

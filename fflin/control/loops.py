@@ -119,7 +119,7 @@ class Loop(BoundLaw):
     `sizes` contains the lengths of z and of the measured values y. The function `windup` returns
     the anti-windup gain E at a time [s]; see `Sample`. If outputs of the robot have their own
     sampling times or delays, the law receives the values `start` (ny,) before the first measurement
-    arrives.
+    arrives. If `has_sensors` is true, the states of the law contain these sensors.
     """
 
     def __init__(
@@ -133,6 +133,7 @@ class Loop(BoundLaw):
         measures_state: bool = False,
         windup: Callable[[float], Array] | None = None,
         start: Array | None = None,
+        has_sensors: bool = False,
     ) -> None:
         self.at, self.dt, self._noise, (nz, self._ny) = at, dt, noise, sizes
         self.measures_state = measures_state
@@ -151,7 +152,8 @@ class Loop(BoundLaw):
         # Values of sensors with a lag, or None.
         self.lag: SensorLag | None = None
         if not measures_state:
-            self.sensors = _sensor_memory(state, dt, start)
+            if not has_sensors:
+                self.sensors = _sensor_memory(state, dt, start)
             lags = lags_of_robot(state)
             if lags.any():
                 self.lag = SensorLag(lags, _start_of(state, start))

@@ -67,6 +67,10 @@ _SAME_FIELD = 1e-6
 _EPS = float(np.finfo(float).eps)
 _POSITION_ROUNDING, _SUM_ROUNDING = 16.0 * _EPS, 1e3 * _EPS
 
+# Rates [SI units] of a robot with constraints below this fraction of the largest rate count as
+# zero.
+_HELD = 1e-6
+
 # Largest difference [SI units] between the first and the last state of a periodic motion.
 _CLOSED = 1e-6
 
@@ -627,9 +631,12 @@ class Trajectory(Design):
             # 1 rad.
             push = np.maximum(push, sums)
             speed = np.maximum(speed, push / self.robot.orbit.mean_motion)
+        # Constraints can hold the base or the joints, so that their rates are rounding errors.
+        least = _HELD if self.robot.constraints else 0.0
+        floors = [least * x.max() for x in (speed, push)]
         for group in ([0, 1, 2], [3, 4, 5], *([rotor] for rotor in alone), others):
-            for x in (speed, push):
-                x[group] = x[group].max(initial=0.0) or 1.0
+            for x, floor in zip((speed, push), floors, strict=True):
+                x[group] = max(x[group].max(initial=0.0), floor) or 1.0
 
         def size(of_q: Array, of_v: Array, h: float) -> float:
             miss = np.maximum(np.abs(of_q) - digits, 0.0) / (speed * h)

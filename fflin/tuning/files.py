@@ -9,25 +9,22 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.names import input_keys
 from fflin.base.record import figure, read_record, reading, text, texts
 from fflin.base.validation import Array
 from fflin.base.writing import as_path
+from fflin.control.law_files import TUNED, in_time_of
 from fflin.control.linear_controller import LinearController
 from fflin.control.policy import System
 from fflin.dynamics.coordinates import frame_of
 from fflin.linear.linearization import linearize
-from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
-
-KIND = "Tuned"
 
 
 def record_of_law(law: LinearController) -> dict[str, object]:
     """Return the entries of the file of a law: its matrices and its operating point."""
     system, lin = law.system, law.lin
     return {
-        "kind": KIND,
+        "kind": TUNED,
         "A": system.A,
         "B": system.B,
         "C": system.C,
@@ -51,7 +48,7 @@ def read_law(path: str | Path) -> dict[str, Any]:
     with reading(target, "tuned law"):
         record, _ = read_record(target)
         kind = text(record.get("kind", ""))
-        if kind != KIND:
+        if kind != TUNED:
             raise ValueError(f"the file contains: {kind or 'no law of fflin'}")
     return record
 
@@ -80,30 +77,7 @@ def saved_law(record: Mapping[str, Any], robot: Robot) -> LinearController:
         figure(record["dt"]),
         *names,
     )
-    return LinearController(system, _in_time(record, lin))
-
-
-def in_time_of(path: str | Path, lin: LinearModel) -> LinearModel:
-    """Return a model with the sample time and the delay of the tuned law in a file.
-
-    The model does not change if the file contains another controller, or a law without a delay.
-    """
-    target = as_path(path)
-    with reading(target, "controller"):
-        record, _ = read_record(target)
-    if "delay" not in record or text(record.get("kind", "")) != KIND or lin.dt:
-        return lin
-    return _in_time(record, lin)
-
-
-def _in_time(record: Mapping[str, Any], lin: LinearModel) -> LinearModel:
-    delays = _vector(record, "delay")
-    if not delays.any():
-        return lin
-    by_input = dict(zip(texts(record["output_names"]), delays.tolist(), strict=True))
-    keys = dict(zip(lin.input_names, input_keys(lin), strict=True))
-    named = {keys[name]: value for name, value in by_input.items() if name in keys}
-    return lin.discretize(figure(record["dt"]), delay=named)
+    return LinearController(system, in_time_of(record, lin))
 
 
 def _vector(record: Mapping[str, Any], key: str) -> Array:

@@ -20,7 +20,11 @@ from fflin.linear.model import LinearModel
 from fflin.tuning.channels import Ends, channel_of, ends_of
 from fflin.tuning.goals import Goal, MaxGain
 from fflin.tuning.law import law_of
-from fflin.tuning.loop import require_plain_sensors, with_robot_lags
+from fflin.tuning.loop import (
+    sensor_delays,
+    with_delayed_outputs,
+    with_robot_lags,
+)
 from fflin.tuning.plant import Plant, plant_of, signals_of
 from fflin.tuning.reduction import truncations
 from fflin.tuning.structures import Names, indices, input_indices
@@ -216,8 +220,9 @@ def hinf(
     ------
     InputError
         If a goal is not a `MaxGain` at all frequencies, a signal does not exist, a command or
-        measured output is not in the goals, a measured output has a `sample` or `delay` of its
-        own, the model holds only at one time, or no design is stable and verified.
+        measured output is not in the goals, a measured output has a `sample` other than that of
+        the model or a `delay` that is not a multiple of it, the model holds only at one time, or
+        no design is stable and verified.
     MissingPackageError
         If slycot is not installed.
 
@@ -236,7 +241,7 @@ def hinf(
     lin = with_robot_lags(lin)
     signals = signals_of(lin)
     rows = indices("output", measured, signals.outputs)
-    require_plain_sensors(lin, rows, "hinf")
+    delays = sensor_delays(lin, rows)
     columns = input_indices(inputs, signals)
     ends = []
     for goal in every:
@@ -255,7 +260,7 @@ def hinf(
                 "give a number, or the continuous model"
             )
         ends.append(found)
-    model = _plant(lin, ends, rows)
+    model = _plant(lin, ends, rows, delays)
     # Outputs without a state that the inputs move are not fed back.
     rows = tuple(row for row in rows if model.C[row].any())
     if not rows:
@@ -281,16 +286,19 @@ def hinf(
     return HInfinity(_Design(law, gamma, plant, selected, placed), lin)
 
 
-def _plant(lin: LinearModel, ends: Sequence[Ends], rows: Sequence[int]) -> Plant:
+def _plant(
+    lin: LinearModel, ends: Sequence[Ends], rows: Sequence[int], delays: Sequence[int]
+) -> Plant:
     """Return the plant with the states that the goals and the measured outputs contain."""
     ny = len(lin.output_names)
-    used = np.zeros(ny + len(lin.state_names), bool)
+    matrices = with_delayed_outputs((lin.A, lin.B, lin.C, lin.D), delays)
+    used = np.zeros(ny + len(matrices[0]), bool)
     used[list(rows)] = True
     for end in ends:
         for kind, index in (*end.sinks, *end.sources):
             if kind in ("output", "error", "sensor"):
                 used[index] = True
-    return plant_of((lin.A, lin.B, lin.C, lin.D), lin.dt, used)
+    return plant_of(matrices, lin.dt, used)
 
 
 def _generalised(

@@ -19,7 +19,7 @@ from fflin.tuning.curves import GoalLoops
 from fflin.tuning.goals import Goal
 from fflin.tuning.hinf import hinf
 from fflin.tuning.law import Law
-from fflin.tuning.loop import require_plain_sensors
+from fflin.tuning.loop import sensor_delays, with_delayed_outputs
 from fflin.tuning.plant import Plant, Signals, plant_of, signals_of
 from fflin.tuning.points import Point, Points, points_of
 from fflin.tuning.problem import Case, Measure, Problem
@@ -108,7 +108,8 @@ def tune(
         If one of these conditions is true:
 
         - a signal of a goal or of the structure does not exist;
-        - a measured output has a `delay`, or a `sample` other than `dt`;
+        - a measured output has a `sample` other than `dt`, or a `delay` that is not a multiple of
+          `dt`;
         - a model holds only at one time, as in an elliptic orbit;
         - no start reaches a stable loop, for example because no law can move an unstable pole;
         - the variance of a goal is infinite, because noise reaches its output without a lag.
@@ -170,7 +171,7 @@ class _Task:
         self.signals: Signals = signals_of(lin)
         self.structured = Structured(structure, self.signals)
         measured, commanded = self.structured.used
-        require_plain_sensors(lin, measured, "tune")
+        self.delays = sensor_delays(lin, measured)
         self.measures = [
             Measure(
                 goal,
@@ -202,9 +203,10 @@ class _Task:
     def plant(self, point: Point) -> Plant:
         """Return the plant of a model."""
         used = self.used
-        more = len(point.matrices[0]) + len(point.matrices[2]) - len(used)
+        matrices = with_delayed_outputs(point.matrices, self.delays)
+        more = len(matrices[0]) + len(matrices[2]) - len(used)
         used = np.append(used, np.zeros(max(more, 0), bool))
-        return plant_of(point.matrices, self.lin.dt, used)
+        return plant_of(matrices, self.lin.dt, used)
 
     def problem(self) -> Problem:
         """Return the problem of the models that are chosen."""

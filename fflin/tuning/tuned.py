@@ -12,7 +12,7 @@ import numpy as np
 from fflin.base import html
 from fflin.base.figures import Figure
 from fflin.base.record import write_record
-from fflin.base.tables import cut, folded, grid, width
+from fflin.base.tables import counted, cut, folded, grid, width
 from fflin.base.validation import Array
 from fflin.base.writing import as_path
 from fflin.control.linear_controller import LinearController
@@ -176,9 +176,10 @@ class Tuned(LinearController):
     def _verdict(self) -> str:
         """Return whether the goals hold, and what limits them."""
         if self.met:
+            models = counted(self.examined, "model")
             return (
-                f"{self.lin.robot}: all goals hold at {_counted(self.examined)}; the largest value "
-                f"is {self.factor:.4g} of its limit"
+                f"{self.lin.robot}: all goals hold at {models}; the largest value is "
+                f"{self.factor:.4g} of its limit"
             )
         names = [goal.label for goal in self.goals if not goal.met]
         text = (
@@ -278,9 +279,9 @@ class Tuned(LinearController):
         finite = [value for value in self.starts if math.isfinite(value)]
         near = sum(value <= 1.01 * min(finite) for value in finite) if finite else 0
         search = (
-            f"{len(self.starts)} starts, of which {near} reached the best value within 1 %; "
-            f"stationarity {self.stationarity:.1e}; "
-            f"{_counted(len(self.points))} in the search, {_counted(self.examined)} examined"
+            f"{counted(len(self.starts), 'start')}, of which {near} reached the best value within "
+            f"1 %; stationarity {self.stationarity:.1e}; "
+            f"{counted(len(self.points), 'model')} in the search, {self.examined} examined"
         )
         rows = cut(self._fitting_rows(), "see goals")
         goals = grid(rows, "llrrrr"[: len(rows[0])])
@@ -347,10 +348,6 @@ class Tuned(LinearController):
         """
         record = record_of_law(self) | {"parameters": dict(self.parameters)}
         write_record(as_path(path), record, checksummed=self.lin.verified)
-
-
-def _counted(number: int) -> str:
-    return "1 model" if number == 1 else f"{number} models"
 
 
 def matrices_of(law: Law, dt: float) -> tuple[Array, Array, Array, Array, float]:

@@ -19,6 +19,11 @@ signals:
 - 1 for a diagonal entry of the inertia, and 2 for an off-diagonal entry,
 - 4 for a coordinate of the centre of mass: 2 in T and 2 in T^T.
 
+If the robot has constraints, a = G b with the accelerations b of the independent coordinates, and
+the generalised forces are G^T F. The constraints can make some signals of a mass property linearly
+dependent. A basis of the signals is then multiplied by the parameter. The basis is empty if the
+parameter has no effect.
+
 These numbers are minimal. No :math:`r_k` can be smaller than the rank of the derivative of the
 inertia matrix M with respect to the parameter. Because X has full rank on a free base, each number
 is equal to this rank if D is nonsingular.
@@ -72,7 +77,8 @@ class LFT(Design):
         Uncertain parameters in the order in which their deltas occur in :math:`\Delta`. Tied
         parameters, which share one delta, are listed once, under their pattern.
     repeats : ndarray (k,)
-        Number of times that each delta occurs in :math:`\Delta`.
+        Number of times that each delta occurs in :math:`\Delta`. Zero if constraints make a
+        parameter ineffective.
     middle, half : ndarray (k,)
         Middle and half width of each range: a parameter has the value ``middle + half * delta``.
         For tied parameters, ``middle + half * delta`` is their common value if their range was
@@ -248,6 +254,10 @@ class Block(NamedTuple):
 # Largest number of signals that one parameter multiplies: 6 for a density.
 _MOST = 6
 
+# Signals are linearly dependent if a singular value is below this. The signals are in units of
+# their size without constraints, for motions of equal kinetic energy.
+_DEPENDENT = 1e-11
+
 
 def linear_fractional(
     lin: LinearModel,
@@ -280,8 +290,9 @@ def linear_fractional(
     taken = (np.arange(_MOST) < form.used[:, None]).ravel()
     ends = np.cumsum([len(block.ranges) for block in blocks])[:-1]
     repeats = [float(used.sum()) for used in np.split(form.used, ends)]
+    force = form.motion()
     # Solve the equation of motion for a, and eliminate a from z.
-    (M, *others), (Z, *direct) = form.parts(form.force), form.parts(form.z[taken])
+    (M, *others), (Z, *direct) = form.parts(force), form.parts(form.z[taken])
     others[2], direct[2] = others[2][:, taken], direct[2][:, taken]
     x, u, w = (-np.linalg.solve(M, matrix) for matrix in others)
     C1, D12, D11 = (d + Z @ matrix for d, matrix in zip(direct, (x, u, w), strict=True))
@@ -328,42 +339,93 @@ class _Form:
             joint: state.columns(pin.getJointJacobian(robot.model, data, joint, _LOCAL))
             for joint in range(1, robot.model.njoints)
         }
-        nv, nu = columns.shape
-        self.ends = np.cumsum((nv, state.nx, nu, _MOST * len(ranges)))
+        # In the independent coordinates of a robot with constraints, all accelerations are G times
+        # the independent ones, and all states are T times the independent ones.
+        nx, nu = lin.B.shape
+        nv, d = len(columns), nx // 2
+        T = np.eye(nx) if lin._all_states is None else lin._all_states
+        self.G: Array = T[nv:, d:]
+        self.ends = np.cumsum((d, nx, nu, _MOST * len(ranges)))
         self.unit = np.eye(self.ends[-1])
-        self.a, self.x, self.u, _ = np.split(self.unit, self.ends[:-1])
+        a, x, self.u, _ = np.split(self.unit, self.ends[:-1])
+        self.a: Array = self.G @ a
+        self.x: Array = T @ x
+        self._constrained = bool(lin.dependent)
+        # Typical sizes of a, x, u and w, in which signals are comparable.
+        inertia = state.project(pin.crba(robot.model, data, centred).T).diagonal()
+        self._speeds = 1.0 / np.sqrt(inertia)
+        self._typical: Array = np.ones(self.ends[-1])
+        self._typical[:d] = 1.0 / np.sqrt(lin.M.diagonal())
         # For each parameter, `z` reserves _MOST rows, and `used` counts the rows in use.
         self.used = np.zeros(len(ranges), dtype=np.intp)
         self.z = np.zeros((_MOST * len(ranges), self.ends[-1]))
-        # Inertial forces plus spring and damper forces minus input forces. By the equation of
-        # motion, this sum is zero.
-        self.force = np.zeros((nv, self.ends[-1]))
-        by_a, by_x, by_u, _ = self.parts(self.force)
+        # Inertial forces plus spring and damper forces minus input forces, of the nominal robot and
+        # of the changes. By the equation of motion, G^T times their sum is zero.
+        self.nominal = np.zeros((d, self.ends[-1]))
+        by_a, by_x, by_u, _ = self.parts(self.nominal)
         by_a[:] = lin.M
-        by_u[:] = -columns
-        by_x[6:, state.groups.q_m] = np.diag(robot.springs.stiffness)
-        by_x[6:, state.groups.qdot_m] = np.diag(robot.springs.damping)
+        by_u[:] = -self.G.T @ columns
+        if lin.dependent:
+            # A also contains the stiffness by the constant forces of preloaded springs in loops.
+            by_x[:] = -lin.M @ lin.A[d:]
+        else:
+            by_x[6:, state.groups.q_m] = np.diag(robot.springs.stiffness)
+            by_x[6:, state.groups.qdot_m] = np.diag(robot.springs.damping)
+        self.force = np.zeros((nv, self.ends[-1]))
+
+    def motion(self) -> Array:
+        """Return the signals (d, k) of the equation of motion, which are zero."""
+        signals: Array = self.nominal + self.G.T @ self.force
+        return signals
 
     def parts(self, signals: Array) -> list[Array]:
         """Split signals (N, k) into views of their coefficients of a, x, u and w."""
         return np.split(signals, self.ends[:-1], axis=1)
 
-    def times(self, at: int, signals: Array) -> Array:
+    def times(self, at: int, signals: Array, sizes: Array | None = None) -> Array:
         """Multiply signals by the change of a parameter from its nominal value.
 
-        `at` is the index of the parameter in `ranges`.
+        `at` is the index of the parameter in `ranges`. `sizes` (k,) are the sizes of the signals
+        without constraints. If they are given, the signals can be linearly dependent.
 
         The result is (shift + half * delta) * signals, where shift is the middle of the range minus
         the nominal value. The products half * signals become new entries of z. So the products
-        delta * half * signals are the new entries of w.
+        delta * half * signals are the new entries of w. If the signals are linearly dependent, a
+        basis of the signals replaces them in z.
         """
         parameter, middle, half = self.ranges[at]
+        basis = signals
+        combined: Array = np.eye(len(signals))
+        if self._constrained and sizes is not None:
+            basis, combined = self._basis(signals, sizes)
         first = _MOST * at + self.used[at]
-        rows = slice(first, first + len(signals))
-        self.used[at] += len(signals)
-        self.z[rows] = half * signals
+        rows = slice(first, first + len(basis))
+        self.used[at] += len(basis)
+        self.z[rows] = half * basis
+        self._typical[self.ends[2] :][rows] = half
         w = self.unit[self.ends[2] :]  # the entries of w as signals
-        return (middle - parameter.value) * signals + w[rows]
+        shift = middle - parameter.value
+        if not self._constrained:
+            return shift * signals + w[rows]
+        result: Array = shift * signals + combined @ w[rows]
+        return result
+
+    def _basis(self, signals: Array, sizes: Array) -> tuple[Array, Array]:
+        """Return a basis of signals (k, n), and the matrix that combines it to the signals."""
+        sizes = np.where(sizes > 0.0, sizes, 1.0)
+        scaled = signals * self._typical / sizes[:, None]
+        U, values, Vt = np.linalg.svd(scaled, full_matrices=False)
+        kept = values > _DEPENDENT
+        basis = values[kept, None] * Vt[kept] / self._typical
+        return basis, sizes[:, None] * U[:, kept]
+
+    def _sizes(self, matrix: Array) -> Array:
+        """Return the sizes (k,) of signals of the robot without constraints.
+
+        A matrix (k, 6 + n) makes the signals of the accelerations.
+        """
+        sizes: Array = np.linalg.norm(matrix * self._speeds, axis=1)
+        return sizes
 
     def add_piece(self, piece: Piece, parts: Mapping[str, int]) -> None:
         """Replace the nominal inertial force of a link by the force with uncertain parameters.
@@ -389,29 +451,35 @@ class _Form:
 
         nominal = X @ self.a
         s = nominal.copy()
+        sizes = self._sizes(X)
         for parameter, L, R in shifts:  # s = T X a
-            s[:3] += L @ self.times(parameter, R @ nominal[3:])
+            of_turn = np.abs(R) @ sizes[3:]
+            s[:3] += L @ self.times(parameter, R @ nominal[3:], of_turn)
 
         f = D @ s
+        of_force = np.abs(D) @ sizes
         if "mass" in parts:
-            f[:3] += self.times(parts["mass"], s[:3])
+            f[:3] += self.times(parts["mass"], s[:3], sizes[:3])
         for entry, (i, j) in ENTRIES.items():
             parameter = parts.get(f"inertia.{entry}")
             if parameter is None:
                 continue
             if i == j:
-                f[3 + i] += self.times(parameter, s[[3 + i]])[0]
+                rows = [3 + i]
+                f[3 + i] += self.times(parameter, s[rows], sizes[rows])[0]
             else:
                 # The inertia is symmetric: its entries (i, j) and (j, i) change alike.
-                change_i, change_j = self.times(parameter, s[[3 + i, 3 + j]])
+                rows = [3 + i, 3 + j]
+                change_i, change_j = self.times(parameter, s[rows], sizes[rows])
                 f[3 + j] += change_i
                 f[3 + i] += change_j
         if "density" in parts:
-            f = f + self.times(parts["density"], f)
+            f = f + self.times(parts["density"], f, of_force)
 
         shifted_force = f.copy()
         for parameter, L, R in shifts:  # T^T f
-            shifted_force[3:] += R.T @ self.times(parameter, L.T @ f[:3])
+            change = self.times(parameter, L.T @ f[:3], np.abs(L.T) @ of_force[:3])
+            shifted_force[3:] += R.T @ change
         self.force += X.T @ (shifted_force - D @ nominal)
 
     def add_alone(self, at: int) -> None:

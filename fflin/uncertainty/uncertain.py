@@ -1,6 +1,6 @@
 """Robot with uncertain parameters: linear-fractional model, samples and worst case."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import permutations
 
@@ -8,6 +8,7 @@ import numpy as np
 
 from fflin.base import html
 from fflin.base.errors import InputError
+from fflin.base.names import without_past
 from fflin.base.validation import (
     Array,
     by_name,
@@ -19,9 +20,12 @@ from fflin.base.validation import (
     vector,
     whole,
 )
-from fflin.dynamics.coordinates import refuse_constraints, refuse_elliptic
+from fflin.control.gain import Gain
+from fflin.control.policy import Policy
+from fflin.dynamics.coordinates import refuse_elliptic
 from fflin.dynamics.state import StateMap
 from fflin.linear.linearization import Prepared, linearize
+from fflin.linear.model import LinearModel
 from fflin.robot.inputs import has_magnetorquers
 from fflin.robot.robot import Robot
 from fflin.uncertainty.derivatives import WEIGH
@@ -87,13 +91,18 @@ class Uncertain:
         """Names of the blocks: the name of one parameter, or the pattern of tied parameters."""
         return tuple(block.name for block in self.blocks)
 
-    def lft(self, q: Array | None = None) -> LFT:
+    def lft(
+        self, q: Array | None = None, *, independent: Sequence[str] | None = None
+    ) -> LFT:
         """Return the model at rest as an exact linear-fractional function of the parameters.
 
         Parameters
         ----------
         q : array_like (nq,), optional
             Configuration; neutral by default.
+        independent : sequence of str, optional
+            Coordinates of the model of a robot with constraints, as in `linearize`. By default,
+            they are chosen for the nominal robot.
 
         Raises
         ------
@@ -101,9 +110,11 @@ class Uncertain:
             If an output depends on accelerations or masses, or if the operating point is not a
             fixed point for all values of the parameters. The operating point can depend on the
             parameters because of gravity, an orbit, stored momentum or a deflected spring.
+        ConstraintError
+            If q violates the constraints of the robot.
         """
         robot = self.robot
-        lin = linearize(self.robot, q)
+        lin = linearize(self.robot, q, independent=independent)
         if any(
             output.FEELS_ACCELERATION or type(output) in WEIGH
             for output in robot.outputs
@@ -112,14 +123,12 @@ class Uncertain:
                 "an output depends on accelerations or masses, which the LFT cannot represent; "
                 "remove it with robot.replace(outputs=)"
             )
-        rest = robot.springs.rest - StateMap(robot).joint_positions(lin.q)
-        varied = [
-            interval.parameter
-            for interval in self.ranges
-            if interval.parameter.by_stiffness
-        ]
-        pulled = [rest[one.joint] for one in varied]
-        pulled += [lin.f0.any(), *robot.gravity, robot.orbit, robot.stored_momentum]
+        self._refuse_deflected(lin)
+        departs = bool(lin.f0.any())
+        if lin.dependent:
+            # The forces of preloaded springs in a loop cancel to rounding errors.
+            departs = not lin.is_equilibrium()
+        pulled = [departs, *robot.gravity, robot.orbit, robot.stored_momentum]
         if any(pulled):
             raise InputError(
                 "gravity, an orbit, stored momentum or a spring that is not at its rest position "
@@ -128,6 +137,20 @@ class Uncertain:
             )
         ready = Prepared(robot, frame=lin.frame, reference=None, moving=False)
         return linear_fractional(lin, ready, self._parameters.pieces, self.blocks)
+
+    def _refuse_deflected(self, lin: LinearModel) -> None:
+        """Raise `InputError` if the stiffness of a deflected spring is uncertain."""
+        robot = self.robot
+        deflected = robot.springs.rest - StateMap(robot).joint_positions(lin.q)
+        for one, *_ in self.ranges:
+            if not (one.by_stiffness and deflected[one.joint]):
+                continue
+            raise InputError(
+                f"the spring whose force '{one.name}' changes is deflected by "
+                f"{abs(deflected[one.joint]):.3g} {robot.joints[one.joint].unit} at this point, so "
+                "that the forces at the point depend on the parameter; give a point at which the "
+                "spring is at rest, or linearise each robot of samples(n)"
+            )
 
     def at(self, values: Mapping[str, float]) -> Robot:
         """Return the robot with the given parameter values {parameter or pattern: value}.
@@ -220,16 +243,18 @@ class Uncertain:
 
         Parameters
         ----------
-        gain : Gain, array_like (nu, nx), StateFeedback or LinearController
+        gain : Gain, array_like (nu, nx), StateFeedback, LinearController or MultirateFeedback
             Linear law, which must stabilise the robot at the middle of the ranges. If it measures
             outputs, they must depend on states only. For a sampled law, every robot is sampled
             exactly with the delays of the law's model. The loops contain the lags of the robot's
             inputs, and of the outputs that the law measures; if the robot has none, the lags of
-            the law's model. The search is then the same, but there is no
-            guarantee for the robots that it does not try. For a `Gain`, only the states in
+            the law's model. Sensors have the sampling times and delays of the law's model. The
+            search is then the same, but there is no guarantee for the robots that it does not try.
+            For a `Gain`, only the states in
             `Gain.regulated`, and states that affect them, must be stable; for a policy, the states
             that it feeds back. For an array, all states must be stable. For example, a gain of
-            reaction wheels does not stabilise the wheel angles, so give the `Gain` itself.
+            reaction wheels does not stabilise the wheel angles, so give the `Gain` itself. The
+            columns of an array belong to the states of `lft`.
         q : array_like (nq,), optional
             Configuration, as in `lft`.
         samples : int
@@ -248,7 +273,20 @@ class Uncertain:
             If K has a wrong size, the loop at the middle of the
             ranges is unstable, or `lft` raises an `InputError` for this robot.
         """
-        return searched(self, self.lft(q), gain, count("samples", samples), seed)
+        lft = self.lft(q, independent=self._coordinates_of(gain))
+        return searched(self, lft, gain, count("samples", samples), seed)
+
+    def _coordinates_of(self, gain: object) -> tuple[str, ...] | None:
+        """Return the independent coordinates of a law of a robot with constraints."""
+        if not self.robot.constraints:
+            return None
+        states: tuple[str, ...] = ()
+        if isinstance(gain, Gain):
+            states = gain.model_states
+        elif isinstance(gain, Policy) and gain.model is not None:
+            states = gain.model.robot_states
+        states = without_past(states)
+        return states[: len(states) // 2] or None
 
 
 def uncertain(robot: Robot, ranges: Mapping[str, object]) -> Uncertain:
@@ -302,7 +340,6 @@ def uncertain(robot: Robot, ranges: Mapping[str, object]) -> Uncertain:
     5
     """
     instance("robot", robot, Robot, "a fflin.Robot").require_unchanged()
-    refuse_constraints(robot, "uncertain models")
     refuse_elliptic(robot, "uncertain models")
     _refuse_magnetorquers(robot)
     given: dict[str, object] = {}

@@ -366,3 +366,43 @@ def test_a_law_about_a_point_does_not_follow_a_periodic_trajectory():
     along = fflin.linearize_orbit(robot, steps=8)
     with pytest.raises(fflin.InputError, match="follows needs a trajectory that ends"):
         law.follow(along)
+
+
+def test_a_delayed_sensor_is_compared_with_the_reference_of_its_measurement(tmp_path):
+    robot = fflin.load(
+        "cubesat",
+        inputs=[fflin.BaseTorque()],
+        outputs=[fflin.StarTracker(delay=SAMPLE)],
+    )
+    lin = fflin.linearize(robot)
+    law = fflin.PD("q_b", "tau_b", shared=True)
+    tuned = fflin.tune(lin, law, fflin.Margin(0.8), dt=SAMPLE, starts=1, steps=3)
+
+    def bang_bang(t, q, v):
+        torque = 1e-4 if t < 0.5 * TURN * (1.0 - 1e-12) else -1e-4
+        return np.array([0.0, 0.0, torque])
+
+    trajectory = fflin.simulate(
+        robot, bang_bang, duration=TURN, sample=0.5, dt=0.5
+    ).trajectory()
+    policy = tuned.follow(trajectory)
+    motion = fflin.simulate(robot, policy, duration=TURN + 4.0, dt=0.125)
+    assert np.abs(motion.q[-1] - motion.q[0]).max() > 0.01
+    assert motion.attitude_error.max() < 1e-6
+    with pytest.raises(fflin.InputError, match="delay"):
+        fflin.write_c(policy, tmp_path)
+
+
+def test_a_slow_sensor_cannot_follow_a_trajectory():
+    robot = fflin.load(
+        "cubesat",
+        inputs=[fflin.BaseTorque()],
+        outputs=[fflin.StarTracker(sample=2 * SAMPLE)],
+    )
+    plain = robot.replace(outputs=[fflin.StarTracker()])
+    lin = fflin.linearize(plain).discretize(SAMPLE)
+    gain = np.hstack((-1e-3 * np.eye(3),))
+    law = fflin.LinearController(gain, lin)
+    still = fflin.simulate(plain, duration=1.0, dt=0.5).trajectory()
+    with pytest.raises(fflin.InputError, match="sample other than"):
+        fflin.simulate(robot, law.follow(still), duration=1.0)

@@ -88,6 +88,17 @@ def test_a_tuned_law_flies_and_is_saved(tuned, stiff, tmp_path):
     assert np.array_equal(again.system.A, tuned.system.A)
 
 
+def test_a_saved_law_is_read_with_its_delay(stiff, tmp_path):
+    lin = fflin.linearize(stiff)
+    goal = fflin.Margin(0.5)
+    late = fflin.tune(lin, LAW, goal, dt=0.2, delay=0.1, starts=1, steps=2)
+    path = tmp_path / "law.npz"
+    late.save(path)
+    policy = fflin.LinearController(path, lin)
+    assert policy.dt == 0.2 and policy.input_delays == late.input_delays
+    assert set(policy.input_delays.values()) == {0.1}
+
+
 @pytest.mark.exhaustive
 def test_two_runs_with_one_seed_are_equal_bit_for_bit(stiff):
     lin = fflin.linearize(stiff)
@@ -292,6 +303,27 @@ def test_a_reduced_controller_may_have_a_given_order_or_norm(optimal):
         optimal.reduced(10)
 
 
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("dt", [0.0, 0.5])
+def test_a_search_begins_at_a_reduced_controller_and_improves_it(robot, dt):
+    pytest.importorskip("slycot")
+    lin = fflin.linearize(robot)
+    model = lin.discretize(dt) if dt else lin
+    small = fflin.hinf(model, FULL, measured="q_b").reduced(8)
+    law = fflin.StateSpaceLaw(8, "q_b", "tau_b", start=small)
+    first = fflin.tune(model, law, FULL, starts=1, steps=1)
+    later = fflin.tune(model, law, FULL, starts=1, steps=10)
+    assert first.goals[0].worst <= small.gamma * (1.0 + 1e-9)
+    assert later.goals[0].worst <= first.goals[0].worst
+    for order, signals, word in (
+        (6, "q_b", "8 states"),
+        (8, "q_b.x", "start measures q_b.y"),
+    ):
+        with pytest.raises(fflin.InputError, match=word):
+            other = fflin.StateSpaceLaw(order, signals, "tau_b", start=small)
+            fflin.tune(model, other, FULL, starts=1, steps=1)
+
+
 def test_states_that_do_not_affect_the_goals_are_not_counted(optimal):
     A, B, C, D = optimal._design.law
     idle = np.zeros((len(A), 2))
@@ -419,19 +451,61 @@ def test_the_lags_of_a_robot_are_in_uncertain_plants():
     assert worst >= 0.75 * (1.0 - 1e-6)
 
 
-@pytest.mark.parametrize("field", [{"sample": 0.4}, {"delay": 0.2}])
-def test_sensors_with_their_own_times_are_refused(field):
-    robot = fflin.load(
-        "cubesat", inputs=[fflin.BaseTorque()], outputs=[fflin.StarTracker(**field)]
+def with_tracker(**times):
+    """A satellite with a torque and a star tracker with given times."""
+    return fflin.load(
+        "cubesat", inputs=[fflin.BaseTorque()], outputs=[fflin.StarTracker(**times)]
     )
+
+
+@pytest.mark.parametrize(
+    ("times", "dt", "word"),
+    [
+        ({"sample": 0.4}, 0.1, "dt=0.4"),
+        ({"sample": 0.4}, None, "the law is continuous"),
+        ({"delay": 0.2}, None, "dt=0.2"),
+        ({"delay": 0.25}, 0.1, "0.2 and 0.3"),
+    ],
+)
+def test_sensors_with_other_sample_times_than_the_law_are_refused(times, dt, word):
     law = fflin.PD("q_b", "tau_b", shared=True)
-    with pytest.raises(fflin.InputError, match=r"q_b\.x has its own sample or delay"):
-        fflin.tune(fflin.linearize(robot), law, fflin.Decay(0.1), dt=0.1)
-    plain = robot.replace(outputs=[fflin.StarTracker(sample=0.1)])
-    tuned = fflin.tune(
-        fflin.linearize(plain), law, fflin.Decay(0.1), dt=0.1, starts=1, steps=5
+    lin = fflin.linearize(with_tracker(**times))
+    with pytest.raises(fflin.InputError, match=word):
+        fflin.tune(lin, law, fflin.Decay(0.1), dt=dt)
+
+
+def test_a_sensor_with_the_sample_time_of_the_law_is_accepted():
+    law = fflin.PD("q_b", "tau_b", shared=True)
+    lin = fflin.linearize(with_tracker(sample=0.1))
+    assert fflin.tune(lin, law, fflin.Decay(0.1), dt=0.1, starts=1, steps=5).met
+
+
+def test_the_delay_of_a_sensor_acts_like_the_same_delay_of_the_inputs():
+    law = fflin.PD("q_b", "tau_b", shared=True)
+    goals = [fflin.Margin(0.9), fflin.MaxGain("tau_b", "q_b", below=60.0)]
+    late = fflin.linearize(with_tracker(delay=0.4))
+    plain = fflin.linearize(with_tracker())
+    sensed = fflin.tune(late, law, goals, dt=0.2, starts=1, steps=4)
+    acted = fflin.tune(plain, law, goals, dt=0.2, delay=0.4, starts=1, steps=4)
+    for goal, other in zip(sensed.goals, acted.goals, strict=True):
+        assert goal.value == pytest.approx(other.value, rel=1e-6)
+    margin = fflin.margins(sensed, sensed.lin).disk
+    assert 0.9 / margin == pytest.approx(sensed.goals[0].check, rel=1e-6)
+    # Without the delay, the margin of the loop is larger.
+    assert fflin.margins(sensed, plain.discretize(0.2)).disk > 1.05 * margin
+
+
+def test_the_delay_of_a_sensor_is_in_the_norm_of_hinf():
+    pytest.importorskip("slycot")
+    goal = fflin.MaxGain({"tau_b": 0.01, "q_b": 1e-3}, {"q_b": 0.05, "tau_b": 1.0})
+    lin = fflin.linearize(with_tracker(delay=0.4)).discretize(0.2)
+    other = fflin.linearize(with_tracker()).discretize(0.2, delay=0.4)
+    policy, delayed = fflin.hinf(lin, goal), fflin.hinf(other, goal)
+    assert policy.gamma == pytest.approx(delayed.gamma, rel=5e-3)
+    assert (
+        policy.gamma
+        > 1.02 * fflin.hinf(fflin.linearize(with_tracker()).discretize(0.2), goal).gamma
     )
-    assert tuned.met
 
 
 def test_the_lags_of_a_robot_are_in_the_loop_of_hinf():
