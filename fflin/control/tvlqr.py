@@ -705,6 +705,9 @@ def periodic_end(
 # multiplier 1, with rounding errors.
 _LARGEST_MULTIPLIER = 1.001
 
+# Number of times that the intervals between knots are halved for a rough periodic solution.
+_HALVINGS = 3
+
 # Entries of transition matrices below this fraction of the largest one are rounding errors.
 _UNCOUPLED = 1e-12
 
@@ -745,10 +748,7 @@ def _periodic_back(
 ) -> tuple[Array, Array, Array]:
     """Return times, P at these times, and T, G and W between them, for the periodic solution."""
     with stabilised(traj):
-        coarse = periodic_riccati.interval_maps(at, traj.t)
-        P = periodic_riccati.periodic_cost(
-            periodic_riccati.over_period(iter(coarse[::-1]))
-        )
+        P = _rough_cost(traj.t, at)
         # This sweep finds the times at which the solution is accurate. The doubling is repeated
         # with the maps between these times, so that it agrees with a sweep to machine precision.
         times, _ = riccati.solve_back(at, traj.t, P)
@@ -763,6 +763,27 @@ def _periodic_back(
 
         P = periodic_riccati.repeated(sweep, P, _UNSTABLE)
         return times, _swept(maps, P), maps
+
+
+def _rough_cost(times: Array, at: Callable[[Array], Array]) -> Array:
+    """Return an estimate of the periodic solution P (nx, nx) at the end of the period.
+
+    The maps between the knots `times` (k,) [s] are not accurate if the cost changes fast. Then the
+    doubling may fail, and is repeated with more knots. Raise `LinAlgError` if it fails always.
+    """
+    for _ in range(_HALVINGS):
+        maps = periodic_riccati.interval_maps(at, times)
+        try:
+            return periodic_riccati.periodic_cost(
+                periodic_riccati.over_period(iter(maps[::-1]))
+            )
+        except np.linalg.LinAlgError:
+            middle = 0.5 * (times[1:] + times[:-1])
+            times = np.sort(np.concatenate((times, middle)))
+    maps = periodic_riccati.interval_maps(at, times)
+    return periodic_riccati.periodic_cost(
+        periodic_riccati.over_period(iter(maps[::-1]))
+    )
 
 
 def _swept(maps: Array, P: Array) -> Array:

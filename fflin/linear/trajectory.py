@@ -47,6 +47,8 @@ _CAUSES = (
     "joints, or springs, damping or gravity that differ from the robot"
 )
 
+_MORE_KNOTS = "give more knots, with steps= of linearize_orbit or --periodic N"
+
 # The integration over an interval is repeated with halved steps. The repetition ends if the state
 # at the end of the interval changes by at most _ACCURACY, or if the interval has _MOST_STEPS steps.
 # The change of the state is relative: it is divided by the duration of the interval and by the
@@ -482,7 +484,8 @@ class Trajectory(Design):
                 error = "the integration overflows, and the errors of "
             return (
                 f"t, q, v, u are not a motion of {where} {error}{(missed > _MOTION).sum()} of "
-                f"{len(missed)} intervals exceed {_MOTION:g}; {_CAUSES}"
+                f"{len(missed)} intervals exceed {_MOTION:g}; "
+                f"{_MORE_KNOTS if self.period else _CAUSES}"
             )
         rates = np.linalg.norm(self.v[:, 3:6], axis=1)
         turns = np.diff(self.t) * np.maximum(rates[1:], rates[:-1])
