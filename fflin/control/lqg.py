@@ -62,11 +62,12 @@ def lqg(
     delayed inputs, the filter uses the limited inputs, and the integrals are corrected as in
     `StateFeedback`.
 
-    The filter reduces the margins of the loop. If inputs have delays or lags, the default weights
-    of `lqr` are made slower here until the disk margin of the whole loop is 2/3, which is a gain
-    margin of 6 dB. The report of the compensator then states the factor and the margin. If a loop
-    that is four times slower has a smaller margin, the gain is not changed, and the report states
-    the margin. Weights from the user are not changed.
+    The filter reduces the margins of the loop. If inputs have delays or lags, or sensors have their
+    own sampling times or delays, the default weights of `lqr` are made slower here until the disk
+    margin of the whole loop is 2/3, which is a gain margin of 6 dB. The report of the compensator
+    then states the factor and the margin. If a loop that is four times slower has a smaller margin,
+    the gain is not changed, and the report states the margin. Weights from the user are not
+    changed.
 
     The compensator of a `MultirateEstimator` has matrices for each sample of the period. It uses
     the measurements of every sensor when they arrive, and is flown by `MultirateFeedback`.
@@ -110,7 +111,8 @@ def lqg(
     instance("estimator", estimator, kinds, "an Estimator, as fflin.kalman returns it")
     first = _compensator(gain, estimator, zero_error)
     slower = gain._slower
-    if slower is None or not is_late(gain):
+    late = isinstance(estimator, MultirateEstimator) or is_late(gain)
+    if slower is None or not late:
         return first
     lin = gain._lin
     assert lin is not None  # since the gain was designed for a model

@@ -263,10 +263,10 @@ def laws_in_loop(
         )
     if not outputs:
         return laws
-    return _with_sensors(laws, lin)
+    return with_sensors(laws, lin)
 
 
-def _with_sensors(laws: list[System], lin: LinearModel) -> list[System]:
+def with_sensors(laws: list[System], lin: LinearModel) -> list[System]:
     """Return laws of outputs in series with the sensors of the model's robot."""
     if lin._robot is None:
         if len(laws) > 1:

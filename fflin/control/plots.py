@@ -44,6 +44,8 @@ from fflin.control.loop_margins import Margins
 from fflin.control.margins import closed_loop
 from fflin.control.optimal.channel_limits import NO_GRID, channel_limits
 from fflin.control.optimal.disk import as_continuous
+from fflin.control.periodic_closed_loop import PeriodicClosedLoop
+from fflin.control.periodic_plots import plot_periodic
 from fflin.control.policy import Policy
 from fflin.linear.check import Check
 from fflin.linear.model import LinearModel
@@ -357,6 +359,10 @@ def plot_loops(
     `delay` or `sample` is given, it contains a Bode plot, a Nichols plot and the sensitivity of the
     loop with the exact sampled plant, as `margins` uses it.
 
+    A periodic law, such as `MultirateFeedback`, answers one frequency with the N frequencies of its
+    period. The figure then contains the largest singular values of the lifted loop, whose signals
+    are these N harmonics: its gain, its sensitivity, and its eigenloci, which must not encircle -1.
+
     Parameters
     ----------
     policy : Policy or Gain
@@ -379,7 +385,7 @@ def plot_loops(
     Raises
     ------
     InputError
-        If the policy is not linear about a point, its model is not known, or the law is periodic.
+        If the policy is not linear about a point, or its model is not known.
 
     Examples
     --------
@@ -402,11 +408,8 @@ def plot_loops(
         raise InputError("the model of the law is not known; give lin=")
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         closed = closed_loop(policy, lin, delay, sample)
-        if len(closed.laws) > 1:
-            raise InputError(
-                "the law is periodic and answers one frequency with several, so its loop has no "
-                "Bode or Nichols plot; use fflin.margins(policy, lin)"
-            )
+        if isinstance(closed, PeriodicClosedLoop):
+            return plot_periodic(closed, path, axes)
         w, response = loop_responses(closed)
         margins = in_one_thread(closed.margins)()
     return _plot_closed(closed, margins, w, response, path, axes)

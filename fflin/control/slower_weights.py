@@ -16,10 +16,10 @@ Design = TypeVar("Design")
 # Disk margin of the default weights: the loop tolerates gain factors between 1/2 and 2 (6 dB).
 LEAST_DISK = 2.0 / 3.0
 
-# The bandwidth is divided by powers of _STEP, at most _STEPS times. If that is not enough, the
-# filter or the delay limits the margin, and a slower loop would lose more than it gains. The
-# interval in which the margin reaches its least value is then halved _HALVINGS times.
-_STEP, _STEPS, _HALVINGS = 2.0**0.5, 4, 4
+# The bandwidth is divided by at most _MOST. If that is not enough, the filter or the delay limits
+# the margin, and a slower loop would lose more than it gains. The search interpolates at most
+# _TRIALS times, and ends if the margin is above its least value by at most the fraction _ABOVE.
+_MOST, _TRIALS, _ABOVE = 4.0, 6, 0.02
 
 
 class Slowed(NamedTuple):
@@ -41,7 +41,7 @@ class Slowed(NamedTuple):
         if self.disk < LEAST_DISK:
             return (
                 f"the disk margin {self.before:.3g} (gain {_gain(self.before)}) is below "
-                f"{LEAST_DISK:.3g} (6 dB), and a loop that is {_STEP**_STEPS:.3g} times slower "
+                f"{LEAST_DISK:.3g} (6 dB), and a loop that is {_MOST:g} times slower "
                 "does not reach it"
             )
         return (
@@ -91,40 +91,39 @@ def slowed(
     before = margin_of(first)
     if before is None or before >= LEAST_DISK:
         return first, None
-    fast = 1.0
-    for step in range(1, _STEPS + 1):
-        slow = _STEP**step
+    for factor in (_MOST, _MOST**0.5):
         try:
-            design = redesign(slow)
+            design = redesign(factor)
         except FflinError:  # the weights are so small that the design fails
-            break
+            continue
         disk = margin_of(design) or 0.0
         if disk >= LEAST_DISK:
-            return _halved(
-                design, Slowed(slow, before, disk), fast, redesign, margin_of
-            )
-        fast = slow
+            return _fastest(design, Slowed(factor, before, disk), redesign, margin_of)
     return first, Slowed(1.0, before, before)
 
 
-def _halved(
+def _fastest(
     design: Design,
     change: Slowed,
-    fast: float,
     redesign: Callable[[float], Design],
     margin_of: Callable[[Design], float | None],
 ) -> tuple[Design, Slowed]:
-    """Return a design with the margin that is faster than `design`, if there is one.
+    """Return the fastest design with the margin, which is at least as fast as `design`.
 
-    The loop whose bandwidth is divided by `fast` does not have the margin.
+    The margin is interpolated over the logarithm of the factor.
     """
-    for _ in range(_HALVINGS):
-        middle = (fast * change.factor) ** 0.5
-        trial = redesign(middle)
+    fast, least = 1.0, change.before
+    for _ in range(_TRIALS):
+        if change.disk <= (1.0 + _ABOVE) * LEAST_DISK:
+            break
+        goal = (1.0 + 0.5 * _ABOVE) * LEAST_DISK
+        part = (goal - least) / (change.disk - least)
+        factor = fast * (change.factor / fast) ** min(max(part, 0.1), 0.9)
+        trial = redesign(factor)
         disk = margin_of(trial) or 0.0
         if disk >= LEAST_DISK:
             design = trial
-            change = change._replace(factor=middle, disk=disk)
+            change = change._replace(factor=factor, disk=disk)
         else:
-            fast = middle
+            fast, least = factor, disk
     return design, change

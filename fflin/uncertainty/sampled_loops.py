@@ -10,8 +10,15 @@ from fflin.base.errors import InputError
 from fflin.base.validation import Array, Mask
 from fflin.control.delayed import law_with_memory
 from fflin.control.gain import Gain, regulated_states
+from fflin.control.margins import with_sensors
 from fflin.control.optimal.disk import Loop, as_continuous, largest_scaled_gain
 from fflin.control.optimal.largest_gain import ACCURACY, gain_crossings, largest_gain
+from fflin.control.optimal.periodic_loops import (
+    Harmonics,
+    PeriodicLoop,
+    lifted,
+    monodromy,
+)
 from fflin.control.policy import Policy, System
 from fflin.dynamics.delays import HeldSystem
 from fflin.uncertainty.lft import LFT
@@ -27,12 +34,28 @@ DISK, OUTPUTS = "disk", "outputs"
 
 
 class SampledLaw(NamedTuple):
-    """Sampled linear law, with the delays of its inputs and the states that it regulates."""
+    """Sampled linear law, with the delays of its inputs and the states that it regulates.
 
-    system: System
+    The law has one system for each sample of its period; laws that are not periodic have one.
+    """
+
+    systems: tuple[System, ...]
     delays: Array  # (nu,) [s]
     regulated: tuple[str, ...]
     outputs: bool  # whether the law measures outputs and not states
+
+    @property
+    def system(self) -> System:
+        """The law at the first sample, which has the signals and the sampling time of all."""
+        return self.systems[0]
+
+    @property
+    def used(self) -> Mask:
+        """Which of the measured signals (ny,) the law uses."""
+        used: Mask = np.any(
+            [x.B.any(axis=0) | x.D.any(axis=0) for x in self.systems], axis=0
+        )
+        return used
 
 
 def sampled_law(gain: object) -> SampledLaw | None:
@@ -45,18 +68,22 @@ def sampled_law(gain: object) -> SampledLaw | None:
         if gain.integrals:
             system = gain.integral_law()
         system, regulated = acting_part(system, regulated_states(gain))
-        return SampledLaw(system, gain.delay, regulated, False)
+        return SampledLaw((system,), gain.delay, regulated, False)
     if not isinstance(gain, Policy):
         return None
     law = gain.linear_law()
-    if law is None or not law.dt:
+    laws = [law] if law is not None else gain.laws_of_period()
+    if not laws or not laws[0].dt:
         return None
     delays = gain.input_delays
-    late = np.array([delays.get(name, 0.0) for name in law.outputs])
+    late = np.array([delays.get(name, 0.0) for name in laws[0].outputs])
     regulated = gain.fed_back
     if not gain.senses_outputs:
-        law, regulated = acting_part(law, regulated)
-    return SampledLaw(law, late, regulated, gain.senses_outputs)
+        part, regulated = acting_part(laws[0], regulated)
+        return SampledLaw((part,), late, regulated, False)
+    if gain.model is not None:
+        laws = with_sensors(laws, gain.model)
+    return SampledLaw(tuple(laws), late, regulated, True)
 
 
 def acting_part(
@@ -86,29 +113,40 @@ class SampledLoops:
 
     def __init__(self, lft: LFT, law: SampledLaw) -> None:
         self.lft = lft
-        self._law = law.system
+        self._laws = law.systems
         self._delays = law.delays
         self._dt = law.system.dt or 0.0
-        self._kept: dict[bytes, tuple[Array, Array, Array, Array]] = {}
+        self._kept: dict[bytes, list[tuple[Array, Array, Array, Array]]] = {}
         self._measured = measured_signals(lft, law)
         # Scaling of the inputs for DISK: the best scaling of the loop at the middle of the ranges.
         # With it, few loops seem to be worse than they are with their own best scaling.
         self._scale: Array = np.ones(len(law.system.outputs))
-        middle = self.loop(np.zeros(len(lft.repeats)), DISK)
-        if middle is not None:
-            self._scale = largest_scaled_gain(middle)[2]
+        middle = np.zeros(len(lft.repeats))
+        if self._undamped(middle) < 0.0:
+            self._scale = self._best_scale(middle)
         # Frequencies at which earlier loops had their largest gains, by kind.
         self._peaks: dict[str, list[float]] = {}
 
-    def _closed(self, row: Array) -> tuple[Array, Array, Array, Array]:
-        """Return F and G of a sampled loop, and its matrices to the commands and to the outputs."""
+    def _best_scale(self, row: Array) -> Array:
+        """Return the best scaling (nu,) of the inputs for DISK of a stable loop."""
+        loop = self.loop(row, DISK)
+        assert loop is not None
+        return largest_scaled_gain(loop)[2]
+
+    def _closed(self, row: Array) -> list[tuple[Array, Array, Array, Array]]:
+        """Return F, G, and the matrices to commands and outputs, for each sample of a period."""
         key = row.tobytes()
-        if key in self._kept:
-            return self._kept[key]
-        A, B, *_ = self.lft.at(row)
-        law = self._law
-        plant, inputs = HeldSystem(A, B, self._dt, self._delays).sampled()
-        past = len(plant) - len(A)
+        if key not in self._kept:
+            A, B, *_ = self.lft.at(row)
+            plant, inputs = HeldSystem(A, B, self._dt, self._delays).sampled()
+            self._kept[key] = [self._with(law, plant, inputs) for law in self._laws]
+        return self._kept[key]
+
+    def _with(
+        self, law: System, plant: Array, inputs: Array
+    ) -> tuple[Array, Array, Array, Array]:
+        """Return the matrices of `_closed` for one law and a sampled plant."""
+        past = len(plant) - len(self.lft.A)
         measured = np.hstack((self._measured, np.zeros((len(self._measured), past))))
         seen = np.hstack((self.lft.C2, np.zeros((len(self.lft.C2), past))))
         F = np.block(
@@ -120,15 +158,18 @@ class SampledLoops:
         G = np.vstack((inputs, np.zeros((len(law.A), inputs.shape[1]))))
         command = np.hstack((law.D @ measured, law.C))
         outputs = np.hstack((seen, np.zeros((len(seen), len(law.A)))))
-        self._kept[key] = F, G, command, outputs
-        return self._kept[key]
+        return F, G, command, outputs
 
     def undamped(self, rows: Array) -> Array:
         """Return minus the least damping ratio of each loop (N,); >= 0 means an unstable loop."""
         return np.array([self._undamped(row) for row in rows])
 
+    def _transition(self, row: Array) -> Array:
+        """Return the transition matrix of a loop over one period."""
+        return self._closed(row)[0][0]
+
     def _undamped(self, row: Array) -> float:
-        poles = np.linalg.eigvals(self._closed(row)[0])
+        poles = np.linalg.eigvals(self._transition(row))
         # A pole at z = 0 has no rate. It is the pole of a delay, and as damped as possible.
         rates = np.log(poles[np.abs(poles) > np.finfo(float).tiny])
         ratios = rates.real / np.maximum(np.abs(rates), 1e-300)
@@ -136,9 +177,9 @@ class SampledLoops:
 
     def loop(self, row: Array, kind: str) -> Loop | None:
         """Return the loop of one kind of gain as a continuous loop, or None if it is unstable."""
-        F, G, command, outputs = self._closed(row)
         if self._undamped(row) >= 0.0:
             return None
+        F, G, command, outputs = self._closed(row)[0]
         H, J = outputs, np.zeros((len(outputs), G.shape[1]))
         if kind == DISK:
             H, J = command, 0.5 * np.eye(G.shape[1])
@@ -189,11 +230,61 @@ class SampledLoops:
         return bool(crossed.any())
 
 
+class PeriodicLoops(SampledLoops):
+    """Closed loops of a law whose matrices repeat after N > 1 samples.
+
+    Gains are those of the system whose sample is one period, which has the signals of N samples.
+    """
+
+    def _best_scale(self, row: Array) -> Array:
+        """Return the scaling (nu,) of the inputs: the mean of the best ones of all harmonics."""
+        _, _, d = Harmonics(self._periodic(row, DISK)).peak()
+        logarithms = np.log(d).reshape(len(self._laws), -1)
+        scale: Array = np.exp(logarithms.mean(axis=0))
+        return scale
+
+    def _transition(self, row: Array) -> Array:
+        """Return the transition matrix of a loop over one period."""
+        return monodromy(np.array([F for F, *_ in self._closed(row)]))
+
+    def _periodic(self, row: Array, kind: str) -> PeriodicLoop:
+        """Return the loop of one kind of gain, for each sample of the period."""
+        F, G, command, outputs = map(np.array, zip(*self._closed(row), strict=True))
+        nu = G.shape[2]
+        if kind == DISK:
+            half = np.array([0.5 * np.eye(nu)] * len(F))
+            return PeriodicLoop(F, G, command, half)
+        return PeriodicLoop(F, G, outputs, np.zeros((len(F), outputs.shape[1], nu)))
+
+    def loop(self, row: Array, kind: str) -> Loop | None:
+        """Return the loop of one kind of gain over a period, or None if it is unstable.
+
+        For DISK, the scaling of an input is the same at all samples.
+        """
+        if self._undamped(row) >= 0.0:
+            return None
+        matrices = lifted(self._periodic(row, kind))
+        loop = as_continuous(*matrices, len(self._laws) * self._dt)
+        if kind != DISK:
+            return loop
+        return loop.scaled(np.tile(self._scale, len(self._laws)))
+
+    def exact(self, row: Array, kind: str) -> float:
+        """Return the largest gain of a loop, for DISK with the best scaling of all harmonics."""
+        if kind != DISK or self._undamped(row) >= 0.0:
+            return super().exact(row, kind)
+        value, angle, _ = Harmonics(self._periodic(row, kind)).peak()
+        # The frequency of the system whose sample is one period, see `as_continuous`.
+        w = np.tan(0.5 * len(self._laws) * angle)
+        self._peaks.setdefault(kind, []).append(min(abs(float(w)), 1e300))
+        return value
+
+
 def measured_signals(lft: LFT, law: SampledLaw) -> Array:
     """Return the matrix (ny, nx) from the states of an LFT to the signals that a law measures."""
     system = law.system
     names = lft.output_names if law.outputs else lft.state_names
-    used: Mask = np.any(system.B, axis=0) | np.any(system.D, axis=0)
+    used = law.used
     needed = [name for name, use in zip(system.inputs, used, strict=True) if use]
     missing = [name for name in needed if name not in names]
     if missing or system.outputs != lft.input_names:

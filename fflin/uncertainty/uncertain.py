@@ -243,13 +243,14 @@ class Uncertain:
 
         Parameters
         ----------
-        gain : Gain, array_like (nu, nx), StateFeedback or LinearController
+        gain : Gain, array_like (nu, nx), StateFeedback, LinearController or MultirateFeedback
             Linear law, which must stabilise the robot at the middle of the ranges. If it measures
             outputs, they must depend on states only. For a sampled law, every robot is sampled
             exactly with the delays of the law's model. The loops contain the lags of the robot's
             inputs, and of the outputs that the law measures; if the robot has none, the lags of
-            the law's model. The search is then the same, but there is no
-            guarantee for the robots that it does not try. For a `Gain`, only the states in
+            the law's model. Sensors have the sampling times and delays of the law's model. The
+            search is then the same, but there is no guarantee for the robots that it does not try.
+            For a `Gain`, only the states in
             `Gain.regulated`, and states that affect them, must be stable; for a policy, the states
             that it feeds back. For an array, all states must be stable. For example, a gain of
             reaction wheels does not stabilise the wheel angles, so give the `Gain` itself. The

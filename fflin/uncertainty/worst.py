@@ -29,6 +29,7 @@ from fflin.uncertainty.lft import LFT
 from fflin.uncertainty.sampled_loops import (
     DISK,
     OUTPUTS,
+    PeriodicLoops,
     SampledLaw,
     SampledLoops,
     acting_part,
@@ -94,7 +95,8 @@ class Worst(html.Reported):
     Attributes
     ----------
     damping : Found
-        Least damping ratio of a pole.
+        Least damping ratio of a pole. The poles of a periodic law are those of one period, with the
+        smallest of their possible frequencies.
     margin : Found
         Least disk margin at the inputs; 0 if a loop is unstable. For policies and sampled gains, it
         has the best scaling of the inputs, as in `margins`. For a continuous `Gain`, the inputs are
@@ -250,7 +252,8 @@ def _sampled_loops(
 ) -> tuple[SampledLoops, Callable[[], list[Figures]]]:
     """Return the loops of a sampled law, and a function that returns the criteria as above."""
     kept = judged_states(lft, measured_signals(lft, law), law.regulated)
-    loops = SampledLoops(part_of(lft, kept), law)
+    kind = PeriodicLoops if len(law.systems) > 1 else SampledLoops
+    loops = kind(part_of(lft, kept), law)
 
     def figures(kind: str) -> Figures:
         return Figures(

@@ -262,8 +262,6 @@ def test_a_delayed_sensor_is_part_of_the_loop():
 
 def test_what_a_periodic_loop_does_not_have_is_refused(loop):
     lin, policy = loop
-    with pytest.raises(fflin.InputError, match="no Bode or Nichols plot"):
-        fflin.plot_loops(policy, lin=lin)
     unknown = replace(lin, _robot=None)
     with pytest.raises(fflin.InputError, match="the model has no robot"):
         fflin.margins(policy, unknown)

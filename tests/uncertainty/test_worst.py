@@ -1,6 +1,7 @@
 """The worst loop of a set of robots, and how far the set is surely safe."""
 
 import itertools
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -554,7 +555,7 @@ def test_the_gain_of_a_sampled_loop_is_that_of_its_frequency_response(
     # One of the tried corners, or a better point, is the worst.
     corner = loops.exact(np.array((-1.0, -1.0)), OUTPUTS)
     assert worst.gain.value >= corner * (1.0 - 1e-5)
-    F, G, _, H = loops._closed(np.array((-1.0, -1.0)))
+    F, G, _, H = loops._closed(np.array((-1.0, -1.0)))[0]
     w = np.geomspace(1e-4, np.pi / 0.5, 3000)
     gains = [
         np.linalg.norm(H @ np.linalg.solve(np.exp(0.5j * x) * np.eye(len(F)) - F, G), 2)
@@ -577,3 +578,40 @@ def test_unstable_sampled_loops_are_counted(sampled_satellite):
     law = fflin.StateFeedback(other, fflin.lqr(other))
     with pytest.raises(fflin.InputError, match="give the law of this robot"):
         model.worst(law)
+
+
+def multirate_satellite(sensors):
+    """Return a satellite with an uncertain inertia, and its model."""
+    robot = fflin.load("cubesat", inputs=[fflin.BaseTorque()], outputs=sensors)
+    model = fflin.uncertain(robot, {"base.density": 0.3})
+    return model, fflin.linearize(robot).discretize(0.25, delay=0.1)
+
+
+@pytest.mark.exhaustive
+def test_the_worst_loop_of_a_multirate_law_is_that_of_margins():
+    sensors = [fflin.StarTracker(sample=0.5, delay=0.25), fflin.Gyroscope("base")]
+    model, lin = multirate_satellite(sensors)
+    estimator = fflin.kalman(lin, {"omega_b": 1e-10}, 1e-9)
+    policy = fflin.MultirateFeedback(lin, fflin.lqg(fflin.lqr(lin), estimator))
+    worst = model.worst(policy, samples=4)
+    assert worst.unstable == 0 and math.isnan(worst.safe)
+    at = fflin.linearize(model.at(worst.margin.parameters))
+    result = fflin.margins(policy, at, delay=0.1)
+    assert worst.margin.value == pytest.approx(result.disk, rel=1e-5)
+    for robot in model.samples(4, seed=3):
+        other = fflin.margins(policy, fflin.linearize(robot), delay=0.1)
+        assert worst.margin.value <= other.disk * (1.0 + 1e-6)
+
+
+@pytest.mark.exhaustive
+def test_the_loops_of_a_law_contain_the_delays_of_its_sensors():
+    sensors = [fflin.StarTracker(delay=0.25), fflin.Gyroscope("base", delay=0.25)]
+    model, lin = multirate_satellite(sensors)
+    none = np.zeros((0, 0))
+    gains = np.hstack((-5e-4 * np.eye(3), -5e-3 * np.eye(3)))
+    system = (none, np.zeros((0, 6)), np.zeros((3, 0)), gains, lin.dt)
+    policy = fflin.LinearController(system, lin)
+    worst = model.worst(policy, samples=4)
+    at = fflin.linearize(model.at(worst.margin.parameters))
+    result = fflin.margins(policy, at, delay=0.1)
+    assert worst.margin.value == pytest.approx(result.disk, rel=1e-5)

@@ -85,6 +85,25 @@ def monodromy(F: Array) -> Array:
     return product
 
 
+def lifted(loop: PeriodicLoop) -> tuple[Array, Array, Array, Array]:
+    """Return A, B, C and D of a system whose sample is a period of the loop.
+
+    Its signals are those of the N samples: the n channels of the first sample come first.
+    """
+    count, size, channels = loop.G.shape
+    rows = loop.H.shape[1]
+    A, B = np.eye(size), np.zeros((size, count * channels))
+    C, D = np.zeros((count * rows, size)), np.zeros((count * rows, count * channels))
+    for j, (F, G, H, J) in enumerate(zip(*loop, strict=True)):
+        inputs = slice(j * channels, (j + 1) * channels)
+        outputs = slice(j * rows, (j + 1) * rows)
+        C[outputs], D[outputs] = H @ A, H @ B
+        D[outputs, inputs] += J
+        A, B = F @ A, F @ B
+        B[:, inputs] += G
+    return A, B, C, D
+
+
 def steady_states(F: Array, G: Values, angle: float = 0.0) -> Values:
     """Return the steady states (N, nx, k) at each sample, for inputs e^(j angle sample).
 
@@ -125,7 +144,7 @@ class Harmonics:
 
     def __init__(self, loop: PeriodicLoop) -> None:
         self.count, _, self.channels = loop.G.shape
-        self._lift(loop)
+        self._lifted = lifted(loop)
 
     @cached_property
     def angles(self) -> Array:
@@ -136,19 +155,6 @@ class Harmonics:
     def responses(self) -> Values:
         """Responses (k, N n, N n) at the angles of the grid."""
         return self.at(self.angles)
-
-    def _lift(self, loop: PeriodicLoop) -> None:
-        """Set the matrices of a system whose sample is a period of the loop."""
-        size, width = loop.F.shape[1], self.count * self.channels
-        by_state, by_signal = np.eye(size), np.zeros((size, width))
-        C, D = np.zeros((width, size)), np.zeros((width, width))
-        for j, (F, G, H, J) in enumerate(zip(*loop, strict=True)):
-            part = slice(j * self.channels, (j + 1) * self.channels)
-            C[part], D[part] = H @ by_state, H @ by_signal
-            D[part, part] += J
-            by_state, by_signal = F @ by_state, F @ by_signal
-            by_signal[:, part] += G
-        self._lifted = by_state, by_signal, C, D
 
     def _grid(self) -> Array:
         """Return ascending angles [rad], from 0 to pi/N."""
