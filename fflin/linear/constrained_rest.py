@@ -8,7 +8,6 @@ the coordinates are chosen, and for points that are not clearly regular.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -21,6 +20,7 @@ from fflin.dynamics.constraints import Hold, hold_of
 from fflin.dynamics.coordinates import ANGULAR
 from fflin.dynamics.rnea import WARNING_COUPLING
 from fflin.dynamics.state import Actuation
+from fflin.linear.constrained import independent_states
 from fflin.linear.model import LinearModel
 
 # Largest product of the norms of J and of the inverse of its dependent columns, in comparable
@@ -136,7 +136,7 @@ class RestSolver:
                     **fields["_computed"],
                     # The default outputs are all states.
                     "C": _all_states,
-                    "x0": partial(_independent_states, fields["_computed"]["y0"], kept),
+                    "x0": partial(independent_states, fields["_computed"]["x0"], kept),
                 },
             },
         )
@@ -206,13 +206,6 @@ def _all_states(lin: LinearModel) -> Array:
     """Return the map from the independent states to all states."""
     assert lin._all_states is not None
     return lin._all_states
-
-
-def _independent_states(
-    whole: Callable[[LinearModel], Array], kept: Indices, lin: LinearModel
-) -> Array:
-    """Return the independent states from the function `whole` of all states."""
-    return frozen(whole(lin)[kept])
 
 
 def _frozen_inertia(M: Array, _: LinearModel) -> Array:

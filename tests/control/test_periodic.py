@@ -98,6 +98,16 @@ def test_constant_models_give_the_solution_of_the_algebraic_equation(sampled):
 
 
 @pytest.mark.exhaustive
+def test_few_knots_give_the_continuous_solution_of_a_fast_loop():
+    satellite = fflin.load("cubesat_magnetic").replace(weights={})
+    costs = [
+        fflin.tvlqr(fflin.linearize_orbit(satellite, steps=n), Qf="periodic").P[0]
+        for n in (16, 64)
+    ]
+    assert apart(*costs) < 1e-3
+
+
+@pytest.mark.exhaustive
 def test_the_continuous_solution_repeats(along):
     schedule = fflin.tvlqr(along, Q, R, "periodic")
     assert apart(schedule.P[0], schedule.P[-1]) < 1e-12
