@@ -136,3 +136,21 @@ def test_two_arms_move_the_target_that_they_hold():
     flown = fflin.simulate(robot, schedule, q0=motion.q[0], engine="python")
     way = pin.difference(robot.model, flown.q[-1], goal)
     assert np.abs(way).max() < 1e-4
+
+
+@pytest.mark.exhaustive
+def test_a_planned_phase_is_followed_by_a_phase_that_holds_the_goal(mast):
+    robot, _ = mast
+    goal = fflin.sweep(robot, fflin.grid(robot, {"bar_3": [0.1]})).q[0]
+    motion = fflin.plan(robot, (goal, None), 9.0, q0=robot.neutral(), knots=4)
+    law = fflin.tvlqr(fflin.linearize_trajectory(robot, motion), sample=3.0)
+    moved = fflin.simulate(robot, law, q0=motion.q[0], engine="python")
+    lin = fflin.linearize(robot, goal, frame="local")
+    hold = fflin.StateFeedback(lin, fflin.lqr(lin).K)
+    q0, v0 = moved.q[-1], moved.v[-1]
+    held = fflin.simulate(
+        robot, hold, q0=q0, v0=v0, duration=1.0, dt=0.02, engine="python"
+    )
+    whole = moved.then(held)
+    assert whole.t[-1] == pytest.approx(10.0)
+    assert np.abs(pin.difference(robot.model, whole.q[-1], goal)).max() < 1e-7

@@ -208,3 +208,19 @@ def test_designs_without_support_name_the_times_of_the_changes(passing):
         fflin.tvkalman(along, 1e-3, 1e-4, sample=0.1)
     with pytest.raises(fflin.InputError, match=r"predictive.*change at t = "):
         fflin.mpc(along, Q, R, horizon=4, dt=0.1, limits=None)
+
+
+@pytest.mark.exhaustive
+def test_predictive_control_along_a_motion_without_limits_is_the_regulator(engine):
+    """Before the dead centre, one choice of coordinates suffices."""
+    robot, (q, v) = engine
+    options = {"duration": 0.2, "dt": 0.01, "every": 1, "engine": "python"}
+    motion = fflin.simulate(robot, q0=q, v0=v, **options)
+    along = fflin.linearize_trajectory(robot, motion.trajectory())
+    assert not along.switches.size
+    policy = fflin.mpc(along, Q, R, horizon=4, dt=0.1, limits=None)
+    q, v = turning(robot, 0.601, -1.5)
+    laws = policy, fflin.tvlqr(along, Q, R, sample=0.1)
+    first, second = (fflin.simulate(robot, law, q0=q, v0=v, **options) for law in laws)
+    assert np.abs(first.u).max() > 1e-3
+    np.testing.assert_allclose(first.u, second.u, atol=1e-9)
