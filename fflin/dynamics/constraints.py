@@ -157,25 +157,31 @@ class Constraints:
 
     def jacobian(self, q: Array) -> Array:
         """Return J (rows, nv) at q (nq,)."""
-        return self.residual_and_jacobian(q)[1]
+        return self._evaluated(q, None)
 
     def residual_and_jacobian(self, q: Array) -> tuple[Array, Array]:
         """Return phi (rows,), see `residual`, and J (rows, nv) at q (nq,)."""
+        residual = np.empty(self.count)
+        return residual, self._evaluated(q, residual)
+
+    def _evaluated(self, q: Array, residual: Array | None) -> Array:
+        """Return J (rows, nv) at q (nq,), and write phi to `residual` (rows,) if it is given."""
         pairs = self.pairs
         columns = pin.computeJointJacobians(self._model, self._data, q)
-        residual = np.empty(self.count)
         jacobian = np.empty((self.count, self._model.nv))
         for pair, signs in zip(pairs, self._signs, strict=True):
             first = self._pose(pair.first)
-            apart = first.actInv(self._pose(pair.second))
-            residual[pair.rows] = _distances(pair, apart)
+            if residual is not None or signs is None:
+                apart = first.actInv(self._pose(pair.second))
+            if residual is not None:
+                residual[pair.rows] = _distances(pair, apart)
             if signs is None:
                 jacobian[pair.rows] = self._mimic_rows(pair, apart)
                 continue
             # Column k of `columns` is the twist in world axes of all bodies that joint k moves.
             selected = pair.selected.dot(first.actionInverse)
             np.multiply(selected.dot(columns), signs, out=jacobian[pair.rows])
-        return residual, jacobian
+        return jacobian
 
     def _mimic_rows(self, pair: Pair, apart: pin.SE3) -> Array:
         """Return the rows of J (k, nv) of a constraint on a robot with mimic joints."""
@@ -430,7 +436,7 @@ def _of_frame(frame: Carried, columns: Array) -> Array:
 def _tilt(axis: Array, rotation: Array) -> Array:
     """Return the rotation vector (3,) that tilts an axis to the axis rotated by a matrix R."""
     tilted = rotation @ axis
-    across = np.cross(axis, tilted)
+    across = _cross(axis, tilted)
     sine = float(np.linalg.norm(across))
     cosine = float(axis @ tilted)
     if sine < 1e-12 and cosine > 0.0:
@@ -442,3 +448,10 @@ def _tilt(axis: Array, rotation: Array) -> Array:
         sine = float(np.linalg.norm(across))
     vector: Array = angle * across / sine
     return vector
+
+
+def _cross(first: Array, second: Array) -> Array:
+    """Return the cross product of two vectors (3,), faster than `np.cross`."""
+    a, b, c = first.tolist()
+    x, y, z = second.tolist()
+    return np.array((b * z - c * y, c * x - a * z, a * y - b * x))

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -56,6 +56,72 @@ class Reduction:
     kept: Indices
     T: Array
     M: Array
+
+
+class Motions(NamedTuple):
+    """Motions of unit kinetic energy that the constraints permit at a moving reference."""
+
+    positions: Array  # (6 + n, d)
+    rates: Array  # (6 + n, d)
+    lower: Array  # (6 + n, d) rates per displacement of the positions
+    size: Array  # (6 + n,) square root of the inertia of each coordinate
+
+    @classmethod
+    def at(cls, closure: Closure, q: Array, v: Array) -> Motions:
+        """Return the motions at a closed point."""
+        state = closure.state
+        M = state.project(pin.crba(state.robot.model, state.robot.create_data(), q).T)
+        space = closure.tangent(q)
+        G = space.basis
+        G = G @ np.linalg.inv(np.linalg.cholesky(G.T @ M @ G)).T
+        positions = G.copy()
+        positions[ANGULAR] *= 0.5
+        lower = np.zeros_like(G)
+        if v.any():
+            slopes = closure.constraints.derivatives(q, v, np.zeros_like(v))
+            turning = space.selected @ state.columns(slopes.twist_by_q)
+            lower = -np.linalg.pinv(space.rows) @ turning @ G
+        return cls(positions, G, lower, np.sqrt(M.diagonal()))
+
+    def best(self) -> Indices:
+        """Return the indices (d,) of the coordinates that determine the motion best."""
+        return _best(self.size, self.rates)
+
+    def least(self, picked: Indices) -> float:
+        """Return how well coordinates determine the motion, from 0 to 1."""
+        if not len(picked):
+            return 1.0
+        parts = self.size[picked, None] * np.array(
+            (self.rates[picked], self.positions[picked])
+        )
+        return float(np.linalg.svd(parts)[1].min())
+
+    def reduction(self, picked: Indices) -> Reduction:
+        """Return the reduction to the coordinates with given indices."""
+        nv, d = self.rates.shape
+        first = np.linalg.inv(self.positions[picked])
+        second = np.linalg.inv(self.rates[picked])
+        lower = (self.lower - self.rates @ second @ self.lower[picked]) @ first
+        T = np.zeros((2 * nv, 2 * d))
+        T[:nv, :d], T[nv:, :d] = self.positions @ first, lower
+        T[nv:, d:] = self.rates @ second
+        kept = np.concatenate((picked, picked + nv))
+        T[kept] = np.eye(2 * d)
+        return Reduction(kept, T, second.T @ second)
+
+
+def _best(size: Array, rates: Array) -> Indices:
+    """Return the indices of the coordinates that determine motions of unit kinetic energy best.
+
+    `rates` (6 + n, d) are the rates of the motions, and `size` (6 + n,) is the square root of the
+    inertia of each coordinate.
+    """
+    from scipy.linalg import qr
+
+    order = 1.0 - _LESS * np.arange(len(size))
+    pivots = qr(((order * size)[:, None] * rates).T, mode="r", pivoting=True)[1]
+    best: Indices = np.sort(pivots[: rates.shape[1]])
+    return best
 
 
 class Reducer:
@@ -185,16 +251,12 @@ class Reducer:
 
     def _choose(self, size: Array, rates: Array, inertia: Array) -> None:
         """Choose the independent coordinates from the rates of a basis with an inertia."""
-        from scipy.linalg import qr
-
         count = len(inertia)
         if self.given is not None:
             self._picked = self._named(count)
             return
         unit = rates @ np.linalg.inv(np.linalg.cholesky(inertia)).T
-        order = 1.0 - _LESS * np.arange(len(size))
-        pivots = qr(((order * size)[:, None] * unit).T, mode="r", pivoting=True)[1]
-        self._picked = np.sort(pivots[:count])
+        self._picked = _best(size, unit)
 
     def _inverses(
         self, size: Array, positions: Array, rates: Array, inertia: Array

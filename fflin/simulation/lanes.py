@@ -89,7 +89,7 @@ def loop_name(plan: Plan, *, lanes: int) -> str:
     if is_extended(plan):
         name += "_extended"
     if plan.plant.constrained is not None:
-        return f"{name}_constrained"
+        name += "_constrained"
     return f"{name}_in_orbit" if plan.plant.field else name
 
 

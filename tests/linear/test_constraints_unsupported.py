@@ -25,7 +25,6 @@ CALLS = {
     "linearize_orbit": lambda robot, _: fflin.linearize_orbit(
         robot.replace(orbit=500e3)
     ),
-    "plan": lambda robot, _: fflin.plan(robot, {}, duration=10.0),
     "relative_equilibria": lambda robot, _: fflin.relative_equilibria(robot),
     "to": lambda _, lin: lin.to("mujoco"),
     "gain.to": lambda _, lin: fflin.lqr(lin).to("drake"),
