@@ -20,6 +20,7 @@ from fflin.base.tables import folded
 from fflin.base.validation import Array, Indices, Mask, Vector, instance, number
 from fflin.control.default_weights import pace_along
 from fflin.control.gain import ModelDesign
+from fflin.control.mean_field import mean_model, mean_rule
 from fflin.control.optimal import differential_riccati as riccati
 from fflin.control.optimal import periodic_riccati
 from fflin.control.trajectory_end import steady_end, steady_regulator
@@ -477,11 +478,9 @@ def tvlqr(
     periodic = asks_periodic(Qf, traj)
     about = 0
     if Q is None and R is None:
-        pace = pace_along(float(traj.t[-1] - traj.t[0]), dt)
-        end = traj[0] if periodic else steady_end(traj).model
         about = traj.last_part
-        warn_of_integral(end, (Q, R), weights, "a law along a trajectory")
-        Q, R, _, rule = rule_weights(end, weights, pace)
+        warn_of_integral(traj[0], (Q, R), weights, "a law along a trajectory")
+        Q, R, rule = _default_weights(traj, weights, dt, periodic=periodic)
     elif weights is not None or Q is None or R is None:
         raise InputError(
             "give either both Q and R, or only weights='urdf' or 'identity'"
@@ -548,6 +547,18 @@ def tvlqr(
         return schedule
     with riccati.bounded_by(remedy):
         return replace(schedule, residual=schedule.defect(at))
+
+
+def _default_weights(
+    traj: LinearTrajectory, weights: Rule | None, dt: float, *, periodic: bool
+) -> tuple[Array, Array, str]:
+    """Return Q, R and the rule of the default weights along a trajectory."""
+    pace = pace_along(float(traj.t[-1] - traj.t[0]), dt)
+    lin = mean_model(traj) if periodic else steady_end(traj).model
+    Q, R, _, rule = rule_weights(lin, weights, pace)
+    if periodic:
+        rule += mean_rule(traj)
+    return Q, R, rule
 
 
 class StateCost:

@@ -20,7 +20,6 @@ from fflin.dynamics.constraints import Hold, hold_of
 from fflin.dynamics.coordinates import ANGULAR
 from fflin.dynamics.rnea import WARNING_COUPLING
 from fflin.dynamics.state import Actuation
-from fflin.linear.constrained import independent_states
 from fflin.linear.model import LinearModel
 
 # Largest product of the norms of J and of the inverse of its dependent columns, in comparable
@@ -136,7 +135,7 @@ class RestSolver:
                     **fields["_computed"],
                     # The default outputs are all states.
                     "C": _all_states,
-                    "x0": partial(independent_states, fields["_computed"]["x0"], kept),
+                    "x0": partial(_independent_outputs, kept),
                 },
             },
         )
@@ -206,6 +205,11 @@ def _all_states(lin: LinearModel) -> Array:
     """Return the map from the independent states to all states."""
     assert lin._all_states is not None
     return lin._all_states
+
+
+def _independent_outputs(kept: Indices, lin: LinearModel) -> Array:
+    """Return the independent states of a model whose outputs are all states."""
+    return frozen(lin.y0[kept])
 
 
 def _frozen_inertia(M: Array, _: LinearModel) -> Array:
