@@ -7,6 +7,7 @@ the interpreter in much the same mixture, so that it depends little on their ver
 """
 
 import gc
+import itertools
 import os
 import subprocess
 import sys
@@ -21,7 +22,13 @@ _COUNT = "_count"  # the argument with which this module runs itself under valgr
 
 # Ratios on CPython 3.11, NumPy 2.4 and Pinocchio 4.1, and by what part of them they may grow: they
 # repeat to two in a thousand, and one call of CRBA more at rest is a sixth.
-BASELINE = {"at rest": 1.63, "operating point": 2.06, "constrained at rest": 2.88}
+BASELINE = {
+    "at rest": 1.63,
+    "operating point": 2.06,
+    "constrained at rest": 2.88,
+    "constrained under load": 4.18,
+    "constrained in motion": 5.26,
+}
 TOLERANCE = 0.1
 
 Call = Callable[[], object]
@@ -65,13 +72,29 @@ def pairs() -> dict[str, tuple[Call, Call]]:
     closed = fflin.configuration(arms, bent)
     free = fflin.Linearizer(arms)
     grasp = fflin.Weld("tool_right", "tool_left")
-    held = fflin.Linearizer(arms.replace(constraints=[grasp]))
+    grasping = arms.replace(constraints=[grasp])
+    held = fflin.Linearizer(grasping)
+    moving = []
+    for angle in (0.0, 0.05):
+        start = fflin.configuration(arms, bent | {"left_1": 0.4 + angle})
+        moving.append(fflin.closed(grasping, start, np.ones(arms.nv)))
+    # The points differ from call to call, because results of the last point are kept.
+    points = itertools.cycle(moving)
+    effort = np.ones(arms.nv)
+
+    def under_load() -> object:
+        return held(next(points)[0], None, effort)
+
+    def in_motion() -> object:
+        return held(*next(points), effort)
 
     return {
         "at rest": (lambda: linearizer(q), inverse),
         "operating point": (lambda: linearizer(q, v, u), slopes),
         # The other side is the robot without its constraint.
         "constrained at rest": (lambda: held(closed), lambda: free(closed)),
+        "constrained under load": (under_load, lambda: free(*moving[0], effort)),
+        "constrained in motion": (in_motion, lambda: free(*moving[0], effort)),
     }
 
 

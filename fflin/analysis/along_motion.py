@@ -101,12 +101,13 @@ def seen(traj: LinearTrajectory, known: Array) -> Split:
 
 def _refined(traj: LinearTrajectory) -> LinearTrajectory:
     """Return the trajectory with at least nx intervals, so that few knots do not limit a rank."""
+    traj.refuse_switches("controllability and observability along a motion")
     intervals = len(traj.t) - 1
     nx = len(traj.state_names)
     if traj.dt or intervals >= nx:
         return traj
     parts = intervals * math.ceil(nx / intervals)
-    return along(traj.resampled((traj.t[-1] - traj.t[0]) / parts))
+    return along(traj.resampled((traj.t[-1] - traj.t[0]) / parts), traj.partition)
 
 
 def _units(lin: LinearModel, duration: float) -> tuple[Array, Array]:

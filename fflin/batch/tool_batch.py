@@ -12,6 +12,7 @@ import pinocchio as pin
 from fflin.base.errors import InputError
 from fflin.base.record import Design
 from fflin.base.validation import Array, Indices, frozen
+from fflin.dynamics.coordinates import refuse_constraints
 from fflin.dynamics.state import StateMap
 from fflin.linear.exchange import ToolModel, euler_step, step_of, transformed
 from fflin.linear.tool_coordinates import Jacobians, ToolCoordinates, tool_coordinates
@@ -139,6 +140,7 @@ def tool_batch(
 ) -> ToolBatch:
     """Convert the models of a batch; see `LinearBatch.to`."""
     step = step_of(tool, dt)
+    refuse_constraints(robot, f"batches in the coordinates of {tool}")
     kind = tool_coordinates(robot, tool, moving=batch.moving)
     points = _Points(robot, batch, kind)
     stacks: dict[str, Array] = {}

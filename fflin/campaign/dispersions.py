@@ -28,15 +28,19 @@ from fflin.control.data_sheet import Deviations, output_keys
 from fflin.control.policy import Command, Policy, bound
 from fflin.control.sensor_errors import SensorErrors
 from fflin.dynamics.coordinates import PIN_ANGULAR, PIN_LINEAR
-from fflin.dynamics.disturbance import Plate
+from fflin.dynamics.disturbance import Plate, distortion
 from fflin.dynamics.state import StateMap
 from fflin.kernel.forward import ActuatorFaults
 from fflin.kernel.tree import Tree, batch_tree
 from fflin.linear.model import LinearModel
 from fflin.robot.disturbance import (
+    MAGNETIC,
     PLATE,
+    RESIDUAL_DIPOLE,
     UNITS,
     DisturbanceTerm,
+    MagneticTerm,
+    magnetic_values,
     plates_of,
     terms_of,
 )
@@ -47,7 +51,12 @@ from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.mass_properties import properties, varied
 from fflin.robot.robot import Robot
 from fflin.simulation.extension import DRAG, SUNLIGHT
-from fflin.simulation.lanes import DISTURBANCE, disturbances_of
+from fflin.simulation.lanes import (
+    DISTORTION,
+    DISTURBANCE,
+    RESIDUAL,
+    disturbances_of,
+)
 from fflin.simulation.plan import Times
 from fflin.simulation.plant import Plant
 
@@ -65,6 +74,12 @@ _OF_SENSORS = ("sensor", "noise", "drift")
 # Kinds that need a sampled law, and whose number is the value in all runs.
 _RANDOM_ERRORS = ("noise", "drift")
 _DISTURBANCES = tuple(f"{name}.{axis}" for name in UNITS for axis in "xyz")
+# Disturbances in a magnetic field, in addition to `_DISTURBANCES`.
+_MAGNETIC = tuple(
+    f"{name}.{axis}" if count == 3 else name
+    for name, (count, _, _) in MAGNETIC.items()
+    for axis in "xyz"[:count]
+)
 # Kind of the relative changes of the amplitudes of periodic disturbances.
 _AMPLITUDE = "amplitude"
 # Kinds of the relative changes of the forces on flat plates.
@@ -117,7 +132,7 @@ class Dispersions:
             **dict.fromkeys((*_OF_INPUTS, "misalignment"), input_keys(plant.actuation)),
             **dict.fromkeys(_OF_SPRINGS, robot.joint_names),
             "frequency": modes,
-            DISTURBANCE: _DISTURBANCES,
+            DISTURBANCE: _disturbances(robot),
             _AMPLITUDE: _periodic(robot),
             **{kind: names for kind, (names, _) in _plates(plant).items()},
         }
@@ -554,12 +569,36 @@ class Dispersions:
                     vectors[:, at] *= factors[wave.name]
             vectors = vectors.reshape(count, -1)
             # The last two terms are the dispersed constants, in the order of `_DISTURBANCES`.
-            vectors[:, -len(_DISTURBANCES) :] = self._of(DISTURBANCE, drawn)
+            size = len(_DISTURBANCES)
+            vectors[:, -size:] = self._of(DISTURBANCE, drawn)[:, :size]
             runs[DISTURBANCE] = vectors
+        if self._magnetic:
+            runs |= self._magnetic_in_lanes(drawn)
         runs |= self._plate_forces(drawn)
         if "delay" in self._kinds:
             runs["delay"] = self.delays(drawn)
         return runs
+
+    @property
+    def _magnetic(self) -> bool:
+        """Whether the residual dipole or the errors of the magnetic field are dispersed."""
+        first = len(_DISTURBANCES)
+        columns = [column for column in self.columns if column.kind == DISTURBANCE]
+        return any(at >= first for column in columns for at in column.at)
+
+    def _magnetic_in_lanes(self, drawn: Array) -> dict[str, Array]:
+        """Return the arrays of `in_lanes` for the residual dipole and the errors of the field."""
+        plant = self._plant
+        assert plant.field is not None
+        robots = [
+            _with_magnetic(plant.robot, row) for row in self._of(DISTURBANCE, drawn)
+        ]
+        residual = [
+            magnetic_values(robot.disturbance, RESIDUAL_DIPOLE) for robot in robots
+        ]
+        matrices = [distortion(robot, plant.field) for robot in robots]
+        flat = [(np.eye(3) if x is None else x).ravel("F") for x in matrices]
+        return {RESIDUAL: np.array(residual), DISTORTION: np.array(flat)}
 
     def _sensors_in_lanes(self, drawn: Array) -> dict[str, Array]:
         """Return the arrays of `in_lanes` for the errors of sensors."""
@@ -607,7 +646,10 @@ class Dispersions:
         )
         if self._kinds & {DISTURBANCE, _AMPLITUDE}:
             factors = {name: x[0] for name, x in self._amplitudes(rows).items()}
-            robot = _disturbed(robot, self._of(DISTURBANCE, rows)[0], factors)
+            constants = self._of(DISTURBANCE, rows)[0]
+            robot = _disturbed(robot, constants[: len(_DISTURBANCES)], factors)
+            if self._magnetic:
+                robot = _with_magnetic(robot, constants)
         if self._kinds & {*_OF_PLATES}:
             plates = [self._plate_factors(kind, rows)[0] for kind in _OF_PLATES]
             robot = _with_plates(robot, *plates)
@@ -706,6 +748,29 @@ def _disturbed(robot: Robot, drawn: Array, factors: Mapping[str, Array]) -> Robo
             if term_name == name
         ]
         terms[name] = (*scaled, DisturbanceTerm(constant=(x, y, z)))
+    return replace(robot, disturbance=terms)
+
+
+def _disturbances(robot: Robot) -> tuple[str, ...]:
+    """Return the names of the constant disturbances that can be dispersed."""
+    if robot.orbit is None or robot.orbit.field is None:
+        return _DISTURBANCES
+    return _DISTURBANCES + _MAGNETIC
+
+
+def _with_magnetic(robot: Robot, drawn: Array) -> Robot:
+    """Return a robot with a further residual dipole and further errors of the magnetic field.
+
+    The entries of `drawn` are in the order of `_disturbances`.
+    """
+    terms = dict(robot.disturbance)
+    first = len(_DISTURBANCES)
+    for name, (count, _, _) in MAGNETIC.items():
+        before = magnetic_values(robot.disturbance, name)
+        more = drawn[first : first + count].tolist()
+        values = [x + y for x, y in zip(before, more, strict=True)]
+        terms[name] = (MagneticTerm(tuple(values)),)
+        first += count
     return replace(robot, disturbance=terms)
 
 

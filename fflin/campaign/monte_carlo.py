@@ -124,6 +124,10 @@ def monte_carlo(
           `Robot.disturbance`, in its default axes. ``tau_b.amplitude`` and ``F_b.amplitude``:
           relative changes of the amplitudes of the periodic terms of `Robot.disturbance`, one for
           each component, such as ``tau_b.x.amplitude``.
+        - ``residual_dipole.disturbance`` [A m^2], ``field_scale.disturbance`` and
+          ``field_rotation.disturbance`` [rad], or components such as
+          ``field_rotation.x.disturbance``: residual dipole and errors of the magnetic field. The
+          drawn values add to `Robot.disturbance`.
         - ``plate_1.drag`` and ``plate_1.sunlight``: relative changes of drag and of solar pressure
           on the flat plates of `Robot.disturbance`, which are numbered from 1.
         - ``NAME.sensor``: constant offset in the measurement of a state that a `StateFeedback`

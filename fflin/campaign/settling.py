@@ -12,9 +12,9 @@ from functools import cached_property, partial
 import numpy as np
 
 from fflin.analysis.reduction import regulated_part
-from fflin.base.errors import InputError
+from fflin.base.errors import ConstraintError, InputError
 from fflin.base.rotation import quaternion_product
-from fflin.base.validation import Array, Mask, as_double, instance
+from fflin.base.validation import Array, Indices, Mask, as_double, instance
 from fflin.batch.run import Execution, Progress
 from fflin.campaign.runs import EDGE, CampaignJob, completed
 from fflin.control.gain import Gain, gain_matrix, regulated_states
@@ -26,6 +26,7 @@ from fflin.linear.fit import require_fit
 from fflin.linear.linearization import linearize
 from fflin.linear.model import LinearModel, refuse_delayed, refuse_frozen
 from fflin.robot.robot import Robot
+from fflin.simulation.constrained import Constrained
 from fflin.simulation.pace import Pace, Poles
 from fflin.simulation.run import STOPS
 
@@ -39,13 +40,15 @@ _CONSTANTS, PATIENCE = 3.0, 3.0
 # with the prediction have shorter steps, so that their relative integration error is about 1e-8.
 _STEP, _STEP_PREDICTED = 0.25, 0.1
 _WIDEST = 10.0  # largest joint displacement [rad|m] to which the step is adapted
+# Number of stages in which a displacement is applied to a robot with constraints.
+_STAGES = 8
 # The steps of a diverging run are shortened by the factor _FINER, at most _FINEST times.
 _FINER, _FINEST = 8, 2
 _MOST_STEPS = 1_000_000
 # approximate number of comparisons with the prediction in a run of a continuous loop
 _CHECKS = 60
 
-OUTCOMES = ("slow", "settled", "chart", "diverged")
+OUTCOMES = ("slow", "settled", "chart", "diverged", "singular")
 
 
 class Loop:
@@ -91,6 +94,15 @@ class Loop:
         # Full state (nx,) at the operating point, and indices of the model's states in the full
         # state.
         self.start = state.to_state(lin.q, lin.v)
+        half = state.nx // 2
+        # Constraints of the robot, and the indices of the coordinates that they determine.
+        self._held: Constrained | None = None
+        self._dependent: Indices = np.zeros(0, dtype=np.intp)
+        if robot.constraints:
+            self._held = Constrained(state, lin.q)
+            names = [name for name in state.names[:half] if name in lin.dependent]
+            indices = [state.names.index(name) for name in names]
+            self._dependent = np.array(indices, dtype=np.intp)
         self.model_states = np.array(
             [state.names.index(name) for name in lin.state_names]
         )
@@ -146,24 +158,65 @@ class Loop:
         """Return a state (nx,) in which the states of the model are displaced at random.
 
         The displacements of the base are `attitude` [deg] and `position` [m]. The largest
-        displacement of a joint is `joint` [rad|m].
+        displacement of a joint is `joint` [rad|m]. If the robot has constraints, the independent
+        states are displaced, and the other states follow.
+
+        Raises
+        ------
+        ConstraintError
+            If the constraints cannot be closed.
         """
-        g = self.state.groups
-        x = self.start.copy()
         axis, along = (
             vector / np.linalg.norm(vector) for vector in rng.normal(size=(2, 3))
         )
-        turn = np.radians(attitude) / 2.0
-        q0 = np.sqrt(1.0 - float(x[g.q_b] @ x[g.q_b]))
-        relative = np.array((*(np.sin(turn) * axis), np.cos(turn)))
-        turned = quaternion_product(np.array((*x[g.q_b], q0)), relative)
-        moved = x.copy()
-        moved[g.q_b] = turned[:3] * np.copysign(1.0, turned[3])
-        moved[g.r_b] += position * along
         spread = rng.uniform(-1.0, 1.0, size=self.robot.n)
-        moved[g.q_m] += joint * spread / np.abs(spread).max(initial=1e-300)
-        x[self.model_states] = moved[self.model_states]
+        spread /= np.abs(spread).max(initial=1e-300)
+
+        def moved(level: float) -> Array:
+            """Return the state after a fraction of the displacement."""
+            turn = level * np.radians(attitude) / 2.0
+            rotation = np.array((*(np.sin(turn) * axis), np.cos(turn)))
+            return self._moved(
+                rotation, level * position * along, level * joint * spread
+            )
+
+        x = self.start.copy()
+        if self._held is None:
+            x[self.model_states] = moved(1.0)[self.model_states]
+            return x
+        # Newton's method begins at the configuration that was closed before.
+        for level in np.linspace(0.0, 1.0, _STAGES + 1)[1:].tolist():
+            x[self.model_states] = moved(level)[self.model_states]
+            q, v = self.state.to_pinocchio(x)
+            try:
+                q, v = self._held.completed(q, v, self._dependent)
+            except np.linalg.LinAlgError:
+                raise ConstraintError("the constraints are singular") from None
+            x = self.state.read(q, v, near=x)
         return x
+
+    def _moved(self, rotation: Array, position: Array, joints: Array) -> Array:
+        """Return the state (nx,) at the start after displacements of all coordinates.
+
+        `rotation` (4,) is a quaternion, `position` is (3,), and `joints` is (n,).
+        """
+        g = self.state.groups
+        moved = self.start.copy()
+        q_b = moved[g.q_b]
+        q0 = np.sqrt(1.0 - float(q_b @ q_b))
+        turned = quaternion_product(np.array((*q_b, q0)), rotation)
+        moved[g.q_b] = turned[:3] * np.copysign(1.0, turned[3])
+        moved[g.r_b] += position
+        moved[g.q_m] += joints
+        return moved
+
+    def residual(self, starts: Array) -> float:
+        """Return the largest distance [m|rad] of states (N, nx) from the constraints."""
+        if self._held is None:
+            return 0.0
+        rows = (self.state.to_pinocchio(x)[0] for x in starts)
+        sizes = [np.abs(self._held.constraints.residual(q)).max() for q in rows]
+        return float(max(sizes))
 
     def runs(
         self,
@@ -264,7 +317,7 @@ class Loop:
 
         `step` is the transition matrix of the linear loop from one history entry to the next. If
         `step` is None, runs are not compared with the linear loop. The prediction error is NaN if a
-        run leaves the chart or diverges.
+        run leaves the chart, diverges or becomes singular.
         """
         e, stop = runs["state_errors"][..., self.model_states], runs["stop"]
         last = self.size(runs["x"][:, self.model_states] - self.lin.x0)
@@ -273,7 +326,11 @@ class Loop:
             runs["largest"][:, 0] > EDGE
         )
         diverged = (stop == STOPS.index("diverged")) | ~(last < DIVERGED * first)
-        code = np.select([turned, diverged, last <= SETTLED * first], [2, 3, 1], 0)
+        # A run that was stopped, and has neither settled nor diverged, has reached a posture at
+        # which the rank of the constraints changes.
+        singular = (stop == STOPS.index("stopped")) & (self._held is not None)
+        ends = [turned, diverged, last <= SETTLED * first, singular]
+        code = np.select(ends, [2, 3, 1, 4], 0)
         apart = np.zeros(len(e))
         if step is not None:
             nx = e.shape[-1]

@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from fflin.base import html
-from fflin.base.errors import InputError
+from fflin.base.errors import ChartError, ConstraintError, InputError
 from fflin.base.intervals import until_failure
 from fflin.base.tables import folded
 from fflin.base.validation import (
@@ -24,7 +24,6 @@ from fflin.base.validation import (
 from fflin.batch.run import Execution, Progress
 from fflin.campaign.runs import expect, notes_on_engine
 from fflin.campaign.settling import OUTCOMES, PATIENCE, Loop, settle
-from fflin.dynamics.coordinates import refuse_constraints
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
 from fflin.simulation.report import TRUSTED
@@ -35,6 +34,9 @@ _LEVELS = 2.0 ** np.arange(-6.0, 1.0)
 _DIRECTIONS = 4
 
 _ROUNDING = 1e-7  # smaller prediction errors are integration errors
+
+# Number of directions in which a displacement of a robot with constraints is tried.
+_ATTEMPTS = 30
 
 # Largest accepted value of a displacement argument.
 _FARTHEST = 1e6
@@ -57,7 +59,7 @@ class Validity(html.Reported, FrozenArrays):
     prediction_error : ndarray (k,)
         Largest error in the motion that the linear model predicts over three time constants of the
         closed loop, as a fraction of the initial displacement. Errors are measured in the norm of
-        the loop's Lyapunov function. The value is NaN if a run left the chart.
+        the loop's Lyapunov function. The value is NaN if a run left the chart or became singular.
     slope : float
         Exponent k with which the absolute error grows as displacement^k, fitted to the four
         smallest levels. The expected value is 2, because linearisation neglects terms of second
@@ -70,7 +72,8 @@ class Validity(html.Reported, FrozenArrays):
         Levels of the random initial displacements, ascending.
     outcomes : tuple of str
         Outcome of the run from each random displacement: "settled", "slow" (not settled within the
-        allowed time), "chart" (approached a rotation of 180 deg) or "diverged".
+        allowed time), "chart" (approached a rotation of 180 deg), "diverged", or "singular"
+        (reached a posture at which the rank of the constraints changes).
     holds : dict
         Displacement up to which every random run settled, with the keys of `trusted`.
     inside : int
@@ -88,6 +91,9 @@ class Validity(html.Reported, FrozenArrays):
         Frame whose axes express the base velocities and inputs in the feedback.
     notes : tuple of str
         Why the runs were simulated in Python although no engine was given.
+    residual : float
+        Largest distance [m|rad] of an initial configuration from the constraints of the robot; 0
+        without constraints.
 
     Examples
     --------
@@ -114,6 +120,7 @@ class Validity(html.Reported, FrozenArrays):
     robot: str
     frame: str
     notes: tuple[str, ...] = ()
+    residual: float = 0.0
 
     @property
     def settled(self) -> int:
@@ -164,6 +171,7 @@ _ENDS = {
     "slow": "did not settle in the allowed time",
     "chart": "approached a rotation of 180 deg",
     "diverged": "diverged",
+    "singular": "reached a singular posture of the constraints",
 }
 
 
@@ -196,6 +204,10 @@ def validity(
     - Runs from random displacements show whether the loop settles. A run has settled if its error
       falls to a thousandth of its initial value within the allowed time. The allowed time is three
       times the settling time of the slowest mode of the linear loop.
+
+    If the robot has constraints, the independent coordinates of the model are displaced. The other
+    coordinates follow in small stages, such that the constraints stay closed. Displacements that no
+    closed configuration has are drawn again.
 
     If numba is installed, the compiled loop computes eight runs at a time.
 
@@ -235,6 +247,7 @@ def validity(
         - the linear loop is unstable;
         - the operating point is not an equilibrium;
         - the poles are so far apart that a run would take a million steps;
+        - the constraints of the robot cannot be closed at displacements of this size;
         - an argument has a wrong size or value.
     FflinError
         If a worker process dies.
@@ -253,7 +266,6 @@ def validity(
     (True, 4)
     """
     loop = Loop(robot, lin, gain)
-    refuse_constraints(robot, "ranges of validity")
     largest = _checked_displacement(loop.lin, attitude, position, joint)
     samples = count("samples", samples)
     seed = whole("seed", seed, 0)
@@ -263,12 +275,10 @@ def validity(
 
     def displaced(levels: Array, streams: Indices) -> Array:
         """Return the initial deviations (N, nx) of runs; each random stream gives one direction."""
-        x = []
-        for level, stream in zip(levels.tolist(), streams.tolist(), strict=True):
-            rng = np.random.default_rng(
-                np.random.SeedSequence(seed, spawn_key=(stream,))
-            )
-            x.append(loop.displaced(rng, **_scaled(largest, level)))
+        x = [
+            _displaced(loop, _scaled(largest, level), seed, stream)
+            for level, stream in zip(levels.tolist(), streams.tolist(), strict=True)
+        ]
         return np.array(x) - loop.start
 
     streams = np.repeat(np.arange(_DIRECTIONS), len(_LEVELS))
@@ -318,7 +328,29 @@ def validity(
         joint_unit=joint_unit(loop.lin),
         robot=loop.lin.robot,
         frame=loop.lin.frame,
+        residual=loop.residual(loop.start + np.vstack((first, second))),
         notes=notes_on_engine(example, engine),
+    )
+
+
+def _displaced(
+    loop: Loop, displacement: dict[str, float], seed: int, stream: int
+) -> Array:
+    """Return a state (nx,) after a displacement in the direction of a random stream.
+
+    If the constraints of the robot cannot be closed there, the direction is drawn again.
+    """
+    for attempt in range(_ATTEMPTS):
+        key = (stream, attempt) if attempt else (stream,)
+        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=key))
+        try:
+            return loop.displaced(rng, **displacement)
+        except (ConstraintError, ChartError):
+            continue
+    raise InputError(
+        f"the constraints of '{loop.robot.name}' were not closed at {_ATTEMPTS} random "
+        f"displacements by {shown(displacement, joint_unit(loop.lin))}; give smaller values for "
+        "attitude, position and joint"
     )
 
 

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
     from fflin.base.figures import CurveStyle
     from fflin.base.validation import Array
+    from fflin.commands.phases import PhaseStart
     from fflin.dynamics.coordinates import Frame
 
 T = TypeVar("T")
@@ -458,7 +459,7 @@ def robot_of_design(
     These inputs are the thrusters and magnetorquers. The base force is omitted without thrusters.
     If `allocate` is None, they are allocated under two conditions: the thrusters can produce every
     wrench on the base, or the magnetorquers every moment, and `law` commands a base torque or is
-    None.
+    None. If only magnetorquers rotate the base, default weights for a slow loop are added.
     """
     if allocate is None:
         from fflin.control.authority import (
@@ -487,7 +488,13 @@ def robot_of_design(
     if fflin.Thruster in kinds:
         wanted.append(fflin.BaseForce)
     missing = [kind() for kind in wanted if kind not in kinds]
-    return robot.replace(inputs=(*missing, *others))
+    design = robot.replace(inputs=(*missing, *others))
+    only_magnetic = kinds <= {fflin.Magnetorquer, fflin.JointTorque}
+    if only_magnetic and robot.orbit and not robot.weights:
+        from fflin.control.magnetic_weights import magnetic_weights
+
+        return design.replace(weights=magnetic_weights(robot))
+    return design
 
 
 def designed(
@@ -502,9 +509,12 @@ def designed(
 
 def tuning_of(
     arguments: Namespace,
-) -> tuple[fflin.Robot, object, fflin.Structure, list[fflin.Goal], dict[str, Any]]:
+) -> tuple[
+    fflin.Robot, object, fflin.Structure, list[fflin.Goal], dict[str, Any], bool
+]:
     """Return the robot, plant, structure, goals and settings of a search.
 
+    The last result is True if the law commands a wrench that other inputs of the robot produce.
     The options --law, --goal and --vary replace the entries of the table [tune] of the robot file.
     All names are checked.
     """
@@ -549,7 +559,7 @@ def tuning_of(
             )
         plant = fflin.uncertain(design, given["vary"])
         settings["q"] = lin.q
-    return design, plant, structure, goals, settings
+    return design, plant, structure, goals, settings, design is not robot
 
 
 def tuned_law(
@@ -614,6 +624,19 @@ def gain_of(
         raise UnknownNameError(message) from None
 
 
+def _phase_of(robot: fflin.Robot, arguments: Namespace) -> PhaseStart | None:
+    """Return the start at the end of the motion of --after, or None without this option."""
+    if not getattr(arguments, "after", None):
+        return None
+    from fflin.commands.phases import start_after
+
+    names = ("joint", "rpy", "position", "velocity")
+    along = ("offset", "trajectory", "schedule", "periodic")
+    refuse(arguments, (*names, *along), "the start is the end of the motion of --after")
+    # This also defines the placements of constraints that have none yet.
+    return start_after(robot, arguments.after)
+
+
 def loop_of(
     robot: fflin.Robot, arguments: Namespace
 ) -> tuple[fflin.Policy | None, dict[str, Any]]:
@@ -627,6 +650,7 @@ def loop_of(
         },
         "limits": limits_of_options(arguments),
     }
+    arguments.phase = _phase_of(robot, arguments)
     if not arguments.controller:
         refuse(
             arguments,
@@ -803,6 +827,8 @@ def start_of(
     With --relative-equilibrium, the given base pose is relative to `reference`, or by default to
     the pose of this equilibrium.
     """
+    if arguments.phase is not None:
+        return arguments.phase.q, arguments.phase.v
     point, number = robot.point, arguments.relative_equilibrium
     # omit the base pose of the point, because the pose `about` below replaces it
     if number:

@@ -55,7 +55,14 @@ _ALLOCATED = (
 
 _MAGNETIC = (
     "allocation: magnetorquers realise the part of tau_b across the magnetic field, in `fflin "
-    "simulate --gain` too; simulate several orbits to see whether the loop is stable"
+    "simulate --gain` too; without given weights, the loop is as slow as the orbit, because a "
+    "faster loop is unstable; simulate several orbits to see whether the loop is stable"
+)
+
+_ALLOCATED = (
+    "the law commands a torque on the base, which thrusters or magnetorquers produce: `fflin "
+    "simulate` and `montecarlo` allocate it, in Python fflin.Allocation does; "
+    "--no-allocate tunes a law that commands each of them"
 )
 
 _NOT_ALLOCATED = (
@@ -96,8 +103,11 @@ def tune(arguments: Namespace) -> Report:
 
     example: fflin tune satellite.toml --law 'pd shared=true' --goal 'margin disk=0.75' -o law.npz
     """
-    robot, plant, structure, goals, settings = tuning_of(arguments)
+    robot, plant, structure, goals, settings, allocated = tuning_of(arguments)
     tuned = fflin.tune(plant, structure, goals, **settings)
+    text = str(tuned)
+    if allocated:
+        text += f"\n\n{folded([_ALLOCATED])}"
     files: dict[Path | None, Callable[[Path], object]] = {
         arguments.output_file: tuned.save,
         arguments.plot: lambda path: fflin.plot_tuned(tuned, path),
@@ -105,7 +115,7 @@ def tune(arguments: Namespace) -> Report:
     code = DONE
     if not all(goal.met for goal in tuned.goals if goal.hard):
         code = FELL_SHORT
-    return Report(robot.name, tuned.record(), str(tuned), files, code)
+    return Report(robot.name, tuned.record(), text, files, code)
 
 
 def tvlqr(arguments: Namespace) -> Report:
@@ -241,6 +251,13 @@ def simulate(arguments: Namespace) -> Report:
         interrupted = motion.stopped
     text = motion_report(motion)
     record = motion_record(motion)
+    if arguments.phase is not None and (impact := arguments.phase.impact):
+        record["impact"] = {
+            "event": impact.event,
+            "impulse": impact.impulse,
+            "energy_lost": impact.energy_lost,
+        }
+        text += f"\n{folded([f'impact at the start: {impact.told}'])}"
     record["margins"], line = _margins_of(policy, settings)
     if line:
         text += f"\n{folded([line])}"

@@ -114,6 +114,7 @@ OPTIONS: dict[str, dict[str, str]] = {
     },
     "simulate": {
         **_LOOP,
+        "start": f"{_LOOP['start']} after",
         SIMULATION: f"{_LOOP[SIMULATION]} every engine",
         "pointing errors": "pointing accuracy budget noise bias no-noise seed",
         OUTPUT: f"plot show output-file html {_PICTURES}",
@@ -322,6 +323,9 @@ ABOUT: dict[str, str] = {
     "offset": "initial error with respect to the start of the trajectory, in base axes. NAME is a "
     "state, a group or a pattern, such as r_b.x, q_m or omega_b.z (SI units), or it is roll, pitch "
     "or yaw [deg]",
+    "after": "start at the end of the motion in FILE, which `fflin simulate -o` saved, for example "
+    "before a latch (--weld) or a release. If this phase has constraints that are not yet closed, "
+    "they close in an impact, as in fflin.latch",
     "duration": "duration of the simulation [s]. The default is the duration of the trajectory. "
     "Without a trajectory, the default is the settling time of the linear loop, limited to 60 ... "
     "600 s",

@@ -296,7 +296,9 @@ FORMS: dict[str, Form] = {
     "seed": one(whole, "S", 0),
     "worst": one(whole, "K", 3),
     "port": one(whole, "N"),
-    **dict.fromkeys(("trajectory", "schedule", "gain", "controller", "guess"), _FILE),
+    **dict.fromkeys(
+        ("trajectory", "schedule", "gain", "controller", "guess", "after"), _FILE
+    ),
     "inputs": one(input_name, "FILE.toml"),
     "robot": one(input_name, "ROBOT"),
     "only": one(str, "NAME"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -13,6 +14,7 @@ from fflin.base.rotation import rotation_matrix
 from fflin.base.validation import Array, positive
 from fflin.control.policy import BDotForm, Command, Policy
 from fflin.dynamics.coordinates import PIN_ANGULAR, Frame
+from fflin.dynamics.disturbance import true_field
 from fflin.dynamics.state import Actuation, StateMap
 from fflin.robot.inputs import has_magnetorquers
 from fflin.robot.joints import ROOT
@@ -21,7 +23,7 @@ from fflin.robot.robot import Robot
 _FRAME: Frame = "lvlh"
 
 # Smallest divisor |b|^2 [T^2].
-_TINY = float(np.finfo(float).tiny)
+TINY = float(np.finfo(float).tiny)
 
 
 @dataclass(frozen=True)
@@ -50,23 +52,14 @@ class _MagneticLaw(Policy):
         """Return the law as a function of t, q and v."""
         actuation = _actuation(robot)
         gains = self._gains(actuation)
-        state = actuation.state
-        assert state.field is not None
-        orbit = state.field
-        field = orbit.magnetic
-        assert field is not None
-        root = robot.model.jointPlacements[ROOT].rotation
+        measure = measured_field(robot, rate=self._MEASURES_RATE)
 
         def command(t: float, q: Array, v: Array) -> Array:
-            R = root @ rotation_matrix(q[3:7])
-            b = field.at(t) @ R
+            vector = measure(t, q, v)
             if self._MEASURES_RATE:
-                orbit.move_to(t)
-                omega = v[PIN_ANGULAR] + orbit.rate @ R
+                b, omega = np.split(vector, 2)
                 # Without a field, the vector is zero.
-                vector = np.cross(b, omega) / max(b @ b, _TINY)
-            else:
-                vector = field.rate(t) @ R + np.cross(b, v[PIN_ANGULAR])
+                vector = np.cross(b, omega) / max(float(b @ b), TINY)
             u: Array = gains @ vector
             return u
 
@@ -157,6 +150,32 @@ class RateDamping(_MagneticLaw):
 
     _UNIT: ClassVar[str] = "N m s"
     _MEASURES_RATE: ClassVar[bool] = True
+
+
+def measured_field(
+    robot: Robot, *, rate: bool
+) -> Callable[[float, Array, Array], Array]:
+    """Return a function of t, q and v for the vectors that a law of the magnetic field measures.
+
+    With `rate`, they are the flux density (3,) [T] and the inertial angular velocity (3,) [rad/s],
+    and otherwise the derivative (3,) [T/s] of the flux density. All are in base axes.
+    """
+    orbit = StateMap(robot, frame=_FRAME).field
+    assert orbit is not None
+    field = true_field(robot, orbit)
+    root = robot.model.jointPlacements[ROOT].rotation
+
+    def measure(t: float, q: Array, v: Array) -> Array:
+        R = root @ rotation_matrix(q[3:7])
+        b = field.at(t) @ R
+        if rate:
+            orbit.move_to(t)
+            omega = v[PIN_ANGULAR] + orbit.rate @ R
+            return np.concatenate((b, omega))
+        derivative: Array = field.rate(t) @ R + np.cross(b, v[PIN_ANGULAR])
+        return derivative
+
+    return measure
 
 
 def _actuation(robot: Robot) -> Actuation:

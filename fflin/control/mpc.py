@@ -476,6 +476,7 @@ def _along(traj: LinearTrajectory, horizon: Horizon, cost: Cost) -> TrajectoryMp
     """Design the controller along a trajectory; its horizon has no stages yet."""
     Q, R, Qf, weights = cost
     dt = horizon.dt
+    traj.refuse_switches("predictive controllers")
     schedule = tvlqr(traj, Q, R, Qf, dt, weights=weights)
     Q, R = schedule.Q, schedule.R  # with default weights, if none are given
     state = StateMap(traj.robot, frame="local")
@@ -490,7 +491,7 @@ def _along(traj: LinearTrajectory, horizon: Horizon, cost: Cost) -> TrajectoryMp
     stages = list[Stage]()
     # Along the trajectory: sample k ends at knot k + 1.
     follows = TrajectoryFeedback(traj, schedule)
-    models = along(traj.resampled(dt))
+    models = along(traj.resampled(dt), traj.partition)
     for k, (total, transition) in enumerate(held_stages(traj, dt, Q, R)):
         K = schedule.K[k]
         P = schedule.P[k + 1]

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fflin.base.errors import FflinWarning, InputError, listed
+from fflin.base.errors import FflinWarning, InputError, listed, located
 from fflin.base.names import chosen, group_of, input_keys
 from fflin.base.process import Progress
 from fflin.base.validation import Array, ArrayLike, Mask, number, whole
@@ -18,7 +18,8 @@ from fflin.control.optimal.plan_search import Search, excess
 from fflin.control.optimal.shooting import Point, Shooting
 from fflin.control.weights import Weight, weight
 from fflin.dynamics import points
-from fflin.dynamics.coordinates import refuse_constraints, refuse_orbit
+from fflin.dynamics.closure import closure_of
+from fflin.dynamics.coordinates import refuse_orbit
 from fflin.dynamics.state import Actuation, StateMap
 from fflin.linear.model import LinearModel
 from fflin.linear.optimality import STATIONARY, Optimality
@@ -70,6 +71,10 @@ def plan(
     and `print` shows them. If the plan is not stationary, a warning states how large the gradient
     of the effort still is, relative to the gradient without the goal and the limits.
 
+    If the robot has constraints, start and goal must be closed, see `closed`. The search uses
+    independent coordinates at each knot, and each knot of the plan is closed. States in `free` may
+    still follow from the other states.
+
     The base may rotate by any angle, including full turns if the angular rates at both ends require
     them. Continuous joints take the shorter direction.
 
@@ -117,7 +122,8 @@ def plan(
         By default, the search begins at a cubic curve from the start to the goal. If all inputs are
         joint torques, the system is nonholonomic, and the base reaches most attitudes only if the
         joints move in loops. Then the search begins at loops of the joints that rotate the base to
-        the attitude of the goal. The loops stay within the limits of the joints if possible.
+        the attitude of the goal. The loops stay within the limits of the joints if possible. If the
+        robot has constraints, the search always begins at the cubic curve, closed at the knots.
     progress : bool, optional
         Whether to show the iteration, the cost relative to the initial guess, and the largest
         violation on stderr. By default, they are shown for long runs if stderr is a terminal.
@@ -134,6 +140,9 @@ def plan(
         If an argument has a wrong size or value, the start or goal is outside a limit, or no motion
         to the goal within the limits is found. The message states by how much the last trial misses
         the goal or exceeds a limit. A feasible motion may exist even if none is found.
+    ConstraintError
+        If the start or the goal violates a constraint of the robot, or the motion at which the
+        search begins cannot be closed.
     MissingPackageError
         If PIQP is not installed.
     UnknownNameError
@@ -155,9 +164,8 @@ def plan(
     """
     state = StateMap(robot)
     refuse_orbit(robot, "plans")
-    refuse_constraints(robot, "plans")
     start = points.point_of(state, x0, q0, v0, partial(points.start_of, robot))
-    end = _goal_point(state, goal)
+    start, end = _on_constraints(state, start, _goal_point(state, goal))
     knots, duration = whole("knots", knots, 3, 10_000), number("duration", duration)
     if not 1e-9 < duration < 1e9:
         raise InputError(f"duration is {duration:g} s, expected a positive time")
@@ -196,8 +204,19 @@ def plan(
         inputs = np.array((low, high))
         cost = _knot_weights(shooting)[:, None] * weights
         size = np.abs(np.where(np.isfinite(bounds), bounds, 0.0)).max(axis=0)
+        determining = shooting.determining(end, asked)
         search = Search(
-            shooting, start, end, asked, bounds, inputs, size, cost, _PARTS, line.say
+            shooting,
+            start,
+            end,
+            asked,
+            determining,
+            bounds,
+            inputs,
+            size,
+            cost,
+            _PARTS,
+            line.say,
         )
         first = initial_guess(shooting, guess, start, end, asked, bounds, weights)
         made = _least(search, first)
@@ -257,6 +276,23 @@ def _goal_point(
     if isinstance(goal, tuple) and len(goal) == 2:
         return points.point_of(state, None, *goal, at_rest)
     return points.point_of(state, goal, None, None, at_rest)
+
+
+def _on_constraints(state: StateMap, start: Point, end: Point) -> tuple[Point, Point]:
+    """Return start and goal on the constraints of the robot, if it has some.
+
+    Raise `ConstraintError` if one of them is far from the constraints.
+    """
+    closure = closure_of(state)
+    if closure is None:
+        return start, end
+    closed = list[Point]()
+    for name, point in {"start": start, "goal": end}.items():
+        with located(f"the {name} of the plan"):
+            q = closure.configuration(point[0])
+            closed.append((q, closure.velocity(q, point[1])))
+    first, last = closed
+    return first, last
 
 
 def _without_velocity(goal: object) -> bool:

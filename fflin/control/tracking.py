@@ -116,7 +116,11 @@ class TrajectoryFeedback(Feedback):
     @property
     def fed_back(self) -> tuple[str, ...]:
         """States with a gain at any time."""
-        return states_of_gain(self.schedule.state_names, self.schedule.K)
+        schedule = self.schedule
+        names = list[str]()
+        for part, group in enumerate(schedule.partition.names):
+            names += states_of_gain(group, schedule.K[schedule.parts == part])
+        return tuple(dict.fromkeys(names))
 
     def initial_inputs_for(self, names: tuple[str, ...]) -> Array | None:
         """Return the inputs of the trajectory at its start."""
@@ -161,10 +165,10 @@ class TrajectoryFeedback(Feedback):
 
     @property
     def _independent(self) -> tuple[str, ...] | None:
-        """Independent coordinates of the schedule of a robot with constraints; None without."""
+        """Last independent coordinates of a robot with constraints; None without constraints."""
         if not self.trajectory.robot.constraints:
             return None
-        names = self.schedule.state_names
+        names = self.schedule.partition.names[-1]
         return names[: len(names) // 2]
 
     def reference(self, t: float) -> tuple[Array, Array, Array]:
@@ -216,9 +220,9 @@ class TrajectoryFeedback(Feedback):
     def end_gain(self) -> Array:
         """Gain K (nu, nx) of the regulator about `end`, with the weights of the schedule."""
         schedule = self.schedule
-        return steady_regulator(
-            SteadyEnd(self.end, np.zeros(3)), schedule.Q, schedule.R, schedule.dt
-        )[1]
+        Q = schedule.Q if schedule.Q.ndim == 2 else schedule.Q[-1]
+        end = SteadyEnd(self.end, np.zeros(3))
+        return steady_regulator(end, Q, schedule.R, schedule.dt)[1]
 
     def beside(self, offset: Mapping[str, float]) -> tuple[Array, Array]:
         """Return q (nq,) and v (nv,) displaced from the initial state of the trajectory.
@@ -261,14 +265,22 @@ class TrajectoryFeedback(Feedback):
 
     def gain(self, t: float) -> Array:
         """Return the gain K (nu, nx) at time t of the run."""
-        knots = self.schedule.t
         if t > self.over:
             return self.end_gain
+        return self.schedule.gain(self._on_schedule(t))
+
+    def part(self, t: float) -> int:
+        """Return the index of the part of the trajectory at time t of the run."""
+        if t > self.over:
+            return len(self.schedule.switches)
+        return self.schedule.part(self._on_schedule(t))
+
+    def _on_schedule(self, t: float) -> float:
+        """Return the time of the schedule at time t of the run."""
+        knots = self.schedule.t
         if self.schedule.period:
-            return self.schedule.gain(float(knots[0]) + t)
-        return self.schedule.gain(
-            float(knots[0]) + min(max(t, 0.0), float(knots[-1] - knots[0]))
-        )
+            return float(knots[0]) + t
+        return float(knots[0]) + min(max(t, 0.0), float(knots[-1] - knots[0]))
 
     def state_map(self, robot: Robot) -> StateMap:
         """Return the robot's states in base axes; `InputError` if the robot does not fit."""
@@ -284,13 +296,16 @@ class TrajectoryFeedback(Feedback):
     def deviation(self, robot: Robot) -> Deviation:
         """Return f(t, q, v) -> u*, e: the inputs of the trajectory and the error relative to it."""
         state = self.state_map(robot)
-        picked = [state.names.index(name) for name in self.schedule.state_names]
-        reduced = len(picked) < state.nx
+        groups = [
+            [state.names.index(name) for name in names]
+            for names in self.schedule.partition.names
+        ]
+        reduced = len(groups[0]) < state.nx
 
         def deviation(t: float, q: Array, v: Array) -> tuple[Array, Array]:
             q_star, v_star, u_star = self.commanded(t)
             e = moving_error(state, q_star, v_star, q, v)
-            return u_star, e[picked] if reduced else e
+            return u_star, e[groups[self.part(t)]] if reduced else e
 
         return deviation
 

@@ -105,6 +105,7 @@ def tvkalman(
             f"'{traj.robot.name}' have their own sample or delay; design for the robot with "
             "robot.replace(outputs=...) without these fields"
         )
+    traj.refuse_switches("Kalman filters")
     V = weight("V", V, traj.output_names, definite=True)
     noise, columns = disturbance(traj, W, G)
     columns = np.broadcast_to(columns, (len(traj.t), *columns.shape[-2:]))
@@ -127,7 +128,7 @@ def tvkalman(
     elif not periodic:
         P = weight("P0", P0, traj.state_names)
     held = list(transitions(traj, dt))
-    at_samples = along(traj.resampled(dt))
+    at_samples = along(traj.resampled(dt), traj.partition)
     nx = len(P)
     maps = np.array([whole for _, whole in held])
     # covariance that the disturbance adds per sample

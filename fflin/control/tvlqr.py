@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,9 +17,10 @@ from fflin.analysis.reduction import regulated_part
 from fflin.base.errors import InputError, StabilizabilityError
 from fflin.base.process import in_one_thread
 from fflin.base.tables import folded
-from fflin.base.validation import Array, Mask, Vector, instance, number
+from fflin.base.validation import Array, Indices, Mask, Vector, instance, number
 from fflin.control.default_weights import pace_along
 from fflin.control.gain import ModelDesign
+from fflin.control.mean_field import mean_model, mean_rule
 from fflin.control.optimal import differential_riccati as riccati
 from fflin.control.optimal import periodic_riccati
 from fflin.control.trajectory_end import steady_end, steady_regulator
@@ -30,12 +32,13 @@ from fflin.control.weights import (
     warn_of_integral,
     weight,
 )
-from fflin.dynamics.integrators import held_cost
+from fflin.dynamics.integrators import HEAVY, LIGHT, held_cost
 from fflin.dynamics.state import StateMap
 from fflin.linear.fit import require_same
 from fflin.linear.floquet import multiplier_text
 from fflin.linear.floquet import multipliers as multipliers_of
-from fflin.linear.linear_trajectory import LinearTrajectory, transitions
+from fflin.linear.linear_trajectory import LinearTrajectory, Steps, transitions
+from fflin.linear.partition import Partition
 from fflin.linear.trajectory import Trajectory
 from fflin.robot.robot import Robot
 
@@ -53,9 +56,28 @@ class Schedule(ModelDesign):
     P: Array
     residual: float
     period: float = field(default=0.0, kw_only=True)
+    switches: Vector = field(default_factory=partial(np.zeros, 0), kw_only=True)
+    switched_names: tuple[str, ...] = field(default=(), kw_only=True)
     orbit: str = field(
         default_factory=str, kw_only=True
     )  # of a periodic motion, as JSON text
+
+    @property
+    def partition(self) -> Partition:
+        """Parts of the trajectory with the same independent coordinates."""
+        return Partition.of(self.switches, self.state_names, self.switched_names)
+
+    @cached_property
+    def parts(self) -> Indices:
+        """Index (M,) of the part of the trajectory to which each knot or sample belongs."""
+        if self.dt:
+            return self.partition.parts_at(self.t, float(self.t[-1] - self.t[0]))
+        # A continuous schedule has two knots at each switch: before and after it.
+        return np.append(0, np.cumsum(np.diff(self.t) == 0.0))
+
+    def part(self, t: float) -> int:
+        """Return the index of the part of the trajectory at the time t [s] of the schedule."""
+        return int(self.parts[self.interval(t)])
 
     @cached_property
     def starts(self) -> list[float]:
@@ -125,6 +147,11 @@ class GainSchedule(Schedule):
         Magnitudes of the characteristic multipliers of the closed loop over one period, the largest
         first; empty if the gains do not repeat. States that are not regulated are left out, unless
         the regulated states depend on them.
+    switches, switched_names
+        Times [s] at which the independent coordinates of a robot with constraints change, and the
+        names of the states after each change, as in `LinearTrajectory`. K, P, A and B are in the
+        coordinates of their time. A continuous schedule has two knots at each switch, before and
+        after it. Q (M, nx, nx) is then given at the knots, and Qf in the last coordinates.
     knots, q, v, u, hold, frame
         Data of the trajectory, which `trajectory` returns as a `Trajectory`.
 
@@ -165,6 +192,7 @@ class GainSchedule(Schedule):
                 if len(self.loop_multipliers) < len(self.state_names):
                     loop = "closed loop of the regulated states"
                 lines[-1] += f"; {loop}: {multiplier_text(self.loop_multipliers)}"
+        lines += self.partition.remarks()
         return folded(lines)
 
     def trajectory(self, robot: Robot) -> Trajectory:
@@ -172,7 +200,8 @@ class GainSchedule(Schedule):
         state = StateMap(robot)
         made = f"the gain schedule was made for '{self.robot}'"
         reduced = bool(robot.constraints)
-        require_same(made, state, "state", self.state_names, None, part=reduced)
+        for names in self.partition.names:
+            require_same(made, state, "state", names, None, part=reduced)
         require_same(made, state, "input", self.input_names, None)
         if self.period and self.orbit != orbit_text(robot):
             raise InputError(
@@ -225,12 +254,25 @@ class GainSchedule(Schedule):
     def cost_to_go(self, t: float) -> Array:
         """Return P (nx, nx) at time t: interpolated, or of the latest sample if sampled."""
         k = self.interval(t)
-        P: Array = self.P[k] if self.dt else self._cubics(self._in_period(t))
-        return P
+        if self.dt:
+            P: Array = self.P[k]
+            return P
+        cubic = self._cubics[self.parts[k]]
+        interpolated: Array = cubic(self._in_period(t))
+        return interpolated
 
     @cached_property
-    def _cubics(self) -> CubicHermiteSpline:
-        """P (nx, nx) as a function of time, by cubics that match P and dP/dt at the knots."""
+    def _knots_of_parts(self) -> list[slice]:
+        """Indices of the knots of each part of a continuous schedule."""
+        ends = np.cumsum(np.bincount(self.parts)).tolist()
+        return [slice(*pair) for pair in pairwise((0, *ends))]
+
+    @cached_property
+    def _cubics(self) -> list[CubicHermiteSpline]:
+        """P (nx, nx) as a function of time, by cubics that match P and dP/dt at the knots.
+
+        There is one function for each part of the trajectory.
+        """
         from scipy.interpolate import CubicHermiteSpline
 
         drift = self.P @ self.A
@@ -238,27 +280,43 @@ class GainSchedule(Schedule):
         slopes = spent - drift - drift.mT - self.Q
         if not np.isfinite(slopes).all():
             raise np.linalg.LinAlgError("P changes too fast")
-        return CubicHermiteSpline(self.t, self.P, slopes)
+        return [
+            CubicHermiteSpline(self.t[knots], self.P[knots], slopes[knots])
+            for knots in self._knots_of_parts
+        ]
 
     @cached_property
     def pieces(self) -> Array:
-        """Coefficients (M - 1, 7, nu nx) of K, for powers of the time since the last knot."""
+        """Coefficients (M - 1, 7, nu nx) of K, for powers of the time since the last knot.
+
+        The interval between the two knots of a switch has no duration; its coefficients are zero.
+        """
         from scipy.interpolate import CubicSpline
 
         # Between knots, P and B are cubics of time, so K = R^-1 B' P has degree 6.
-        of_B = CubicSpline(self.t, self.B).c[::-1]
-        pieces = np.zeros((7, *of_B[0].mT.shape))
-        for power, reach in enumerate(np.linalg.solve(self.R, of_B.mT)):
-            pieces[power : power + 4] += reach @ self._cubics.c[::-1]
+        pieces = np.zeros((7, len(self.t) - 1, *self.K.shape[1:]))
+        for knots, cubics in zip(self._knots_of_parts, self._cubics, strict=True):
+            of_B = CubicSpline(self.t[knots], self.B[knots]).c[::-1]
+            intervals = slice(knots.start, knots.stop - 1)
+            for power, reach in enumerate(np.linalg.solve(self.R, of_B.mT)):
+                pieces[power : power + 4, intervals] += reach @ cubics.c[::-1]
         return pieces.swapaxes(0, 1).reshape(len(self.t) - 1, 7, -1)
 
-    def defect(self, at: Callable[[Array], Array]) -> float:
-        """Return the largest relative residual of the differential equation between knots."""
-        middle = 0.5 * (self.t[:-1] + self.t[1:])
-        P, rate = self._cubics(middle), self._cubics(middle, 1)
-        A, S, Q = at(middle)
-        drift = P @ A
-        return riccati.imbalance(np.array((drift, drift.mT, -P @ S @ P, Q, rate)))
+    def defect(self, at: Callable[[Array, int], Array]) -> float:
+        """Return the largest relative residual of the differential equation between knots.
+
+        `at` returns the coefficients A, S and Q at times (k,), in the coordinates of a part.
+        """
+        worst = 0.0
+        for part, knots in enumerate(self._knots_of_parts):
+            t = self.t[knots]
+            middle = 0.5 * (t[:-1] + t[1:])
+            P, rate = self._cubics[part](middle), self._cubics[part](middle, 1)
+            A, S, Q = at(middle, part)
+            drift = P @ A
+            terms = np.array((drift, drift.mT, -P @ S @ P, Q, rate))
+            worst = max(worst, riccati.imbalance(terms))
+        return worst
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -360,7 +418,9 @@ def tvlqr(
     ----------
     traj : LinearTrajectory
     Q : array_like (nx, nx) or (nx,), float, or mapping, optional
-        Weight on the error, positive semidefinite, as in `lqr`.
+        Weight on the error, positive semidefinite, as in `lqr`. If the independent coordinates of a
+        robot with constraints change, Q and Qf refer to the coordinates at the first knot. The cost
+        of an error does not change at a switch, and neither does the law.
     R : array_like (nu, nu) or (nu,), float, or mapping, optional
         Weight on the inputs, positive definite.
     Qf : "steady", "periodic", or as Q
@@ -413,14 +473,14 @@ def tvlqr(
     >>> fflin.tvlqr(along, sample=0.1).K.shape
     (21, 9, 18)
     """
-    dt, steady = sample_time(traj, sample), asks_steady(Qf)
+    dt = sample_time(traj, sample)
+    asks_steady(Qf)  # raises an error for an unknown string
     periodic = asks_periodic(Qf, traj)
-    names = traj.state_names
+    about = 0
     if Q is None and R is None:
-        pace = pace_along(float(traj.t[-1] - traj.t[0]), dt)
-        end = traj[0] if periodic else steady_end(traj).model
-        warn_of_integral(end, (Q, R), weights, "a law along a trajectory")
-        Q, R, _, rule = rule_weights(end, weights, pace)
+        about = traj.last_part
+        warn_of_integral(traj[0], (Q, R), weights, "a law along a trajectory")
+        Q, R, rule = _default_weights(traj, weights, dt, periodic=periodic)
     elif weights is not None or Q is None or R is None:
         raise InputError(
             "give either both Q and R, or only weights='urdf' or 'identity'"
@@ -429,42 +489,40 @@ def tvlqr(
     if periodic:
         Q, regulated, left_out = _of_regulated(traj, Q)
         rule += left_out
-        Qf = np.zeros_like(Q)  # replaced by the periodic solution
-    elif steady:
-        Qf = steady_regulator(steady_end(traj), Q, R, sample)[0]
-    else:
-        Qf = weight("Qf", Qf, names)
+    cost = StateCost(traj, Q, about)
+    at_end: Array = np.zeros_like(Q)  # replaced by the periodic solution
+    if not periodic:
+        at_end = _end_weight(traj, Qf, cost, R, sample)
 
-    def at(times: Array) -> Array:
-        A, B = traj.matrices_at(times)
-        return np.array((A, B @ np.linalg.solve(R, B.mT), np.broadcast_to(Q, A.shape)))
+    def at(times: Array, part: int) -> Array:
+        A, B = traj.matrices_at(times, part)
+        return np.array((A, B @ np.linalg.solve(R, B.mT), cost.at(times, part)))
 
     residual = 0.0
     remedy = "smaller weights or a larger R"
     multipliers: Array = np.zeros(0)
     with riccati.bounded_by(remedy):
         if sample is not None:
-            stages = list(held_stages(traj, dt, Q, R))
+            stages = list(held_stages(traj, dt, cost, R))
             if periodic:
-                Qf = periodic_end(traj, stages[::-1])
-            gains, costs, residual = riccati.samples_back(reversed(stages), Qf)
+                at_end = periodic_end(traj, stages[::-1])
+            gains, costs, residual = riccati.samples_back(reversed(stages), at_end)
             t = traj.samples(dt)
             P = costs[::-1]
             K = np.concatenate((gains[::-1], gains[:1]))
             A, B = np.split(np.array([whole for _, whole in stages]), [len(Q)], axis=2)
             if periodic:
                 multipliers = loop_multipliers(A - B @ K[:-1], regulated)
-        elif periodic:
-            t, P, maps = _periodic_back(traj, at)
-            Qf = P[-1]
-            multipliers = loop_multipliers(
-                periodic_riccati.loop_factors(maps, P), regulated
-            )
-            A, B = traj.matrices_at(t)
-            K = np.linalg.solve(R, B.transpose(0, 2, 1) @ P)
         else:
-            t, P = riccati.solve_back(at, traj.t, Qf)
-            A, B = traj.matrices_at(t)
+            if periodic:
+                t, P, maps = _periodic_back(traj, lambda times: at(times, 0))
+                at_end = P[-1]
+                multipliers = loop_multipliers(
+                    periodic_riccati.loop_factors(maps, P), regulated
+                )
+                A, B = traj.matrices_at(t)
+            else:
+                t, P, A, B = _solved_back(traj, at, at_end)
             K = np.linalg.solve(R, B.transpose(0, 2, 1) @ P)
     schedule = GainSchedule._of(
         traj,
@@ -473,9 +531,9 @@ def tvlqr(
         P=P,
         A=A,
         B=B,
-        Q=Q,
+        Q=cost.along(t, continuous=not dt),
         R=R,
-        Qf=Qf,
+        Qf=at_end,
         residual=residual,
         robot=traj.robot.name,
         urdf_sha256=traj.robot.urdf_sha256,
@@ -489,6 +547,107 @@ def tvlqr(
         return schedule
     with riccati.bounded_by(remedy):
         return replace(schedule, residual=schedule.defect(at))
+
+
+def _default_weights(
+    traj: LinearTrajectory, weights: Rule | None, dt: float, *, periodic: bool
+) -> tuple[Array, Array, str]:
+    """Return Q, R and the rule of the default weights along a trajectory."""
+    pace = pace_along(float(traj.t[-1] - traj.t[0]), dt)
+    lin = mean_model(traj) if periodic else steady_end(traj).model
+    Q, R, _, rule = rule_weights(lin, weights, pace)
+    if periodic:
+        rule += mean_rule(traj)
+    return Q, R, rule
+
+
+class StateCost:
+    """Cost e' Q e of the error along a trajectory, in the coordinates of any of its parts.
+
+    The given Q (nx, nx) refers to the coordinates of the part `about`.
+    """
+
+    def __init__(self, traj: LinearTrajectory, Q: Array, about: int) -> None:
+        self._traj = traj
+        self._Q = Q
+        self._about = about
+
+    def at(self, times: Array, part: int) -> Array:
+        """Return Q (k, nx, nx) at times (k,) in the coordinates of a part."""
+        if part == self._about:
+            return np.broadcast_to(self._Q, (len(times), *self._Q.shape))
+        maps = self._traj.error_maps(times, part, self._about)
+        cost: Array = maps.mT @ self._Q @ maps
+        return cost
+
+    def along(self, t: Array, *, continuous: bool) -> Array:
+        """Return Q at the knots t of a schedule; (nx, nx) if the coordinates do not change."""
+        traj = self._traj
+        if not traj.last_part:
+            return self._Q
+        if continuous:
+            parts = np.append(0, np.cumsum(np.diff(t) == 0.0))
+        else:
+            parts = traj.partition.parts_at(t, float(t[-1] - t[0]))
+        return np.concatenate(
+            [self.at(t[parts == part], part) for part in range(1 + traj.last_part)]
+        )
+
+    def in_steps(self, steps: Steps) -> Array:
+        """Return Q (m, nx, nx) of the integration steps of a sample, or (nx, nx) if constant."""
+        traj = self._traj
+        if not traj.last_part:
+            return self._Q
+        costs = np.zeros((len(steps.h), *self._Q.shape))
+        duration = float(traj.t[-1] - traj.t[0])
+        for early, late, cost in zip(*steps.nodes.T, costs, strict=True):
+            times = np.array((early, late))
+            part = int(traj.partition.parts_at(times, duration)[0])
+            first, second = self.at(times, part)
+            cost[:] = HEAVY * first + LIGHT * second
+        return costs
+
+
+def _solved_back(
+    traj: LinearTrajectory, at: Callable[[Array, int], Array], P: Array
+) -> tuple[Array, Array, Array, Array]:
+    """Return times, P, A and B at these times, from P at the end of a trajectory.
+
+    If the coordinates change, the time of the change occurs twice, before and after it.
+    """
+    columns = list[tuple[Array, Array, Array, Array]]()
+    for part in range(traj.last_part, -1, -1):
+        coefficients = partial(_in_part, at, part)
+        t, values = riccati.solve_back(coefficients, traj.knots_of(part), P)
+        columns.append((t, values, *traj.matrices_at(t, part)))
+        if part:
+            change = traj.switch_maps[part - 1]
+            P = change.T @ values[0] @ change
+            P = 0.5 * (P + P.T)
+    times, costs, A, B = (
+        np.concatenate(arrays) for arrays in zip(*columns[::-1], strict=True)
+    )
+    return times, costs, A, B
+
+
+def _in_part(at: Callable[[Array, int], Array], part: int, times: Array) -> Array:
+    return at(times, part)
+
+
+def _end_weight(
+    traj: LinearTrajectory,
+    Qf: Weight | str,
+    cost: StateCost,
+    R: Array,
+    sample: float | None,
+) -> Array:
+    """Return the weight on the error at the end, in the coordinates of the last part."""
+    end = traj.t[-1:], traj.last_part
+    if isinstance(Qf, str):
+        return steady_regulator(steady_end(traj), cost.at(*end)[0], R, sample)[0]
+    given = StateCost(traj, weight("Qf", Qf, traj.state_names), 0)
+    at_end: Array = given.at(*end)[0]
+    return at_end
 
 
 def orbit_text(robot: Robot) -> str:
@@ -557,6 +716,9 @@ def periodic_end(
 # multiplier 1, with rounding errors.
 _LARGEST_MULTIPLIER = 1.001
 
+# Number of times that the intervals between knots are halved for a rough periodic solution.
+_HALVINGS = 3
+
 # Entries of transition matrices below this fraction of the largest one are rounding errors.
 _UNCOUPLED = 1e-12
 
@@ -597,10 +759,7 @@ def _periodic_back(
 ) -> tuple[Array, Array, Array]:
     """Return times, P at these times, and T, G and W between them, for the periodic solution."""
     with stabilised(traj):
-        coarse = periodic_riccati.interval_maps(at, traj.t)
-        P = periodic_riccati.periodic_cost(
-            periodic_riccati.over_period(iter(coarse[::-1]))
-        )
+        P = _rough_cost(traj.t, at)
         # This sweep finds the times at which the solution is accurate. The doubling is repeated
         # with the maps between these times, so that it agrees with a sweep to machine precision.
         times, _ = riccati.solve_back(at, traj.t, P)
@@ -615,6 +774,27 @@ def _periodic_back(
 
         P = periodic_riccati.repeated(sweep, P, _UNSTABLE)
         return times, _swept(maps, P), maps
+
+
+def _rough_cost(times: Array, at: Callable[[Array], Array]) -> Array:
+    """Return an estimate of the periodic solution P (nx, nx) at the end of the period.
+
+    The maps between the knots `times` (k,) [s] are not accurate if the cost changes fast. Then the
+    doubling may fail, and is repeated with more knots. Raise `LinAlgError` if it fails always.
+    """
+    for _ in range(_HALVINGS):
+        maps = periodic_riccati.interval_maps(at, times)
+        try:
+            return periodic_riccati.periodic_cost(
+                periodic_riccati.over_period(iter(maps[::-1]))
+            )
+        except np.linalg.LinAlgError:
+            middle = 0.5 * (times[1:] + times[:-1])
+            times = np.sort(np.concatenate((times, middle)))
+    maps = periodic_riccati.interval_maps(at, times)
+    return periodic_riccati.periodic_cost(
+        periodic_riccati.over_period(iter(maps[::-1]))
+    )
 
 
 def _swept(maps: Array, P: Array) -> Array:
@@ -640,16 +820,31 @@ def loop_multipliers(factors: Array, regulated: Mask) -> Array:
 
 
 def held_stages(
-    traj: LinearTrajectory, dt: float, Q: Array, R: Array
+    traj: LinearTrajectory, dt: float, Q: Array | StateCost, R: Array
 ) -> Iterator[tuple[Array, Array]]:
     """Yield the cost matrix and the transition matrix of each sample, first sample first."""
-    nx, W = len(Q), block_diag(Q, R)
+    state_cost = Q if isinstance(Q, StateCost) else StateCost(traj, Q, 0)
+    nx = len(traj.state_names)
+    n = nx + len(R)
     for steps, whole in transitions(traj, dt):
-        total, transition = np.zeros_like(W), np.eye(len(W))
-        for cost, step in zip(held_cost(steps.F, W, steps.h), steps.maps, strict=True):
+        total, transition = np.zeros((n, n)), np.eye(n)
+        costs = _held_costs(steps, state_cost.in_steps(steps), R)
+        for cost, step in zip(costs, steps.maps, strict=True):
             total += transition.T @ cost @ transition
             transition[:nx] = step @ transition
         yield total, whole
+
+
+def _held_costs(steps: Steps, Q: Array, R: Array) -> Array:
+    """Return the cost matrices (m, nx + nu, nx + nu) of the integration steps of a sample."""
+    if Q.ndim == 2:
+        return held_cost(steps.F, block_diag(Q, R), steps.h)
+    return np.array(
+        [
+            held_cost(F, block_diag(weight_of_step, R), h)
+            for F, weight_of_step, h in zip(steps.F, Q, steps.h, strict=True)
+        ]
+    )
 
 
 def sample_time(traj: LinearTrajectory, sample: float | None) -> float:

@@ -33,6 +33,13 @@ _REGULAR, _ZERO = 1e-6, 1e-10
 # Least size of J in units of equal inertia: if J is smaller, nothing moves the constrained frames.
 _LEAST = 1e-3
 
+# Largest product of the norms of J and of the inverse of its dependent columns, in comparable
+# units, at which a point is clearly regular.
+_CLEAR = 300.0
+
+# Velocity of the rows, relative to the norms of J and nu, that is only a rounding error.
+_EXACT = 1e-15
+
 # A rank is constant nearby if no motion on the manifold accelerates redundant rows by more than
 # this fraction of the motion's own accelerations.
 _CONSTANT = 1e-7
@@ -54,13 +61,37 @@ class TangentSpace(NamedTuple):
     jacobian: Array  # J (rows, 6 + n)
     selected: Array  # (r, rows)
     basis: Array  # basis (6 + n, d) of the velocities with J nu = 0
+    inverse: Array  # (6 + n, r): a matrix with J_r `inverse` = E
     redundant: Array  # (rows - r, rows): combinations of rows of J that are zero
     row_scale: Array  # (rows,) that converts angular rows to metres
+    # Whether the rows of `basis` for the coordinates of `Closure.partition` are an identity
+    partitioned: bool = False
 
     @property
     def rows(self) -> Array:
         """Independent rows J_r (r, 6 + n) of the constraints."""
         return self.selected @ self.jacobian
+
+
+class _Partition:
+    """Independent and dependent coordinates of regular constraints, and scales of J."""
+
+    def __init__(
+        self, dependent: Indices, picked: Indices, row_scale: Array, column_scale: Array
+    ) -> None:
+        r, d = len(dependent), len(picked)
+        self.order = np.concatenate((dependent, picked))
+        self.place = np.argsort(self.order)
+        self.row_scale = row_scale
+        self.scale = np.outer(row_scale, column_scale)  # of J to comparable units
+        # from the scaled solution to velocities, and from comparable units to the inverse
+        unscale = -np.outer(column_scale[dependent], 1.0 / column_scale[picked])
+        columns = np.outer(column_scale[dependent], np.ones(r))
+        self.unscale = np.concatenate((unscale, columns), axis=1)
+        self.selected = np.diag(row_scale)
+        self.rows, self.free = np.eye(r), np.eye(d)
+        self.zeros = np.zeros((d, r))
+        self.redundant = np.zeros((0, r))
 
 
 class Closure:
@@ -71,10 +102,22 @@ class Closure:
         self.constraints = Constraints(state.robot)
         self._model = state.robot.model
         self._data = state.robot.create_data()
+        from scipy.linalg.lapack import dgesv
+
+        self._solve = dgesv
+        self._partition: _Partition | None = None
+        # Jacobian at the last closed configuration of `configuration`
+        self._jacobian: tuple[Array, Array] | None = None
+        # Last configuration and its tangent space, which several functions need
+        self._last: tuple[Array, TangentSpace] | None = None
 
     def configuration(self, q: Array) -> Array:
         """Return the closed configuration at q (nq,); raise an error if q is more than 1e-6 off."""
         self.constraints.settle(q)
+        residual, jacobian = self.constraints.residual_and_jacobian(q)
+        if np.abs(residual).max() <= CLOSED:
+            self._jacobian = q, jacobian
+            return q
         distance, text = self.distance(q)
         if not distance <= _NEAR:
             raise ConstraintError(
@@ -95,13 +138,16 @@ class Closure:
             return v
         nu = self.state.velocities(v)
         space = self.tangent(q)
+        J = space.jacobian
+        rate = J @ nu
+        if rate.dot(rate) <= _EXACT**2 * np.vdot(J, J) * nu.dot(nu):
+            return v
         kept = self.kept(space, q, nu)
         scale = 1.0 / np.sqrt(self._inertia(q).diagonal())
         apart = float(np.linalg.norm((nu - kept) / scale))
         speed = float(np.linalg.norm(nu / scale))
         if apart <= _NEAR * speed:
             return self.state.spread(kept)
-        rate = space.jacobian @ nu
         title = self._title(int(np.argmax(np.abs(rate * space.row_scale))))
         raise ConstraintError(
             f"v violates constraint '{title}', whose frames would move apart at "
@@ -219,8 +265,61 @@ class Closure:
         rows = np.where(self.constraints.angular, radius, 1.0)
         return rows, np.sqrt(mass / inertia)
 
+    def partition(self, picked: Indices, q: Array) -> None:
+        """Prepare for the independent coordinates `picked` (d,), chosen at q (nq,).
+
+        At points that are clearly regular, `tangent` then needs no singular values.
+        """
+        row_scale, column_scale = self.scales(q)
+        dependent = np.setdiff1d(np.arange(len(column_scale)), picked)
+        if len(dependent) == len(row_scale):
+            self._partition = _Partition(dependent, picked, row_scale, column_scale)
+            self._last = None
+
     def tangent(self, q: Array) -> TangentSpace:
         """Return the tangent space at a closed q (nq,); raise an error for a singular posture."""
+        if self._last is not None and (self._last[0] == q).all():
+            return self._last[1]
+        space = self._regular(q)
+        if space is None:
+            space = self._general(q)
+        self._last = q.copy(), space
+        return space
+
+    def _regular(self, q: Array) -> TangentSpace | None:
+        """Return the tangent space from a partition, or None if q is not clearly regular."""
+        part = self._partition
+        if part is None:
+            return None
+        if self._jacobian is not None and self._jacobian[0] is q:
+            J = self.state.columns(self._jacobian[1])
+        else:
+            J = self.state.columns(self.constraints.jacobian(q))
+        scaled = (J * part.scale).take(part.order, axis=1)
+        r = len(J)
+        _, _, solved, failed = self._solve(
+            scaled[:, :r], np.concatenate((scaled[:, r:], part.rows), axis=1)
+        )
+        d = solved.shape[1] - r
+        inverse = solved[:, d:]
+        size = np.vdot(scaled, scaled) * np.vdot(inverse, inverse)
+        if failed or not size < _CLEAR**2:
+            return None
+        solved *= part.unscale
+        basis = np.concatenate((solved[:, :d], part.free))
+        right = np.concatenate((inverse, part.zeros))
+        return TangentSpace(
+            rank=r,
+            jacobian=J,
+            selected=part.selected,
+            basis=basis.take(part.place, axis=0),
+            inverse=right.take(part.place, axis=0),
+            redundant=part.redundant,
+            row_scale=part.row_scale,
+            partitioned=True,
+        )
+
+    def _general(self, q: Array) -> TangentSpace:
         J = self.state.columns(self.constraints.jacobian(q))
         row_scale, columns = self.scales(q)
         U, sizes, Vt = np.linalg.svd(row_scale[:, None] * J * columns)
@@ -239,6 +338,7 @@ class Closure:
             jacobian=J,
             selected=(U[:, :rank] / sizes[:rank]).T * row_scale,
             basis=columns[:, None] * Vt[rank:].T,
+            inverse=columns[:, None] * Vt[:rank].T,
             redundant=U[:, rank:].T * row_scale,
             row_scale=row_scale,
         )

@@ -23,7 +23,6 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError
-from fflin.base.rotation import skew
 from fflin.base.validation import Array, Mask
 from fflin.robot.constraints import Constraint, Hinge, Spherical, Weld
 from fflin.robot.joints import ROOT, Carried, find_frame
@@ -31,6 +30,19 @@ from fflin.robot.robot_data import RobotData
 
 _LOCAL = pin.ReferenceFrame.LOCAL
 _BASE = slice(0, 6)  # columns of the base
+# Indices of a twist with the angular part first
+_SWAPPED = np.array([3, 4, 5, 0, 1, 2])
+
+
+class _Kinematics(NamedTuple):
+    """Pose, twist and acceleration of the joints of a constraint; Pinocchio overwrites them."""
+
+    first_pose: pin.SE3
+    first_twist: pin.Motion
+    first_rate: pin.Motion
+    second_pose: pin.SE3
+    second_twist: pin.Motion
+    second_rate: pin.Motion
 
 
 class Pair(NamedTuple):
@@ -41,6 +53,7 @@ class Pair(NamedTuple):
     selected: Array  # S (k, 6)
     first: Carried  # frame 1, on the joint of `to`, or on the universe
     second: Carried  # frame 2
+    state: _Kinematics
 
     @property
     def is_loop(self) -> bool:
@@ -48,21 +61,31 @@ class Pair(NamedTuple):
         return self.first.joint >= ROOT
 
 
-class _Slopes(NamedTuple):
-    """Derivatives (6, nv) of the twist V and the acceleration of a frame, in its own axes."""
-
-    twist_by_q: Array
-    jacobian: Array
-    rate_by_q: Array
-    rate_by_v: Array
-
-
 class RowDerivatives(NamedTuple):
-    """Derivatives (rows, nv) of the rows of the constraints, in Pinocchio's order."""
+    """Derivatives of the rows of the constraints, in Pinocchio's order."""
 
-    twist_by_q: Array  # of J v with respect to q, at constant v
-    by_q: Array  # of J dv/dt + gamma with respect to q, at constant v and dv/dt
-    by_v: Array  # of J dv/dt + gamma with respect to v
+    # The three derivatives below (rows, 3 nv), side by side
+    all: Array
+    # Derivative (nv, nv) of J^T times constant forces with respect to q, due to rotations alone:
+    # the wrench on frame 2 is constant in the axes of frame 1, so it turns relative to frame 2. The
+    # derivative at wrenches that are constant in the frames of their joints is not included.
+    force_by_q: Array
+
+    @property
+    def twist_by_q(self) -> Array:
+        """Derivative (rows, nv) of J v with respect to q, at constant v."""
+        return self.all[:, : len(self.force_by_q)]
+
+    @property
+    def by_q(self) -> Array:
+        """Derivative (rows, nv) of J dv/dt + gamma with respect to q, at constant v and dv/dt."""
+        nv = len(self.force_by_q)
+        return self.all[:, nv : 2 * nv]
+
+    @property
+    def by_v(self) -> Array:
+        """Derivative (rows, nv) of J dv/dt + gamma with respect to v."""
+        return self.all[:, 2 * len(self.force_by_q) :]
 
 
 class Constraints:
@@ -134,25 +157,31 @@ class Constraints:
 
     def jacobian(self, q: Array) -> Array:
         """Return J (rows, nv) at q (nq,)."""
-        return self.residual_and_jacobian(q)[1]
+        return self._evaluated(q, None)
 
     def residual_and_jacobian(self, q: Array) -> tuple[Array, Array]:
         """Return phi (rows,), see `residual`, and J (rows, nv) at q (nq,)."""
+        residual = np.empty(self.count)
+        return residual, self._evaluated(q, residual)
+
+    def _evaluated(self, q: Array, residual: Array | None) -> Array:
+        """Return J (rows, nv) at q (nq,), and write phi to `residual` (rows,) if it is given."""
         pairs = self.pairs
         columns = pin.computeJointJacobians(self._model, self._data, q)
-        residual = np.empty(self.count)
         jacobian = np.empty((self.count, self._model.nv))
         for pair, signs in zip(pairs, self._signs, strict=True):
             first = self._pose(pair.first)
-            apart = first.actInv(self._pose(pair.second))
-            residual[pair.rows] = _distances(pair, apart)
+            if residual is not None or signs is None:
+                apart = first.actInv(self._pose(pair.second))
+            if residual is not None:
+                residual[pair.rows] = _distances(pair, apart)
             if signs is None:
                 jacobian[pair.rows] = self._mimic_rows(pair, apart)
                 continue
             # Column k of `columns` is the twist in world axes of all bodies that joint k moves.
             selected = pair.selected.dot(first.actionInverse)
             np.multiply(selected.dot(columns), signs, out=jacobian[pair.rows])
-        return residual, jacobian
+        return jacobian
 
     def _mimic_rows(self, pair: Pair, apart: pin.SE3) -> Array:
         """Return the rows of J (k, nv) of a constraint on a robot with mimic joints."""
@@ -183,46 +212,64 @@ class Constraints:
 
     def bias(self, q: Array, v: Array) -> Array:
         """Return gamma (rows,) at q (nq,) and v (nv,), so that J dv/dt + gamma = 0."""
-        pin.forwardKinematics(self._model, self._data, q, v, np.zeros_like(v))
         bias = np.zeros(self.count)
-        for pair in self.pairs:
-            X = self._apart(pair)
-            first, second = self._twist(pair.first), self._twist(pair.second)
-            rates = X.act(self._acceleration(pair.second))
-            rates -= self._acceleration(pair.first)
+        pairs = self.pairs
+        if not v.any():
+            return bias
+        pin.forwardKinematics(self._model, self._data, q, v, np.zeros_like(v))
+        for pair in pairs:
+            _, own, twist, rate = self._motions(pair)
+            rate -= pair.first.placement.actInv(pair.state.first_rate)
             # dX/dt V_2 = V x X V_2 with the relative twist V = X V_2 - V_1.
-            rates -= first.cross(X.act(second))
-            bias[pair.rows] = pair.selected @ rates.vector
+            rate -= own.cross(twist)
+            bias[pair.rows] = pair.selected @ rate.vector
         return bias
 
-    def derivatives(self, q: Array, v: Array, a: Array) -> RowDerivatives:
-        """Return the derivatives of the rows at q (nq,), v (nv,) and the acceleration a (nv,)."""
+    def derivatives(
+        self, q: Array, v: Array, a: Array, forces: Array | None = None
+    ) -> RowDerivatives:
+        """Return the derivatives of the rows at q (nq,), v (nv,) and the acceleration a (nv,).
+
+        `forces` (rows,) are constraint forces, zero by default.
+        """
+        nv = self._model.nv
         pin.computeForwardKinematicsDerivatives(self._model, self._data, q, v, a)
-        derivatives = RowDerivatives(*np.zeros((3, self.count, self._model.nv)))
+        slopes = np.zeros((self.count, 3 * nv))
+        force_by_q = np.zeros((nv, nv))
         for pair in self.pairs:
-            pose = self._apart(pair)
-            X = pose.action
-            first, second = self._slopes(pair.first), self._slopes(pair.second)
-            relative = X @ second.jacobian - first.jacobian
-            twist = pose.act(self._twist(pair.second))
-            rate = pose.act(self._acceleration(pair.second))
-            turning = self._twist(pair.first).action
-            # d(X V_2) = X dV_2 - (X V_2) x (relative xi), and the same for accelerations.
-            twist_by_q = X @ second.twist_by_q - twist.action @ relative
-            rate_by_q = X @ second.rate_by_q - rate.action @ relative
-            S, rows = pair.selected, pair.rows
-            derivatives.twist_by_q[rows] = S @ (twist_by_q - first.twist_by_q)
-            rate_by_q -= first.rate_by_q
-            rate_by_q += twist.action @ first.twist_by_q - turning @ twist_by_q
-            derivatives.by_q[rows] = S @ rate_by_q
-            rate_by_v = X @ second.rate_by_v - first.rate_by_v
-            rate_by_v += twist.action @ first.jacobian
-            rate_by_v -= turning @ X @ second.jacobian
-            derivatives.by_v[rows] = S @ rate_by_v
+            to_first, V_1, twist, rate = self._motions(pair)
+            second = to_first.action.dot(self._slopes(pair.second))
+            apart = second
             if pair.is_loop:
-                for array in derivatives:
-                    array[rows, _BASE] = 0.0
-        return derivatives
+                first = pair.first.placement.actionInverse.dot(self._slopes(pair.first))
+                apart = second - first
+            # The columns of a motion of frame 2 relative to frame 1
+            relative = apart[:, 3 * nv :]
+            turn = twist.action
+            # d(X V_2) = X dV_2 - (X V_2) x (relative xi), and the same for accelerations.
+            twist_by_q = apart[:, :nv]
+            twist_by_q -= turn.dot(relative)
+            rate_by_q = apart[:, nv : 2 * nv]
+            rate_by_q -= rate.action.dot(relative)
+            if pair.is_loop:
+                own = V_1.action
+                rate_by_q += (turn - own).dot(first[:, :nv])
+                rate_by_q -= own.dot(twist_by_q)
+                rate_by_v = apart[:, 2 * nv : 3 * nv]
+                rate_by_v += (turn - own).dot(first[:, 3 * nv :])
+                rate_by_v -= own.dot(relative)
+            slopes[pair.rows] = pair.selected.dot(apart[:, : 3 * nv])
+            if pair.is_loop:
+                for start in range(0, 3 * nv, nv):
+                    slopes[pair.rows, start : start + 6] = 0.0
+            if forces is not None:
+                wrench = pair.selected.T.dot(forces[pair.rows])
+                # The turned wrench is n x theta, and f x theta + f x d for the force f, the moment
+                # n, and the rotation theta and displacement d.
+                turning = pin.Motion(wrench[3:], wrench[:3]).action.T
+                turned = turning.dot(-relative.take(_SWAPPED, axis=0))
+                force_by_q += second[:, 3 * nv :].T.dot(turned)
+        return RowDerivatives(slopes, force_by_q)
 
     def wrenches(self, q: Array, forces: Array) -> pin.StdVec_Force:
         """Return the wrenches on all joints, in their frames, of constraint forces (rows,)."""
@@ -236,25 +283,6 @@ class Constraints:
             wrenches[second.joint] += second.placement.act(turned)
         return wrenches
 
-    def force_by_q(self, q: Array, forces: Array) -> Array:
-        """Return the derivative (nv, nv) of J^T times the forces (rows,), due to rotations alone.
-
-        The wrench on frame 2 is constant in the axes of frame 1, so it turns relative to frame 2.
-        The derivative at wrenches that are constant in the frames of their joints is not included.
-        """
-        pin.computeJointJacobians(self._model, self._data, q)
-        total = np.zeros((self._model.nv, self._model.nv))
-        for pair in self.pairs:
-            X = self._apart(pair).action
-            second = _of_frame(pair.second, self._joint_jacobian(pair.second))
-            first = _of_frame(pair.first, self._joint_jacobian(pair.first))
-            force, torque = np.split(pair.selected.T @ forces[pair.rows], 2)
-            turned = np.zeros((6, 6))
-            turned[:3, 3:] = turned[3:, :3] = skew(force)
-            turned[3:, 3:] = skew(torque)
-            total += second.T @ X.T @ turned @ (X @ second - first)
-        return total
-
     def _made(self) -> Iterator[Pair]:
         at = 0
         for item in self.items:
@@ -266,7 +294,14 @@ class Constraints:
             to = self._carrier(item.to)
             first = Carried(to.joint, to.placement * item.placement)
             rows = slice(at, at + len(item.rows))
-            yield Pair(item, rows, item.rows, first, self._carrier(item.frame))
+            second = self._carrier(item.frame)
+            motions = [
+                array[frame.joint]
+                for frame in (first, second)
+                for array in (self._data.oMi, self._data.v, self._data.a)
+            ]
+            kinematics = _Kinematics(*motions)
+            yield Pair(item, rows, item.rows, first, second, kinematics)
             at = rows.stop
 
     def _carrier(self, frame: str | None) -> Carried:
@@ -281,23 +316,33 @@ class Constraints:
         """Return the pose of frame 2 in frame 1."""
         return self._pose(pair.first).actInv(self._pose(pair.second))
 
-    def _twist(self, frame: Carried) -> pin.Motion:
-        return frame.placement.actInv(self._data.v[frame.joint])
+    def _motions(
+        self, pair: Pair
+    ) -> tuple[pin.SE3, pin.Motion, pin.Motion, pin.Motion]:
+        """Return the motions of the frames of a constraint, in the axes of frame 1.
 
-    def _acceleration(self, frame: Carried) -> pin.Motion:
-        return frame.placement.actInv(self._data.a[frame.joint])
+        They are the twist of frame 1, the twist of frame 2, and the acceleration of frame 2. The
+        first result is the pose of the joint of frame 2 in frame 1.
+        """
+        state = pair.state
+        to_first = (state.first_pose * pair.first.placement).actInv(state.second_pose)
+        twist = to_first.act(state.second_twist)
+        rate = to_first.act(state.second_rate)
+        own = pair.first.placement.actInv(state.first_twist)
+        return to_first, own, twist, rate
 
-    def _slopes(self, frame: Carried) -> _Slopes:
-        """Return derivatives of the twist and acceleration of a frame, in its own axes."""
-        if frame.joint < ROOT:
-            return _Slopes(*np.zeros((4, 6, self._model.nv)))
-        twist_by_q, rate_by_q, rate_by_v, jacobian = (
+    def _slopes(self, frame: Carried) -> Array:
+        """Return derivatives (6, 4 nv) of the motion of a joint, in its own axes.
+
+        They are the derivatives of the twist by q, of the acceleration by q and by v, and the
+        Jacobian.
+        """
+        return np.concatenate(
             pin.getJointAccelerationDerivatives(
                 self._model, self._data, frame.joint, _LOCAL
-            )
+            ),
+            axis=1,
         )
-        columns = twist_by_q, jacobian, rate_by_q, rate_by_v
-        return _Slopes._make(_of_frame(frame, column) for column in columns)
 
     def _joint_jacobian(self, frame: Carried) -> Array:
         if frame.joint < ROOT:
@@ -391,7 +436,7 @@ def _of_frame(frame: Carried, columns: Array) -> Array:
 def _tilt(axis: Array, rotation: Array) -> Array:
     """Return the rotation vector (3,) that tilts an axis to the axis rotated by a matrix R."""
     tilted = rotation @ axis
-    across = np.cross(axis, tilted)
+    across = _cross(axis, tilted)
     sine = float(np.linalg.norm(across))
     cosine = float(axis @ tilted)
     if sine < 1e-12 and cosine > 0.0:
@@ -403,3 +448,10 @@ def _tilt(axis: Array, rotation: Array) -> Array:
         sine = float(np.linalg.norm(across))
     vector: Array = angle * across / sine
     return vector
+
+
+def _cross(first: Array, second: Array) -> Array:
+    """Return the cross product of two vectors (3,), faster than `np.cross`."""
+    a, b, c = first.tolist()
+    x, y, z = second.tolist()
+    return np.array((b * z - c * y, c * x - a * z, a * y - b * x))

@@ -40,6 +40,8 @@ class Contact:
         Derivatives of lam with respect to displacements of the state in base axes.
     forces_by_u : ndarray (rows, nu)
         Derivatives of lam with respect to u in base axes.
+    twist_by_q : ndarray (r, 6 + n)
+        Derivatives of J_r nu with respect to displacements of the configuration.
     """
 
     space: TangentSpace
@@ -48,6 +50,7 @@ class Contact:
     wrenches: pin.StdVec_Force
     forces_by_x: Array
     forces_by_u: Array
+    twist_by_q: Array
 
     def added_to(self, wrenches: pin.StdVec_Force | None) -> pin.StdVec_Force:
         """Return the wrenches of the constraints plus other wrenches on the joints."""
@@ -77,10 +80,14 @@ class ContactSolver:
     """Solution of the constrained equations of motion at points of one robot."""
 
     def __init__(self, closure: Closure) -> None:
+        from scipy.linalg.lapack import dposv
+
+        self._solve = dposv
         self._closure = closure
         self._state = closure.state
-        self._inverse_by_rows = np.zeros((0, 0))
-        self._delassus = np.zeros((0, 0))
+        self._rows: Array = np.zeros((0, 0))
+        self._inverse_by_rows: Array = np.zeros((0, 0))
+        self._delassus: Array = np.zeros((0, 0))
 
     def contact(
         self, q: Array, v: Array, nu: Array, c: Array, inverse: Array
@@ -88,21 +95,22 @@ class ContactSolver:
         """Return the contact at a point from the free accelerations c and M^-1."""
         constraints = self._closure.constraints
         space = self._closure.tangent(q)
-        rows = space.rows
-        self._inverse_by_rows = inverse @ rows.T
-        self._delassus = rows @ self._inverse_by_rows
-        a = self._rate(q, nu, c)
-        gamma = space.selected @ constraints.bias(q, v)
-        reduced = -np.linalg.solve(self._delassus, rows @ a + gamma)
-        forces = space.selected.T @ reduced
+        self._rows = rows = space.rows
+        self._inverse_by_rows = inverse.dot(rows.T)
+        self._delassus = rows.dot(self._inverse_by_rows)
+        error = rows.dot(self._rate(q, nu, c))
+        error += space.selected.dot(constraints.bias(q, v))
+        reduced = -self._solved(error)
+        forces = space.selected.T.dot(reduced)
         none = np.zeros((0, 0))
         return Contact(
             space=space,
-            c=c + self._inverse_by_rows @ reduced,
+            c=c + self._inverse_by_rows.dot(reduced),
             forces=forces,
             wrenches=constraints.wrenches(q, forces),
             forces_by_x=none,
             forces_by_u=none,
+            twist_by_q=none,
         )
 
     def differentiate(
@@ -122,28 +130,44 @@ class ContactSolver:
         """
         state, constraints = self._state, self._closure.constraints
         nv = len(contact.c)
-        space = contact.space
-        turning = constraints.force_by_q(q, contact.forces)
-        slopes[:, :nv] += inverse @ state.project(turning)
-        rate_slopes = slopes.copy()
-        theta, w, v_b = slice(0, 3), slice(nv, nv + 3), slice(nv + 3, nv + 6)
-        rate_slopes[LINEAR, theta] += skew(state.gravity(q))
-        rate_slopes[LINEAR, w] += skew(nu[LINEAR])
-        rate_slopes[LINEAR, v_b] -= skew(nu[ANGULAR])
+        space, rows = contact.space, self._rows
         rates = state.spread(self._rate(q, nu, contact.c))
-        of_rows = constraints.derivatives(q, v, rates)
-        explicit = np.hstack((state.columns(of_rows.by_q), state.columns(of_rows.by_v)))
-        residual = space.rows @ rate_slopes + space.selected @ explicit
-        by_x = -np.linalg.solve(self._delassus, residual)
-        by_input = -np.linalg.solve(self._delassus, space.rows @ by_u)
-        slopes += self._inverse_by_rows @ by_x
-        by_u += self._inverse_by_rows @ by_input
-        contact.forces_by_x = space.selected.T @ by_x
-        contact.forces_by_u = space.selected.T @ by_input
+        of_rows = constraints.derivatives(q, v, rates, contact.forces)
+        slopes[:, :nv] += inverse.dot(state.project(of_rows.force_by_q))
+        residual = np.empty((len(rows), 2 * nv + by_u.shape[1]))
+        residual[:, : 2 * nv] = rows.dot(slopes)
+        residual[:, 2 * nv :] = rows.dot(by_u)
+        explicit = space.selected.dot(of_rows.all)
+        explicit = explicit.reshape(-1, len(v))
+        explicit = state.columns(explicit).reshape(len(rows), 3 * nv)
+        residual[:, : 2 * nv] += explicit[:, nv:]
+        if state.robot.anchored:
+            # Loops do not depend on the linear acceleration of the base.
+            linear = rows[:, LINEAR]
+            residual[:, :3] += linear.dot(skew(state.gravity(q)))
+            residual[:, nv : nv + 3] += linear.dot(skew(nu[LINEAR]))
+            residual[:, nv + 3 : nv + 6] -= linear.dot(skew(nu[ANGULAR]))
+        solved = -self._solved(residual)
+        by_x, by_input = solved[:, : 2 * nv], solved[:, 2 * nv :]
+        slopes += self._inverse_by_rows.dot(by_x)
+        by_u += self._inverse_by_rows.dot(by_input)
+        contact.forces_by_x = space.selected.T.dot(by_x)
+        contact.forces_by_u = space.selected.T.dot(by_input)
+        contact.twist_by_q = explicit[:, :nv]
+
+    def _solved(self, right: Array) -> Array:
+        """Return (J_r M^-1 J_r^T)^-1 times a vector or a matrix."""
+        _, solved, failed = self._solve(self._delassus, right)
+        if failed:  # rounding errors are as large as the smallest eigenvalue
+            solved = np.linalg.solve(self._delassus, right)
+        result: Array = solved
+        return result
 
     def _rate(self, q: Array, nu: Array, c: Array) -> Array:
         """Return dnu/dt (3.2) from the accelerations c without gravity."""
         rate = c.copy()
-        rate[LINEAR] += self._state.gravity(q)
-        rate[LINEAR] -= skew(nu[ANGULAR]) @ nu[LINEAR]
+        if self._state.robot.anchored:
+            # Loops do not depend on the linear acceleration of the base.
+            rate[LINEAR] += self._state.gravity(q)
+            rate[LINEAR] -= skew(nu[ANGULAR]) @ nu[LINEAR]
         return rate

@@ -8,8 +8,19 @@ import numpy as np
 from fflin.base.rotation import rotation_matrix
 from fflin.base.validation import Array, Values
 from fflin.dynamics.coordinates import PIN_ANGULAR, PIN_LINEAR
+from fflin.dynamics.magnetic import DistortedField, MagneticField, distortion_of
 from fflin.dynamics.orbital import OrbitField
-from fflin.robot.disturbance import BASE, INERTIAL, ORBITAL, plates_of, terms_of
+from fflin.robot.disturbance import (
+    BASE,
+    FIELD_ROTATION,
+    FIELD_SCALE,
+    INERTIAL,
+    ORBITAL,
+    RESIDUAL_DIPOLE,
+    magnetic_values,
+    plates_of,
+    terms_of,
+)
 from fflin.robot.flat_plate import FlatPlate
 from fflin.robot.inputs import BaseForce, BaseTorque
 from fflin.robot.joints import ROOT
@@ -177,11 +188,28 @@ class Plate:
         return 0.0, self.normal
 
 
+def distortion(robot: Robot, field: OrbitField) -> Array | None:
+    """Return the matrix (3, 3) of the errors of the magnetic field, or None without errors."""
+    (scale,) = magnetic_values(robot.disturbance, FIELD_SCALE)
+    rotation = magnetic_values(robot.disturbance, FIELD_ROTATION)
+    if not scale and not any(rotation):
+        return None
+    return distortion_of(field.axes, scale, np.array(rotation))
+
+
+def true_field(robot: Robot, field: OrbitField) -> MagneticField | DistortedField:
+    """Return the magnetic field of an orbit with the errors that the robot's disturbance adds."""
+    magnetic = field.magnetic
+    assert magnetic is not None
+    matrix = distortion(robot, field)
+    return magnetic if matrix is None else DistortedField(magnetic, matrix)
+
+
 class BaseDisturbance:
     """Disturbances of a robot as functions of time and of the attitude of the base.
 
     `field` is the field of the robot's orbit, or None without an orbit. If `constant` is true, the
-    periodic parts are left out.
+    periodic parts and the torque of the residual dipole are left out.
     """
 
     def __init__(
@@ -193,18 +221,24 @@ class BaseDisturbance:
         self.periodic = any(wave.rate for wave in self.waves)
         plates = plates_of(robot.disturbance)
         self.plates = [Plate(plate, field) for plate in plates]
+        # Residual dipole [A m^2] in base axes, and the magnetic field that acts on it.
+        self.dipole = np.array(magnetic_values(robot.disturbance, RESIDUAL_DIPOLE))
+        self._magnetic: MagneticField | DistortedField | None = None
+        if self.dipole.any() and field is not None and not constant:
+            self._magnetic = true_field(robot, field)
         self._root = robot.model.jointPlacements[ROOT].rotation
         self._field = field
 
     @property
     def acts(self) -> bool:
         """Whether there is any disturbance."""
-        return bool(self.waves or self.plates)
+        return bool(self.waves or self.plates or self._magnetic)
 
     def clear(self) -> None:
         """Remove all disturbances."""
         self.waves.clear()
         self.plates.clear()
+        self._magnetic = None
 
     def wrench(self, t: float, q: Array) -> Array:
         """Return force and torque (6,) on the base, in base axes, at time t [s] and q (nq,)."""
@@ -219,4 +253,6 @@ class BaseDisturbance:
             total[_ROWS[wave.name]] += value
         for plate in self.plates:
             total += plate.wrench(t, R)
+        if self._magnetic is not None:
+            total[PIN_ANGULAR] += np.cross(self.dipole, self._magnetic.at(t) @ R)
         return total

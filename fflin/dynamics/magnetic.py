@@ -4,10 +4,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+import pinocchio as pin
 
 from fflin.base.errors import InputError
 from fflin.base.rotation import skew
-from fflin.base.validation import Array, vector
+from fflin.base.validation import Array, Values, vector
 from fflin.robot.orbit import (
     DIPOLES,
     MAGNETIC_POLES,
@@ -96,6 +97,23 @@ class MagneticField:
         rate: Array = self._axes @ flux_rate
         return rate
 
+    def phasors(self) -> dict[float, Values] | None:
+        """Return the flux density as {rate [rad/s]: complex amplitude (3,) [T]}.
+
+        The flux density is the sum of the real parts of amplitude times exp(j rate t). Return None
+        unless the field is a dipole along the rotation axis, and the orbit is circular.
+        """
+        orbit = self._orbit
+        if not isinstance(orbit, CircularOrbit) or self._function is not None:
+            return None
+        if self.rotates:
+            return None
+        a = self.moment / orbit.radius**3
+        wave = a * self._sine * np.exp(1j * orbit.argument_of_latitude)
+        constant = np.array([0.0, 0.0, a * self._cosine + 0j])
+        periodic = np.array([2j * wave, wave, 0.0])
+        return {0.0: self._axes @ constant, orbit.mean_motion: self._axes @ periodic}
+
     def _position(self, t: float) -> _Position:
         """Return the position on the orbit at time t [s]."""
         orbit = self._orbit
@@ -146,3 +164,37 @@ class MagneticField:
             )
         in_axes: Array = self._axes @ directions @ flux
         return in_axes
+
+
+class DistortedField:
+    """Magnetic field that differs from the field of the orbit.
+
+    The matrix `distortion` (3, 3), in the axes of the orbital frame, multiplies the flux density of
+    `field`.
+    """
+
+    def __init__(self, field: MagneticField, distortion: Array) -> None:
+        self._field = field
+        self._distortion = distortion
+
+    def at(self, t: float) -> Array:
+        """Return the flux density (3,) [T] at time t [s]."""
+        flux: Array = self._distortion @ self._field.at(t)
+        return flux
+
+    def rate(self, t: float) -> Array:
+        """Return the derivative (3,) [T/s] of `at` with respect to time."""
+        change: Array = self._distortion @ self._field.rate(t)
+        return change
+
+
+def distortion_of(axes: Array, scale: float, rotation: Array) -> Array:
+    """Return the matrix (3, 3) that rotates and scales a magnetic field.
+
+    The columns of `axes` (3, 3) are as in `MagneticField`. The vector `rotation` (3,) [rad] is in
+    the axes `lvlh`, and the field is multiplied by 1 + `scale`.
+    """
+    outwards, along, normal = axes.T
+    lvlh = np.column_stack((along, -normal, -outwards))
+    matrix: Array = (1.0 + scale) * pin.exp3(lvlh @ rotation)
+    return matrix

@@ -22,6 +22,7 @@ from fflin.dynamics.coordinates import (
     Chart,
     Frame,
 )
+from fflin.dynamics.magnetic import DistortedField
 from fflin.dynamics.orbital import OrbitField
 from fflin.robot.joints import ROOT, find_frame
 from fflin.robot.robot import Robot
@@ -470,6 +471,9 @@ class StateMap:
 class Actuation:
     """Inputs of a robot: their names and units, the matrix B_u, and their wrenches on the links."""
 
+    # Magnetic field in which the magnetorquers act, if it is not the field of `state`.
+    true_field: DistortedField | None = None
+
     def __init__(self, state: StateMap) -> None:
         robot = state.robot
         nv = 6 + state.robot.n
@@ -572,6 +576,8 @@ class Actuation:
 
     def flux(self, t: float) -> Array:
         """Return the magnetic flux density (3,) [T] at time t [s], in orbital axes."""
+        if self.true_field is not None:
+            return self.true_field.at(t)
         field = self.state.field
         assert field is not None
         assert field.magnetic is not None

@@ -24,6 +24,7 @@ from fflin.base.errors import FileError, InputError, MissingPackageError, listed
 from fflin.base.record import content_digest, reading
 from fflin.base.validation import Array, frozen
 from fflin.base.writing import as_path, failing, read_file, write_atomically
+from fflin.control.bdot import measured_field
 from fflin.control.loops import Loop, Measure, Step, next_sample
 from fflin.control.policy import BoundLaw, Command, Policy
 from fflin.dynamics.coordinates import Frame, frame_of
@@ -33,8 +34,18 @@ from fflin.export.laws import CASES, Case, Law, law_of, measured
 from fflin.linear.fit import require_configuration_size, require_same
 from fflin.robot.robot import Robot
 
-_DOUBLE = {"sqrt": "sqrt", "largest": "DBL_MAX", "two_pi": "6.283185307179586477"}
-_FLOAT = {"sqrt": "sqrtf", "largest": "FLT_MAX", "two_pi": "6.283185307179586477F"}
+_DOUBLE = {
+    "sqrt": "sqrt",
+    "largest": "DBL_MAX",
+    "smallest": "DBL_MIN",
+    "two_pi": "6.283185307179586477",
+}
+_FLOAT = {
+    "sqrt": "sqrtf",
+    "largest": "FLT_MAX",
+    "smallest": "FLT_MIN",
+    "two_pi": "6.283185307179586477F",
+}
 
 _INVALID = 2  # status of a call, as in templates/header.h
 _LARGEST = 2**26  # [bytes] largest size of each file of a law
@@ -68,6 +79,8 @@ def write_c(
     - For an output feedback, the arguments are the outputs y, and the controller memory, which the
       caller allocates. A state feedback with integral action also has this memory. If the inputs
       saturate at `limits`, the integrals are corrected as in `simulate`.
+    - For `BDot` and `RateDamping`, the arguments are the derivative of the magnetic flux density,
+      or the flux density and the angular velocity, in base axes.
     - For gains along a trajectory, for a law that follows one, and for outputs that are measured at
       different rates, the sample number is an additional argument. The gains of a periodic
       trajectory repeat. The attitudes and positions in the outputs y of a law that follows a
@@ -76,9 +89,9 @@ def write_c(
     Parameters
     ----------
     law : Gain, StateFeedback, ScheduledFeedback, OutputFeedback, LinearController or GainSchedule
-        Control law; a `MultirateFeedback`, `Compensator` or `TrajectoryFeedback` is also accepted.
-        Controllers and gains
-        along a trajectory must be in discrete time.
+        Control law; a `MultirateFeedback`, `Compensator`, `TrajectoryFeedback`, `BDot` or
+        `RateDamping` is also accepted. Controllers and gains along a trajectory must be in
+        discrete time.
     folder : path
         Folder for the files; created if it does not exist. Existing files with the same names are
         replaced only if they were written for the same type of law and the same robot, and if the
@@ -86,7 +99,7 @@ def write_c(
     robot : Robot, optional
         Robot for which the law was designed. Give it if the law does not contain the robot, and
         `load` does not return this robot for its name. Laws that were read from a file, and every
-        `Compensator`, do not contain the robot.
+        `Compensator`, `BDot` and `RateDamping`, do not contain the robot.
     limits : "urdf", float, mapping or list, optional
         Limits at which the inputs saturate, as in `simulate`; none by default.
     name : str
@@ -315,9 +328,14 @@ class CLaw(Policy):
         state = StateMap(
             robot, reference=self.origin, frame=frame_of(robot, self.frame)
         )
+        magnetic = self._about["kind"] == "magnetic"
         for kind, (names, units) in self._about["signals"].items():
+            if magnetic and kind != "input":
+                continue
             require_same(made, state, kind, tuple(names), tuple(units))
         require_configuration_size(made, self._about["nq"], robot)
+        if magnetic:
+            return self._magnetic_command(robot)
         if self._about["kind"] == "output":
             return self._output_loop(state)
         world = StateMap(robot, frame=state.frame)
@@ -335,6 +353,18 @@ class CLaw(Policy):
         def policy(t: float, q: Array, v: Array) -> Array:
             given[at] = measured(world, q, v)
             self._call(t, *self._sample(t), given.ctypes, u.ctypes)
+            return u.astype(float)
+
+        return policy
+
+    def _magnetic_command(self, robot: Robot) -> Command:
+        """Return the command of a law of the magnetic field, which is measured without errors."""
+        measure = measured_field(robot, rate=self._about["measures_rate"])
+        u = np.zeros(len(self._about["u0"]), self._real)
+
+        def policy(t: float, q: Array, v: Array) -> Array:
+            y = measure(t, q, v).astype(self._real)
+            self._call(t, y.ctypes, u.ctypes)
             return u.astype(float)
 
         return policy
@@ -449,7 +479,7 @@ def _texts(law: Law, name: str, real: str) -> tuple[str, dict[str, str]]:
     """Return the title of a law, and the texts of its four files as {file ending: text}."""
     state, tables, robot = law.state, law.tables, law.robot
     names, units = law.inputs
-    kind = "state" if state else "output"
+    kind = law.kind
     title = f"{law.title} of '{robot.name}'"
     frame = _frame_of(law)
     # Largest rounding error that the test program accepts, relative to `Case.scale`, the sum of the
@@ -507,6 +537,9 @@ def _texts(law: Law, name: str, real: str) -> tuple[str, dict[str, str]]:
             _filled("interpolation.c", words) if "axis_size" in tables else ""
         )
         words |= _memory_words(words, law.memory, str(words["sample_given"]))
+    elif law.magnetic is not None:
+        words |= {"outputs": len(law.signals[0])}
+        words |= _magnetic_words(words, measures_rate=law.magnetic.measures_rate)
     else:
         nz = law.memory
         outputs = tables["y0"].shape[1]
@@ -527,6 +560,23 @@ def _texts(law: Law, name: str, real: str) -> tuple[str, dict[str, str]]:
     return title, {**code, ".json": json.dumps(about, indent=1) + "\n"}
 
 
+def _magnetic_words(
+    words: dict[str, object], *, measures_rate: bool
+) -> dict[str, object]:
+    """Return {placeholder: text} for placeholders that occur only in templates of magnetic laws."""
+    if measures_rate:
+        return {
+            "formula": "u = D (b x omega) / |b|^2, with the magnetic flux density b and the "
+            "inertial angular\n * velocity omega, both in base axes.",
+            "vector_code": _filled("rate_damping.c", words),
+        }
+    return {
+        "formula": "u = D db/dt, with the derivative of the magnetic flux density b in base "
+        "axes, such as\n * the difference of two measurements divided by the time between them.",
+        "vector_code": _filled("flux_rate.c", words),
+    }
+
+
 def _dependent_comment(law: Law) -> str:
     """Return the comment on the states that constraints determine; empty without constraints."""
     if law.state is None or law.lin is None or not law.lin.dependent:
@@ -544,13 +594,15 @@ def _frame_of(law: Law) -> str:
         return law.state.frame
     if law.lin:
         return law.lin.frame
+    if law.magnetic:
+        return "lvlh"
     return "local" if law.points else ""
 
 
 def _about(law: Law, title: str, real: str, frame: str) -> dict[str, object]:
     """Return the description of a law that `CLaw` reads, without its SHA-256."""
     state, lin, robot = law.state, law.lin, law.robot
-    kind = "state" if state else "output"
+    kind = law.kind
     u0 = law.tables["u0"]
     initial = u0[0] if law.initial is None else law.initial
     about: dict[str, object] = {
@@ -572,7 +624,9 @@ def _about(law: Law, title: str, real: str, frame: str) -> dict[str, object]:
         about["point"] = [lin.q.tolist(), lin.v.tolist()]
         if lin.delay.any():
             about["delay"] = lin.delay.tolist()
-    if not state:
+    if law.magnetic is not None:
+        about["measures_rate"] = law.magnetic.measures_rate
+    elif not state:
         about |= {"period": law.period, "y0": law.tables["y0"][0].tolist()}
     if law.delay:
         about["delay"] = list(law.delay)

@@ -12,13 +12,22 @@ from numpy.linalg import norm
 from fflin.base.errors import FflinError, InputError
 from fflin.base.rotation import conjugate, quaternion_product
 from fflin.base.validation import Array, Indices, instance
+from fflin.control.bdot import TINY
 from fflin.control.compensator import Compensator
 from fflin.control.following import Following, ReferencePath
 from fflin.control.gain import Gain, model_of, sampled_for
 from fflin.control.loops import NOT_CORRECTED, Sample
 from fflin.control.multirate_feedback import MultirateFeedback
 from fflin.control.policies import LinearLaw, StateFeedback
-from fflin.control.policy import Command, OutputForm, PathForm, Policy, StateForm, bound
+from fflin.control.policy import (
+    BDotForm,
+    Command,
+    OutputForm,
+    PathForm,
+    Policy,
+    StateForm,
+    bound,
+)
 from fflin.control.tracking import TrajectoryFeedback, TrajectoryOutputFeedback
 from fflin.control.tvlqr import GainSchedule
 from fflin.dynamics.state import StateMap
@@ -59,6 +68,9 @@ class Law:
     with memory has ``C z`` as a further term, and the next z is ``A z + B (x - x0)``. Its K has one
     row.
 
+    A magnetic law is ``u = D w``. Its vector w is the measured y, or b x omega / (b b) of the
+    measured y = (b, omega).
+
     An output law is ``u = u0 + C z + D (y - y0)``. The next controller state z is
     ``A z + B (y - y0)``. Its tables u0 and y0 have one row for all samples, or one row for each
     sample.
@@ -87,6 +99,15 @@ class Law:
     period: int = 1  # number of samples after which the tables A, B and E repeat
     # whether the rows of the tables for the samples repeat, instead of the last one being kept
     repeats: bool = False
+    # data of a magnetic law
+    magnetic: BDotForm | None = None
+
+    @property
+    def kind(self) -> str:
+        """Kind of the law: state, output or magnetic."""
+        if self.magnetic is not None:
+            return "magnetic"
+        return "state" if self.state else "output"
 
 
 def measured(world: StateMap, q: Array, v: Array) -> Array:
@@ -154,7 +175,8 @@ def law_of(given: object, robot: object, limits: object) -> Law:
 def _not_written(given: object) -> InputError:
     return InputError(
         f"law has type {type(given).__name__}, expected a Gain, StateFeedback, OutputFeedback, "
-        "LinearController, Compensator, GainSchedule, TrajectoryFeedback or ScheduledFeedback"
+        "LinearController, Compensator, GainSchedule, TrajectoryFeedback, ScheduledFeedback, BDot "
+        "or RateDamping"
     )
 
 
@@ -172,6 +194,9 @@ def _law_of(given: Design, robot: Robot) -> Law:
     if isinstance(given, Compensator):
         return _compensator_law(given, robot)
     policy = _policy_of(given, robot)
+    form = policy.form(robot)
+    if isinstance(form, BDotForm):
+        return _magnetic_law(title, form, robot)
     law = _law_along_trajectory(title, policy, robot)
     if law is None:
         dt = given.dt if isinstance(given, Gain) else policy.sample_time
@@ -524,6 +549,55 @@ def _references(state: StateMap, q: Array, v: Array) -> dict[str, Array]:
         "reference": np.hstack((state.positions(q), attitudes)),
         "x0": np.hstack((np.zeros((len(q), 6)), *joints)),
     }
+
+
+_AXES = ("x", "y", "z")
+
+
+def _magnetic_law(title: str, form: BDotForm, robot: Robot) -> Law:
+    """Convert a law of the magnetic field, whose moments are a gain times a vector."""
+    names = [f"derivative of b.{axis}" for axis in _AXES]
+    units = ["T/s"] * 3
+    if form.measures_rate:
+        names = [f"b.{axis}" for axis in _AXES] + [f"omega.{axis}" for axis in _AXES]
+        units = ["T"] * 3 + ["rad/s"] * 3
+    return Law(
+        title=title,
+        state=None,
+        signals=(tuple(names), tuple(units)),
+        inputs=signals_of(StateMap(robot), "input"),
+        dt=0.0,
+        robot=robot,
+        lin=None,
+        tables={
+            "u0": np.zeros((1, len(form.gain))),
+            "D": form.gain,
+            "E": NOT_CORRECTED,
+        },
+        operations=16.0,
+        memory=0,
+        cases=list(_magnetic_cases(form)),
+        magnetic=form,
+    )
+
+
+def _magnetic_cases(form: BDotForm) -> Iterator[Case]:
+    """Yield test cases of a magnetic law at random measurements; one has no field."""
+    random = np.random.default_rng(0)
+    gains = np.abs(form.gain)
+    for number in range(CASES):
+        y: Array = random.normal(size=3) * 10.0 ** random.uniform(-9, -5)
+        vector, size = y, np.abs(y)
+        if form.measures_rate:
+            b = 1e3 * y
+            if not number:
+                b = np.zeros(3)
+            omega = random.normal(size=3) * 10.0 ** random.uniform(-4, 0)
+            y = np.concatenate((b, omega))
+            square = max(float(b @ b), TINY)
+            vector = np.cross(b, omega) / square
+            size = np.full(3, norm(b) * norm(omega) / square)
+        yield Case(0, y, form.gain @ vector, gains @ size)
 
 
 def _compensator_law(given: Compensator, robot: Robot) -> Law:

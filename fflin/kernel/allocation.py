@@ -19,7 +19,7 @@ from fflin.base.validation import Array
 from fflin.kernel import vectors as vec
 from fflin.kernel.bodies import factorise, solve_inwards, write_columns
 from fflin.kernel.forward import MECHANICS, POINT, configure, push, turn_held
-from fflin.kernel.orbit import flux_at, write_now
+from fflin.kernel.orbit import model_flux_at, write_now
 from fflin.kernel.tree import INDICES, LANED, Struct, empty
 from fflin.kernel.vectors import Entries, called, load, root, store
 
@@ -258,7 +258,7 @@ def write_difference(allocation, orbit, point, commanded):
 def _write_columns(work, tree, orbit, point):
     """Write the columns of B_u; in orbit, with the magnetic field that `orbit.now` contains."""
     if orbit is not None:
-        write_columns(work, tree, flux_at(orbit, point.q))
+        write_columns(work, tree, model_flux_at(orbit, point.q))
     else:
         write_columns(work, tree, None)
 

@@ -22,6 +22,7 @@ from fflin.kernel.orbit import (
     RATE_CHANGE,
     STRENGTH,
     add_gradient,
+    add_residual_torque,
     changing_field,
     flux_at,
     from_inertial_axes,
@@ -205,6 +206,8 @@ def disturb(work, robot, orbit, extension, point, t):
         if disturbance.held[index]:
             force = vec.across(vec.axes_of(point.q), force)
         vec.add3(work, robot.tree.offsets.c + disturbance.at[index], force)
+    if orbit is not None:
+        add_residual_torque(work, orbit, point.q, robot.tree.offsets.c)
     if extension is not None:
         axes, to = vec.axes_of(point.q), robot.tree.offsets.c
         add_plates(work, extension.plates, orbit, axes, to)

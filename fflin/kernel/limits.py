@@ -93,10 +93,6 @@ def _has_displaced_root(robot: Robot) -> bool:
     return not robot.model.jointPlacements[ROOT].isIdentity(0.0)
 
 
-def _has_constraints_in_orbit(robot: Robot) -> bool:
-    return bool(robot.constraints) and robot.orbit is not None
-
-
 LIMITS = (
     Limit(lambda task: not numba_is_there() and without_numba(), "{}"),
     Limit(lambda task: task.outputs, "the outputs are not the state"),
@@ -127,10 +123,6 @@ LIMITS = (
     Limit(
         lambda task: task.simulated and task.first(_has_displaced_root),
         "the root joint of '{}' is not at the origin of the world",
-    ),
-    Limit(
-        lambda task: task.first(_has_constraints_in_orbit),
-        "the constraints of '{}' are simulated in orbit in Python",
     ),
     Limit(
         lambda task: task.own_sample_time,

@@ -244,7 +244,7 @@ class Arguments(
 ):
     """Arguments of `advance`.
 
-    `orbit` is used by `advance_in_orbit` and `advance_one_in_orbit` only. The reference then
+    `orbit` is used by the functions whose names end with `in_orbit` only. The reference then
     contains the Jacobi integral in place of the momentum.
 
     If `project` is true, `forward.impose` corrects the base's position and velocity at the end of
@@ -349,8 +349,8 @@ def advance_one(words, clock, last, every, rows, work):
 
 
 # Only robots with constraints use the next two functions, only robots in orbit the two functions
-# after them, and only robots with lags or flat plates the last six, so that other robots do not
-# wait until they are compiled.
+# after them, only robots with both the two functions after these, and only robots with lags or flat
+# plates the last eight, so that other robots do not wait until they are compiled.
 
 
 def advance_constrained(words, clock, last, every, rows, work):
@@ -377,6 +377,20 @@ def advance_one_in_orbit(words, clock, last, every, rows, work):
     """Advance one run of a robot in orbit; the arguments are the arguments of `advance_one`."""
     arguments = ARGUMENTS_OF_ONE(words)
     _advance(arguments, arguments.orbit, None, None, clock, last, every, rows, work)
+
+
+def advance_constrained_in_orbit(words, clock, last, every, rows, work):
+    """Advance eight runs of a robot with constraints in orbit; see `advance_constrained`."""
+    arguments = CONSTRAINED(words)
+    usual, held = arguments.usual, arguments.constraints
+    _advance(usual, usual.orbit, held, None, clock, last, every, rows, work)
+
+
+def advance_one_constrained_in_orbit(words, clock, last, every, rows, work):
+    """Advance one run of a robot with constraints in orbit; see `advance_one_constrained`."""
+    arguments = CONSTRAINED_OF_ONE(words)
+    usual, held = arguments.usual, arguments.constraints
+    _advance(usual, usual.orbit, held, None, clock, last, every, rows, work)
 
 
 def advance_extended(words, clock, last, every, rows, work):
@@ -421,6 +435,22 @@ def advance_one_extended_in_orbit(words, clock, last, every, rows, work):
     arguments = EXTENDED_OF_ONE(words)
     usual, extension = arguments.usual, arguments.extension
     _advance(usual, usual.orbit, None, extension, clock, last, every, rows, work)
+
+
+def advance_extended_constrained_in_orbit(words, clock, last, every, rows, work):
+    """Advance eight runs with constraints and an extension in orbit; see `advance_extended`."""
+    arguments = EXTENDED(words)
+    usual, extension = arguments.usual, arguments.extension
+    held = arguments.constraints
+    _advance(usual, usual.orbit, held, extension, clock, last, every, rows, work)
+
+
+def advance_one_extended_constrained_in_orbit(words, clock, last, every, rows, work):
+    """Advance one run with constraints and an extension in orbit; see `advance_one_extended`."""
+    arguments = EXTENDED_OF_ONE(words)
+    usual, extension = arguments.usual, arguments.extension
+    held = arguments.constraints
+    _advance(usual, usual.orbit, held, extension, clock, last, every, rows, work)
 
 
 def _advance(arguments, orbit, constraints, extension, clock, last, every, rows, work):

@@ -16,7 +16,7 @@ from collections import namedtuple
 
 from fflin.kernel import vectors as vec
 from fflin.kernel.bodies import add_column, at_parent, joint_axis, stored_momentum
-from fflin.kernel.tree import FIELD, INERTIA, PLACE, REALS, Struct
+from fflin.kernel.tree import FIELD, INERTIA, LANED, PLACE, REALS, Struct
 from fflin.kernel.vectors import called, load
 
 # Offsets in `Orbit.now`.
@@ -31,7 +31,10 @@ _KEPLER_STEPS = 80
 
 
 class Orbit(
-    namedtuple("Orbit", "outwards normal mean_motion ellipse latitude dipole pole now")
+    namedtuple(
+        "Orbit",
+        "outwards normal mean_motion ellipse latitude dipole pole distortion residual now",
+    )
 ):
     """Orbit of the simulated robot.
 
@@ -46,6 +49,9 @@ class Orbit(
     - `pole` (5,): for a tilted dipole, the amplitude [T] of the other part, the longitude [rad] of
       its pole from the ascending node at t = 0, the angular velocity [rad/s] of the central body,
       and sine and cosine of the inclination; otherwise empty.
+    - `distortion` (9,): columns of the matrix that multiplies the magnetic field, because the true
+      field differs from the model; empty without a difference.
+    - `residual` (3,) [A m^2]: residual dipole in base axes; empty without one.
     - `now` (11,): k [1/s^2], theta' [rad/s], theta'' [rad/s^2], the angle [rad] by which the
       orbital frame has rotated since t = 0, the magnetic flux density (3,) [T] in the axes of the
       orbital frame, the derivative (3,) of these three numbers, and the derivative of k [1/s^3].
@@ -53,7 +59,7 @@ class Orbit(
     """
 
 
-ORBIT = Struct(Orbit, REALS)
+ORBIT = Struct(Orbit, REALS, {LANED: "distortion residual"})
 
 
 def write_now(orbit, t):
@@ -177,15 +183,39 @@ def spin_at(orbit, q):
     return vec.times(normal_at(orbit, q), orbit.now[RATE])
 
 
+def model_flux_at(orbit, q):
+    """Return the magnetic flux density [T] of the model, without its errors, in base axes."""
+    return vec.across(vec.axes_of(q), vec.get3(orbit.now, FLUX))
+
+
 def flux_at(orbit, q):
     """Return the magnetic flux density [T] in base axes."""
-    return vec.across(vec.axes_of(q), vec.get3(orbit.now, FLUX))
+    return _true_vector(orbit, q, FLUX)
 
 
 def flux_rate_at(orbit, q, nu):
     """Return the time derivative [T/s] of the magnetic flux density in base axes."""
-    change = vec.across(vec.axes_of(q), vec.get3(orbit.now, FLUX_CHANGE))
+    change = _true_vector(orbit, q, FLUX_CHANGE)
     return vec.plus(change, vec.cross(flux_at(orbit, q), vec.get3(nu, 0)))
+
+
+def _true_vector(orbit, q, at):
+    """Return a vector of the true magnetic field in base axes; `now[at]` is the model's vector."""
+    axes = vec.axes_of(q)
+    vector = vec.get3(orbit.now, at)
+    result = vec.across(axes, vector)
+    if len(orbit.distortion) > 0:
+        columns = vec.get_columns(orbit.distortion, 0)
+        result = vec.across(axes, vec.product(columns, vector))
+    return result
+
+
+@called
+def add_residual_torque(work, orbit, q, to):
+    """Add the torque (3,) of the residual dipole, in base axes, to `work` from `to` on."""
+    if len(orbit.residual) > 0:
+        dipole = vec.get3(orbit.residual, 0)
+        vec.add3(work, to, vec.cross(dipole, flux_at(orbit, q)))
 
 
 def from_inertial_axes(orbit, a):

@@ -8,7 +8,6 @@ the coordinates are chosen, and for points that are not clearly regular.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -136,7 +135,7 @@ class RestSolver:
                     **fields["_computed"],
                     # The default outputs are all states.
                     "C": _all_states,
-                    "x0": partial(_independent_states, fields["_computed"]["y0"], kept),
+                    "x0": partial(_independent_outputs, kept),
                 },
             },
         )
@@ -208,11 +207,9 @@ def _all_states(lin: LinearModel) -> Array:
     return lin._all_states
 
 
-def _independent_states(
-    whole: Callable[[LinearModel], Array], kept: Indices, lin: LinearModel
-) -> Array:
-    """Return the independent states from the function `whole` of all states."""
-    return frozen(whole(lin)[kept])
+def _independent_outputs(kept: Indices, lin: LinearModel) -> Array:
+    """Return the independent states of a model whose outputs are all states."""
+    return frozen(lin.y0[kept])
 
 
 def _frozen_inertia(M: Array, _: LinearModel) -> Array:

@@ -15,6 +15,7 @@ from fflin.base.validation import Array, Vector, instance, number, shaped, vecto
 from fflin.dynamics.coordinates import Frame, refuse_constraints
 from fflin.dynamics.integrators import held_exponential
 from fflin.dynamics.state import StateMap
+from fflin.linear.constrained_exchange import chosen, require_rest
 from fflin.linear.fit import require_fit
 from fflin.linear.linearization import linearize
 from fflin.linear.model import LinearModel, StateSpace, refuse_delayed
@@ -92,6 +93,10 @@ def transform(
     the length of a quaternion; (15.1) to (15.6) of docs/derivation.md give them in full.
     docs/guide/tools.md compares the conventions of the tools.
 
+    If the robot has constraints, the state of the result contains as many of the tool's coordinates
+    as are independent: the joints that the linear model contains, and coordinates of the base that
+    determine the others. The default outputs are all coordinates of the tool.
+
     Parameters
     ----------
     robot : Robot
@@ -117,6 +122,7 @@ def transform(
 
         - the model and the robot have different states or inputs;
         - a discrete-time model was read from a file;
+        - the robot has constraints, and `dt` is given or the point is no equilibrium at rest;
         - `dt` is out of range or not allowed for this tool.
     UnknownNameError
         If the tool is unknown.
@@ -135,7 +141,6 @@ def transform(
     """
     instance("lin", lin, LinearModel, "a fflin.LinearModel").require_unchanged()
     refuse_delayed(lin, f"the conversion to {tool}")
-    refuse_constraints(robot, f"the coordinates of {tool}")
     require_fit(lin, robot, StateMap(robot, frame=lin.frame))
     sampled = lin.dt
     whole = lin.generator
@@ -144,6 +149,13 @@ def transform(
         raise InputError(
             "the model is sampled; transform its continuous-time model instead"
         )
+    if robot.constraints:
+        if step:
+            raise InputError(
+                f"the steps of {tool} do not support constraints; leave out dt, and call "
+                "discretize of the linear model first"
+            )
+        return _constrained_model(robot, whole, tool, sampled)
     lin, (kind, source, to, rates) = whole, _jacobians_at(robot, whole, tool)
     A, B = transformed(source, to, lin.A, lin.B)
     (q, v), states = kind.vectors(lin.q, lin.v), kind.states()
@@ -196,6 +208,67 @@ def transform(
     )
 
 
+def _constrained_model(
+    robot: Robot, lin: LinearModel, tool: str, sampled: float
+) -> ToolModel:
+    """Return the model of a robot with constraints in the coordinates of a tool.
+
+    `lin` is in continuous time, and `sampled` is the sample time of the result [s], or 0.
+    """
+    require_rest(lin, tool)
+    at_rest = np.zeros(6 + robot.n)
+    kind, source, to = _jacobians_of(robot, lin, tool, at_rest)
+    rows, S, W, by_state = chosen(lin, kind, source, to)
+    back = np.linalg.inv(S)
+    to_inputs = np.linalg.inv(source.V)
+    B: Array = S @ lin.B @ to_inputs
+    A: Array = S @ lin.A @ back + B @ by_state @ back
+    B = B @ to.V
+    (q, v), states = kind.vectors(lin.q, lin.v), kind.states()
+    position: Array = np.zeros(len(v)) if kind.tangent else q
+    x0: Array = np.concatenate((position, v))
+    D = lin.D @ to_inputs
+    C: Array = (lin.C + D @ by_state) @ back
+    y0 = lin.y0
+    outputs = dict(zip(lin.output_names, lin.output_units, strict=True))
+    if lin.output_names == StateMap(robot, frame=lin.frame).names:
+        C = W @ back
+        y0 = x0
+        outputs = states
+    f0 = np.zeros(len(A))
+    if sampled:
+        A, B = held_exponential(A, B, sampled)
+    names, units = [*states], [*states.values()]
+    inputs = [(kind.actuation.names[i], kind.actuation.units[i]) for i in kind.inputs]
+    T_u = np.linalg.solve(to.V, source.V)
+    return ToolModel(
+        tool=tool,
+        robot=lin.robot,
+        reference="fixed",
+        verified=lin.verified,
+        state_names=tuple(names[row] for row in rows),
+        state_units=tuple(units[row] for row in rows),
+        input_names=tuple(name for name, _ in inputs),
+        input_units=tuple(unit for _, unit in inputs),
+        output_names=tuple(outputs),
+        output_units=tuple(outputs.values()),
+        A=A,
+        B=B,
+        C=C,
+        D=D @ to.V,
+        f0=f0,
+        x0=x0[rows],
+        u0=T_u @ lin.u0,
+        y0=y0,
+        dt=sampled,
+        T=S,
+        T_left=back,
+        T_u=T_u,
+        q=q,
+        v=v,
+    )
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class ToolGain(Design):
     """State feedback in another tool's coordinates, ``u = u0 - K (x - x0)``; see `Gain.to`.
@@ -229,8 +302,16 @@ def tool_gain(lin: LinearModel, K: Array, tool: str) -> ToolGain:
     """Convert the gain K of a model to a tool's coordinates, with the same closed-loop poles."""
     model = lin.to(tool)
     whole = lin.generator
-    assert whole is not None and lin._robot is not None
-    _, source, to, _ = _jacobians_at(lin._robot, whole, tool)
+    robot = lin._robot
+    assert whole is not None and robot is not None
+    if robot.constraints:
+        kind, source, to = _jacobians_of(robot, whole, tool, np.zeros(6 + robot.n))
+        by_state = chosen(whole, kind, source, to).by_state
+        turned: Array = np.linalg.solve(to.V, by_state) @ model.T_left
+        return ToolGain(
+            model.T_u @ K @ model.T_left + turned, model, verified=lin.verified
+        )
+    _, source, to, _ = _jacobians_at(robot, whole, tool)
     # The input axes of the tool may rotate relative to the input axes of the model. In this case,
     # an input that is constant in the model's axes varies with the attitude in the tool's axes
     # (15.4).
@@ -296,6 +377,7 @@ def from_tool(
     >>> bool(abs(back.B - lin.B).max() < 1e-13)
     True
     """
+    refuse_constraints(robot, f"models from {tool}")
     q, v = tool_coordinates(robot, tool).to_pinocchio(q, v)
     about = partial(
         linearize, robot, q, v, frame=frame, reference=reference, moving=moving
@@ -344,19 +426,33 @@ def _jacobians_at(
             "lin lacks some states of the robot; use the full model of the robot"
         )
     model_coordinates = ToolCoordinates(state, moving=lin.moving)
-    other_coordinates = tool_coordinates(robot, tool, moving=lin.moving)
     nu = state.velocities(lin.v)
-    u = model_coordinates.actuation.in_base_axes(state.chart(lin.q), lin.u0)
-    point = lin.q, nu, u
     dy = lin.drift
     if dy is None:
         # f0 = P dy/dt, and the accelerations do not affect the left inverse of P.
-        at_rest = model_coordinates.jacobians(*point, np.zeros_like(nu))
+        u = model_coordinates.actuation.in_base_axes(state.chart(lin.q), lin.u0)
+        at_rest = model_coordinates.jacobians(lin.q, nu, u, np.zeros_like(nu))
         dy = at_rest.left @ lin.f0
     acceleration = dy[len(nu) :]
-    from_y = model_coordinates.jacobians(*point, acceleration)
-    to_tool = other_coordinates.jacobians(*point, acceleration)
-    return other_coordinates, from_y, to_tool, np.append(nu, acceleration)
+    kind, from_y, to_tool = _jacobians_of(robot, lin, tool, acceleration)
+    return kind, from_y, to_tool, np.append(nu, acceleration)
+
+
+def _jacobians_of(
+    robot: Robot, lin: LinearModel, tool: str, acceleration: Array
+) -> tuple[ToolCoordinates, Jacobians, Jacobians]:
+    """Return the tool's coordinates, and the Jacobians of the model and of the tool.
+
+    The accelerations (6 + n,) are in base axes.
+    """
+    state = StateMap(robot, reference=lin.reference, frame=lin.frame)
+    model_coordinates = ToolCoordinates(state, moving=lin.moving)
+    other_coordinates = tool_coordinates(robot, tool, moving=lin.moving)
+    nu = state.velocities(lin.v)
+    u = model_coordinates.actuation.in_base_axes(state.chart(lin.q), lin.u0)
+    point = lin.q, nu, u, acceleration
+    from_y = model_coordinates.jacobians(*point)
+    return other_coordinates, from_y, other_coordinates.jacobians(*point)
 
 
 def transformed(

@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from fflin.base.errors import InputError
+from fflin.base.errors import InputError, listed, located
 from fflin.base.process import in_one_thread
-from fflin.base.validation import Array, ArrayLike, Complex
+from fflin.base.validation import Array, ArrayLike, Complex, Indices, Vector
 from fflin.dynamics.integrators import GAUSS, HEAVY, LIGHT, held_exponential
 from fflin.linear.check import Check, check_all
 from fflin.linear.fit import require_same
 from fflin.linear.linearization import Linearizer
 from fflin.linear.model import LinearModel, refuse_sampled
+from fflin.linear.partition import Partition, partition_of
 from fflin.linear.trajectory import Trajectory, intervals_of
 from fflin.robot.robot import Robot
 
@@ -58,6 +59,11 @@ class LinearTrajectory(Trajectory):
         Time [s] after which the motion and the models repeat; 0 if they do not repeat.
     multipliers : ndarray (nx,)
         Characteristic multipliers of a periodic motion.
+    switches : ndarray (S,)
+        Times [s] of knots at which the independent coordinates of a robot with constraints change.
+        From a switch on, the models are in the new coordinates.
+    switched_names : tuple of str
+        Names of dx after each switch, nx for each one.
     robot, t, q, v, u, hold, frame : see `Trajectory`
 
     Examples
@@ -79,13 +85,16 @@ class LinearTrajectory(Trajectory):
     input_names: tuple[str, ...]
     output_names: tuple[str, ...]
     dt: float = 0.0
+    switches: Vector = field(default_factory=partial(np.zeros, 0), kw_only=True)
+    switched_names: tuple[str, ...] = field(default=(), kw_only=True)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         made = "the linear trajectory was made for another robot"
         reduced = bool(self.robot.constraints)
         state = self._aba.state
-        require_same(made, state, "state", self.state_names, None, part=reduced)
+        for names in self.partition.names:
+            require_same(made, state, "state", names, None, part=reduced)
 
     @property
     def input_units(self) -> tuple[str, ...]:
@@ -99,8 +108,9 @@ class LinearTrajectory(Trajectory):
         """Return the linear model at the knot with the given index."""
         k = range(len(self))[index]
         t = float(self.t[k])
-        q, v = self._linearizer.on_constraints(self.q[k], self.v[k])
-        lin = self._linearizer(q, v, self.u_base[k], t=t)
+        linearizer: Linearizer = self._linearizers[self._parts[k]]
+        q, v = linearizer.on_constraints(self.q[k], self.v[k])
+        lin = linearizer(q, v, self.u_base[k], t=t)
         matrices = {name: getattr(self, name)[k] for name in "ABCD"}
         if self.dt:
             time = lin.t
@@ -119,36 +129,111 @@ class LinearTrajectory(Trajectory):
             remarks = [*remarks, f"{period}; {multiplier_text(self.multipliers)}"]
         if self.robot.orbit:
             remarks = [*remarks, str(self.robot.orbit)]
+        remarks += self.partition.remarks()
         return remarks
 
     @property
     def independent(self) -> tuple[str, ...] | None:
-        """Independent coordinates of a robot with constraints, as for `linearize`; None without."""
+        """Independent coordinates of a robot with constraints, as for `linearize`; None without.
+
+        They are the coordinates at the first knot.
+        """
         if not self.robot.constraints:
             return None
         return self.state_names[: len(self.state_names) // 2]
 
+    @property
+    def partition(self) -> Partition:
+        """Parts of the motion with the same independent coordinates."""
+        return Partition.of(self.switches, self.state_names, self.switched_names)
+
+    @property
+    def last_part(self) -> int:
+        """Index of the last part of the motion."""
+        return len(self.switches)
+
+    def knots_of(self, part: int) -> Vector:
+        """Return the times [s] of the knots of a part, from its first knot to its end."""
+        ends = np.append(self.switches, self.t[-1])
+        begins = np.append(self.t[0], self.switches)
+        within = (self.t >= begins[part]) & (self.t <= ends[part])
+        knots: Vector = self.t[within]
+        return knots
+
+    def refuse_switches(self, what: str) -> None:
+        """Raise `InputError` if the independent coordinates change; `what` is the feature."""
+        if len(self.switches):
+            raise InputError(
+                f"{what} need one choice of independent coordinates along the motion, but they "
+                f"change at t = {listed(f'{t:g}' for t in self.switches)} s; give independent= to "
+                "linearize_trajectory, or split the trajectory there"
+            )
+
     @cached_property
-    def _linearizer(self) -> Linearizer:
-        return Linearizer(self.robot, moving=True, independent=self.independent)
+    def _parts(self) -> Indices:
+        """Index (N,) of the part to which the model of each knot belongs."""
+        return self._parts_at(self.t)
+
+    def _parts_at(self, times: Array) -> Indices:
+        return self.partition.parts_at(times, float(self.t[-1] - self.t[0]))
+
+    @cached_property
+    def _linearizers(self) -> tuple[Linearizer, ...]:
+        """Linearizer of each part."""
+        if not self.robot.constraints:
+            return (Linearizer(self.robot, moving=True),)
+        half = len(self.state_names) // 2
+        return tuple(
+            Linearizer(self.robot, moving=True, independent=names[:half])
+            for names in self.partition.names
+        )
+
+    @cached_property
+    def switch_maps(self) -> Array:
+        """Maps (S, nx, nx) from the errors dx before each switch to the errors after it."""
+        maps = np.zeros((len(self.switches), *self.A.shape[1:]))
+        for part, t in enumerate(self.switches.tolist()):
+            maps[part] = self.error_maps(np.array([t]), part, part + 1)[0]
+        return maps
+
+    def error_maps(self, times: Array, part: int, to: int) -> Array:
+        """Return the maps (k, nx, nx) from the errors in one part's coordinates to another's.
+
+        The coordinates of `part` must determine the motion at the times (k,).
+        """
+        state = self._aba.state
+        rows = [state.names.index(name) for name in self.partition.names[to]]
+        linearizer = self._linearizers[part]
+        q, v, _ = self.points(times)
+        maps = np.zeros((len(times), len(rows), len(rows)))
+        for k, point in enumerate(zip(q, v, strict=True)):
+            closed = linearizer.on_constraints(*point)
+            maps[k] = linearizer.reduction(*closed, linearizer.independent).T[rows]
+        return maps
 
     def matrices(self, t: float) -> tuple[Array, Array]:
         """Return A (nx, nx) and B (nx, nu) about the motion at time t [s], also between knots."""
         A, B = self.matrices_at(np.array([self._within(t)]))
         return A[0], B[0]
 
-    def matrices_at(self, times: Array) -> tuple[Array, Array]:
-        """Return A (k, nx, nx) and B (k, nx, nu) at times (k,), with one matrix pair per time."""
+    def matrices_at(self, times: Array, part: int | None = None) -> tuple[Array, Array]:
+        """Return A (k, nx, nx) and B (k, nx, nu) at times (k,), with one matrix pair per time.
+
+        They are in the coordinates of the part with the given index, or of the part at each time.
+        """
         times = self._within_period(times)
         k, s = intervals_of(self.t, times)
         if self.dt:
             s = 0.0 * s
         inside, knot = (s > 0.0) & (s < 1.0), k + (s == 1.0)
         A, B = self.A[knot], self.B[knot]
-        if inside.any():
-            inner = times[inside]
-            models = self._linearizer.along(*self.points(inner), inner)
-            A[inside], B[inside] = models["A"], models["B"]
+        parts = self._parts_at(times) if part is None else np.full(len(times), part)
+        new = inside | (parts != self._parts[knot])
+        for index in np.unique(parts[new]).tolist():
+            rows = new & (parts == index)
+            inner = times[rows]
+            models = self._linearizers[index].along(*self.points(inner), inner)
+            A[rows], B[rows] = models["A"], models["B"]
         return A, B
 
     def between(self, t: float, *arrays: Array) -> tuple[Array, ...]:
@@ -228,7 +313,7 @@ class LinearTrajectory(Trajectory):
         """
         refuse_sampled(self.dt, "discretize")
         maps = np.array([transition for _, transition in transitions(self, dt)])
-        nx, models = len(self.state_names), along(self.resampled(dt), self.independent)
+        nx, models = len(self.state_names), along(self.resampled(dt), self.partition)
         return replace(models, A=maps[:, :nx, :nx], B=maps[:, :nx, nx:], dt=float(dt))
 
     def to(self, tool: str, *, dt: float | None = None) -> ToolTrajectory:
@@ -286,8 +371,9 @@ def linearize_trajectory(
         Whether to raise an error, instead of a warning, if the knots violate the robot's dynamics
         with a residual above 1e-2.
     independent : sequence of str, optional
-        Coordinates of the models of a robot with constraints, see `Linearizer`. By default, they
-        are chosen at the first knot. All models have the same coordinates.
+        Coordinates of the models of a robot with constraints, see `Linearizer`; the same along the
+        motion. By default, they are chosen at the first knot. Where another choice determines the
+        motion much better, they change, see `switches` of the result.
     **options
         The options `hold` and `frame` of `Trajectory`.
 
@@ -330,25 +416,69 @@ def linearize_trajectory(
         given: dict[str, Any] = {"t": t, "q": q, "v": v, "u": u, **options}
         motion = Trajectory(robot, **given)
     motion.require(strict=strict)
-    return along(motion, independent)
+    if independent is None:
+        return along(motion)
+    return along(motion, _partition(motion, independent))
 
 
-def along(
-    motion: Trajectory, independent: Sequence[str] | None = None
-) -> LinearTrajectory:
-    """Return the error dynamics of a trajectory, linearised about all knots."""
-    linearizer = Linearizer(motion.robot, moving=True, independent=independent)
-    fields: dict[str, Any] = linearizer.along(
-        motion.q, motion.v, motion.u_base, motion.t
+def along(motion: Trajectory, partition: Partition | None = None) -> LinearTrajectory:
+    """Return the error dynamics of a trajectory, linearised about all knots.
+
+    The coordinates of a robot with constraints are those of the partition, or are chosen.
+    """
+    robot = motion.robot
+    if partition is None:
+        partition = _partition(motion, robot.independent or None)
+    parts = partition.parts_at(motion.t, float(motion.t[-1] - motion.t[0]))
+    point = motion.q, motion.v, motion.u_base, motion.t
+    blocks = list[dict[str, Array]]()
+    for index, names in enumerate(partition.names):
+        rows = parts == index
+        independent = names[: len(names) // 2] if robot.constraints else None
+        linearizer = Linearizer(robot, moving=True, independent=independent)
+        blocks.append(linearizer.along(*(array[rows] for array in point)))
+        if robot.constraints:
+            linearizer.require_same_side(blocks[-1].pop("T"), motion.t[rows])
+    fields: dict[str, Any] = blocks[0]
+    if len(blocks) > 1:
+        fields = {
+            key: np.concatenate([block[key] for block in blocks]) for key in blocks[0]
+        }
+    fields["state_names"] = partition.names[0]
+    for key in ("input_names", "output_names"):
+        fields[key] = linearizer.prepared.common[key]
+    made = LinearTrajectory._of(
+        motion,
+        **fields,
+        dt=0.0,
+        switches=partition.times,
+        switched_names=partition.later,
     )
-    names = linearizer.prepared.common | linearizer.constrained_names
-    for key in ("state_names", "input_names", "output_names"):
-        fields[key] = names[key]
-    made = LinearTrajectory._of(motion, **fields, dt=0.0)
     for name in ("interval_errors", "cubics"):
         if name in vars(motion):  # keep cached results of the same motion
             vars(made)[name] = vars(motion)[name]
     return made
+
+
+def _partition(motion: Trajectory, independent: Sequence[str] | None) -> Partition:
+    """Return the parts of a motion; a single one if the coordinates are given.
+
+    Without constraints, all states are independent.
+    """
+    robot = motion.robot
+    linearizer = Linearizer(robot, moving=True, independent=independent)
+    names = linearizer.prepared.map.names
+    if not robot.constraints:
+        return Partition(np.zeros(0), (names,))
+    if independent is not None:
+        linearizer.along(motion.q[:1], motion.v[:1], motion.u_base[:1], motion.t[:1])
+        return Partition(np.zeros(0), (linearizer.constrained_names["state_names"],))
+    points = list[tuple[Array, Array]]()
+    for t, *point in zip(motion.t.tolist(), motion.q, motion.v, strict=True):
+        with located(f"at t = {t:g} s"):
+            points.append(linearizer.on_constraints(*point))
+    motions = [linearizer.motions(*point) for point in points]
+    return partition_of(motion.t, motions, names)
 
 
 # ACCURACY is the required relative accuracy of a sample's transition matrix. The integration steps
@@ -447,6 +577,7 @@ def _through(
         held_exponential(mixed[:, :nx, :nx], mixed[:, :nx, nx:], h), axis=-1
     )
     ends = np.cumsum([2 * len(times) for times in start])[:-1]
+    _change_coordinates(traj, np.concatenate([t[1:] for t in cuts]), maps, 2 * parts)
     columns = [np.split(array, ends) for array in (mixed, h, maps, heavy_light)]
     samples = list[tuple[Steps, Array]]()
     for row in zip(*columns, strict=True):
@@ -456,3 +587,18 @@ def _through(
             whole[:nx] = step @ whole
         samples.append((steps, whole[:nx]))
     return samples
+
+
+def _change_coordinates(
+    traj: LinearTrajectory, ends: Array, maps: Array, steps: int
+) -> None:
+    """Append the change of coordinates to the last step of each interval that ends at a switch.
+
+    `ends` (m,) are the times of the ends of the intervals, and `maps` (m steps, nx, nx + nu) are
+    the transition matrices of their steps.
+    """
+    near = 1e-9 * float(traj.t[-1] - traj.t[0])
+    for t, change in zip(traj.switches, traj.switch_maps, strict=True):
+        for interval in np.flatnonzero(np.abs(ends - t) <= near).tolist():
+            last = (interval + 1) * steps - 1
+            maps[last] = change @ maps[last]

@@ -21,7 +21,13 @@ from fflin.dynamics.rnea import AccelerationDerivatives, Accelerations, Turning
 from fflin.dynamics.state import Actuation, StateMap
 from fflin.linear.aba_route import inertia_matrix
 from fflin.linear.check import certify
-from fflin.linear.constrained import Reducer, reduced_fields
+from fflin.linear.constrained import (
+    Motions,
+    Reducer,
+    Reduction,
+    independent_states,
+    reduced_fields,
+)
 from fflin.linear.constrained_rest import RestSolver
 from fflin.linear.files import given
 from fflin.linear.model import LinearModel
@@ -407,6 +413,35 @@ class Linearizer:
         return make, (self.robot,)
 
     def _anywhere(self, q: Array, v: Array, u: Array, t: float) -> LinearModel:
+        ready = self.prepared
+        state = ready.map
+        chart, made = self._in_all_states(q, v, u, t)
+        time = {"t": t} if state.varying else {}
+        contact = self._accelerations.contact
+        if self._reducer is not None and contact is not None:
+            reduction = self._reducer.reduction(chart, q, state.velocities(v), contact)
+            names = self._reducer.names
+            if self._rest is not None and self._rest.waits:
+                self._rest.choose(reduction.kept, q, self._fields | names)
+            slow = dict(self._fields["_computed"])
+            slow["x0"] = partial(independent_states, slow["x0"], reduction.kept)
+            fields = {
+                **self._fields,
+                **made,
+                **names,
+                **reduced_fields(reduction, ready.rest | made, made.get("C")),
+                "_computed": slow,
+                "_inertia": partial(given, frozen(reduction.M)),
+            }
+            return LinearModel(fields, **time)
+        if state.varying:
+            return LinearModel(self._fields | made, t=t)
+        return LinearModel(self._fields | made)
+
+    def _in_all_states(
+        self, q: Array, v: Array, u: Array, t: float
+    ) -> tuple[Chart, dict[str, Array]]:
+        """Return the chart at a point, and the arrays of the model in all states of the robot."""
         ready, lower = self.prepared, self._lower
         state, actuation = ready.map, ready.actuation
         state.move_to(t)
@@ -449,22 +484,37 @@ class Linearizer:
         made = {"A": A, "B": B, "q": q, "v": v, "u0": u, self._rate: rate} | seen
         for array in made.values():
             array.setflags(write=False)
-        time = {"t": t} if state.varying else {}
-        contact = self._accelerations.contact
-        if self._reducer is not None and contact is not None:
-            whole = LinearModel(self._fields | made)
-            reduction = self._reducer.reduction(chart, q, v, nu, contact.space)
-            fields = reduced_fields(state, reduction, whole)
-            if self._rest is not None and self._rest.waits:
-                self._rest.choose(reduction.kept, q, self._fields | self._reducer.names)
-            return LinearModel(
-                {**self._fields, "_computed": {}, **made, **fields}
-                | {"_inertia": partial(given, frozen(reduction.M))},
-                **time,
-            )
-        if state.varying:
-            return LinearModel(self._fields | made, t=t)
-        return LinearModel(self._fields | made)
+        return chart, made
+
+    def tangent_along(self, q: Array, v: Array, u: Array) -> tuple[Array, Array]:
+        """Return A (N, nx, nx) and B (N, nx, nu) in all nx states, about N closed points.
+
+        A maps errors on the manifold of the constraints to their rates.
+        """
+        A = np.empty((len(q), *self.prepared.rest["A"].shape))
+        B = np.empty((len(q), *self._shape_B))
+        with self._lock:
+            for k, point in enumerate(zip(q, v, u, strict=True)):
+                _, made = self._in_all_states(*point, 0.0)
+                A[k], B[k] = made["A"], made["B"]
+        return A, B
+
+    def motions(self, q: Array, v: Array) -> Motions:
+        """Return the motions that the constraints permit at a closed point."""
+        assert self._closure is not None
+        with self._lock:
+            return Motions.at(self._closure, q, v)
+
+    def reduction(
+        self, q: Array, v: Array, independent: Sequence[str] | None = None
+    ) -> Reduction:
+        """Return the reduction to named coordinates at a closed point, by default the best ones."""
+        motions = self.motions(q, v)
+        if independent is None:
+            return motions.reduction(motions.best())
+        names = self.prepared.map.names
+        picked = np.array([names.index(name) for name in independent])
+        return motions.reduction(picked)
 
     def along(
         self, q: Array, v: Array, u: Array, t: Array | None = None
@@ -551,21 +601,18 @@ class Linearizer:
                 point = self.on_constraints(q[index], v[index])
                 with np.errstate(over="ignore", invalid="ignore"):
                     models.append(self._anywhere(*point, u[index], t))
-        self._require_same_side(models, times)
         arrays = {key: np.array([getattr(x, key) for x in models]) for key in "ABCD"}
-        return {**arrays, "y": np.array([model.y0 for model in models])}
+        maps = np.array([model._all_states for model in models])
+        return {**arrays, "y": np.array([model.y0 for model in models]), "T": maps}
 
-    def _require_same_side(self, models: Sequence[LinearModel], times: Array) -> None:
-        """Raise `ConstraintError` if the independent coordinates stop moving between two points.
+    def require_same_side(self, maps: Array, times: Array) -> None:
+        """Raise `ConstraintError` if the independent coordinates stop between two close points.
 
         There, the basis of the velocities that belongs to the coordinates becomes infinite, and
-        changes its orientation.
+        changes its orientation. `maps` (N, nx, 2 d) are the maps T of the points.
         """
-        bases = []
-        for model in models:
-            assert model._all_states is not None
-            nv, d = len(model._all_states) // 2, len(model.A) // 2
-            bases.append(model._all_states[nv:, d:])
+        nv, d = maps.shape[1] // 2, maps.shape[2] // 2
+        bases = maps[:, nv:, d:]
         for index, (before, after) in enumerate(pairwise(bases)):
             if np.linalg.slogdet(before.T @ after)[0] > 0.0:
                 continue

@@ -26,7 +26,6 @@ from fflin.dynamics.coordinates import (
     IN_REFERENCE_AXES,
     LINEAR,
     SMALLEST_Q0,
-    refuse_constraints,
     refuse_orbit,
 )
 from fflin.dynamics.state import Actuation, StateMap
@@ -394,7 +393,6 @@ def tool_coordinates(
         raise unknown("tool", tool, TOOLS)
     if tool[:5] != "euler":
         refuse_orbit(robot, f"the coordinates of {tool}")
-    refuse_constraints(robot, f"the coordinates of {tool}")
     return ToolCoordinates(StateMap(robot), tool, moving=moving)
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from fflin.base.errors import InputError
 from fflin.base.record import Design
 from fflin.base.validation import Array, Vector
+from fflin.dynamics.coordinates import refuse_constraints
 from fflin.dynamics.state import StateMap
 from fflin.linear.exchange import euler_step, step_of
 from fflin.linear.tool_coordinates import ToolCoordinates, tool_coordinates
@@ -120,6 +121,7 @@ class _Change:
     """Constant matrices from the errors of a moving reference to the tool's coordinates."""
 
     def __init__(self, robot: Robot, tool: str) -> None:
+        refuse_constraints(robot, f"trajectories in the coordinates of {tool}")
         self.kind = kind = tool_coordinates(robot, tool, moving=True)
         if tool not in ALONG:
             raise InputError(

@@ -47,6 +47,8 @@ _CAUSES = (
     "joints, or springs, damping or gravity that differ from the robot"
 )
 
+_MORE_KNOTS = "give more knots, with steps= of linearize_orbit or --periodic N"
+
 # The integration over an interval is repeated with halved steps. The repetition ends if the state
 # at the end of the interval changes by at most _ACCURACY, or if the interval has _MOST_STEPS steps.
 # The change of the state is relative: it is divided by the duration of the interval and by the
@@ -64,6 +66,10 @@ _SAME_FIELD = 1e-6
 # the sum of the magnitudes of the terms.
 _EPS = float(np.finfo(float).eps)
 _POSITION_ROUNDING, _SUM_ROUNDING = 16.0 * _EPS, 1e3 * _EPS
+
+# Rates [SI units] of a robot with constraints below this fraction of the largest rate count as
+# zero.
+_HELD = 1e-6
 
 # Largest difference [SI units] between the first and the last state of a periodic motion.
 _CLOSED = 1e-6
@@ -478,7 +484,8 @@ class Trajectory(Design):
                 error = "the integration overflows, and the errors of "
             return (
                 f"t, q, v, u are not a motion of {where} {error}{(missed > _MOTION).sum()} of "
-                f"{len(missed)} intervals exceed {_MOTION:g}; {_CAUSES}"
+                f"{len(missed)} intervals exceed {_MOTION:g}; "
+                f"{_MORE_KNOTS if self.period else _CAUSES}"
             )
         rates = np.linalg.norm(self.v[:, 3:6], axis=1)
         turns = np.diff(self.t) * np.maximum(rates[1:], rates[:-1])
@@ -624,9 +631,12 @@ class Trajectory(Design):
             # 1 rad.
             push = np.maximum(push, sums)
             speed = np.maximum(speed, push / self.robot.orbit.mean_motion)
+        # Constraints can hold the base or the joints, so that their rates are rounding errors.
+        least = _HELD if self.robot.constraints else 0.0
+        floors = [least * x.max() for x in (speed, push)]
         for group in ([0, 1, 2], [3, 4, 5], *([rotor] for rotor in alone), others):
-            for x in (speed, push):
-                x[group] = x[group].max(initial=0.0) or 1.0
+            for x, floor in zip((speed, push), floors, strict=True):
+                x[group] = max(x[group].max(initial=0.0), floor) or 1.0
 
         def size(of_q: Array, of_v: Array, h: float) -> float:
             miss = np.maximum(np.abs(of_q) - digits, 0.0) / (speed * h)

@@ -20,7 +20,7 @@ import pinocchio as pin
 
 from fflin.base.errors import InputError, require_known
 from fflin.base.names import stands_for_any
-from fflin.robot.disturbance import ORBITAL, plates_of, terms_of
+from fflin.robot.disturbance import MAGNETIC, ORBITAL, plates_of, terms_of
 from fflin.robot.equipment.appendages import Appendage, FlexibleAppendage, rigid_inertia
 from fflin.robot.equipment.assembly import (
     Mounted,
@@ -126,6 +126,14 @@ def _require_consistent(robot: RobotData) -> None:
             raise InputError(
                 f"disturbance 'plate' has a density, but '{robot.name}' is not in orbit; give "
                 "velocity, in inertial axes, or give the robot an orbit"
+            )
+    in_field = robot.orbit is not None and robot.orbit.field is not None
+    for name in robot.disturbance:
+        if name in MAGNETIC and not in_field:
+            raise InputError(
+                f"disturbance '{name}' needs a magnetic field, but '{robot.name}' has none; give "
+                "it an orbit with a field, such as CircularOrbit(500e3, inclination=1.7, "
+                "field='dipole')"
             )
     for name in robot.used_frames:
         find_frame(robot.model, name)

@@ -1,4 +1,7 @@
-"""Disturbances of the true system: torques and forces on the base that no control law knows."""
+"""Disturbances of the true system: torques and forces on the base that no control law knows.
+
+In a magnetic field, they include a residual magnetic dipole, and errors of the field model.
+"""
 
 from __future__ import annotations
 
@@ -76,7 +79,44 @@ class DisturbanceTerm:
 # Name of the flat plates in the field `disturbance`.
 PLATE = "plate"
 
-Disturbing: TypeAlias = DisturbanceTerm | FlatPlate
+# Names of the disturbances that need a magnetic field: a constant magnetic moment in base axes, and
+# the difference between the true field and the field of the orbit. The true field is the field of
+# the orbit, rotated by a rotation vector in the axes `lvlh` and multiplied by 1 + field_scale.
+RESIDUAL_DIPOLE = "residual_dipole"
+FIELD_SCALE = "field_scale"
+FIELD_ROTATION = "field_rotation"
+
+# {name: (number of values, unit, axes)}
+MAGNETIC = {
+    RESIDUAL_DIPOLE: (3, "A m^2", "base"),
+    FIELD_ROTATION: (3, "rad", "lvlh"),
+    FIELD_SCALE: (1, "", ""),
+}
+
+
+@dataclass(frozen=True)
+class MagneticTerm:
+    """Values of a residual dipole or of an error of the magnetic field.
+
+    Attributes
+    ----------
+    values : tuple of float
+        Three values of `RESIDUAL_DIPOLE` [A m^2] or `FIELD_ROTATION` [rad], or one value of
+        `FIELD_SCALE`.
+    """
+
+    values: tuple[float, ...]
+
+    def text(self, name: str, *, orbit: bool) -> str:
+        """Return the values as text, such as "0.01, 0, 0 A m^2 (base axes)"."""
+        _, unit, axes = MAGNETIC[name]
+        text = ", ".join(f"{x:.6g}" for x in self.values)
+        if axes:
+            text += f" {unit} ({axes} axes)"
+        return text
+
+
+Disturbing: TypeAlias = DisturbanceTerm | FlatPlate | MagneticTerm
 
 # Terms {name: terms} of the torque tau_b and the force F_b, and flat plates; their sum acts on the
 # base.
@@ -87,7 +127,8 @@ def checked_disturbance(given: object) -> dict[str, tuple[Disturbing, ...]]:
     """Return the field `disturbance` of a robot as {name: terms}; None or {} removes it.
 
     The value of a torque or force is three numbers, a table of `DisturbanceTerm`, or a list of
-    these. The value of "plate" is a table of `FlatPlate`, or a list of these.
+    these. The value of "plate" is a table of `FlatPlate`, or a list of these. The values of
+    `MAGNETIC` are three numbers or one number.
     """
     if given is None:
         return {}
@@ -95,7 +136,7 @@ def checked_disturbance(given: object) -> dict[str, tuple[Disturbing, ...]]:
         raise InputError(
             f"disturbance is {given!r}, expected a table such as {{'tau_b': [2e-5, 0, 0]}}"
         )
-    require_known("disturbance", given, (*UNITS, PLATE))
+    require_known("disturbance", given, (*UNITS, PLATE, *MAGNETIC))
     terms: dict[str, tuple[Disturbing, ...]] = {}
     for name, value in given.items():
         items: Sequence[object] = [value]
@@ -105,10 +146,25 @@ def checked_disturbance(given: object) -> dict[str, tuple[Disturbing, ...]]:
             label = f"disturbance '{name}'"
             terms[name] = tuple(checked_plate(label, item) for item in items)
             continue
+        if name in MAGNETIC:
+            terms[name] = (_magnetic_term(name, value),)
+            continue
         if isinstance(value, list | tuple) and any(map(_is_term, value)):
             items = value
         terms[name] = tuple(_term(f"disturbance '{name}'", item) for item in items)
     return terms
+
+
+def _magnetic_term(name: str, value: object) -> MagneticTerm:
+    """Return a checked term of `MAGNETIC` from its values."""
+    label = f"disturbance '{name}'"
+    if isinstance(value, tuple) and len(value) == 1:
+        value = value[0]
+    if isinstance(value, MagneticTerm):
+        return value
+    if name == FIELD_SCALE:
+        return MagneticTerm((number(label, value),))
+    return MagneticTerm(three_numbers(label, value))
 
 
 def _is_term(value: object) -> bool:
@@ -165,3 +221,11 @@ def terms_of(given: DisturbanceTerms) -> list[tuple[str, DisturbanceTerm]]:
 def plates_of(given: DisturbanceTerms) -> list[FlatPlate]:
     """Return the flat plates of a disturbance."""
     return [plate for plate in given.get(PLATE, ()) if isinstance(plate, FlatPlate)]
+
+
+def magnetic_values(given: DisturbanceTerms, name: str) -> tuple[float, ...]:
+    """Return the values of a term of `MAGNETIC`; zeros if the disturbance does not contain it."""
+    for term in given.get(name, ()):
+        if isinstance(term, MagneticTerm):
+            return term.values
+    return (0.0,) * MAGNETIC[name][0]

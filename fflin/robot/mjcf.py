@@ -53,19 +53,24 @@ def is_mjcf(document: bytes, path: Path) -> bool:
 
 def describe_mjcf(document: bytes, path: Path) -> Mjcf:
     """Read an MJCF file; `document` contains the bytes of the file at `path`."""
-    root = parse(document, str(path))
+    origin = str(path)
+    root = parse(document, origin)
+    if any(_all(root, "include")):
+        document = _with_includes(document, path)
+        origin = f"{path} with its included files"
+        root = parse(document, origin)
     if root.tag != "mujoco":
         raise root.error(
             "the root element is not <mujoco>; give a URDF or an MJCF file"
         )
     for element in root.iterate():
-        if element.tag in ("include", "attach", "replicate"):
+        if element.tag in ("attach", "replicate"):
             raise element.error(
                 f"<{element.tag}> is not supported; save the model as one file with MuJoCo's "
                 "mj_saveLastXML"
             )
     try:
-        model = _built(document, root, path)
+        model = _built(document, root, path, read=origin == str(path))
     except (RuntimeError, ValueError, IndexError) as error:
         raise UrdfError(
             f"{path}: Pinocchio cannot build the model: {' '.join(str(error).split())[:300]}"
@@ -95,13 +100,63 @@ def describe_mjcf(document: bytes, path: Path) -> Mjcf:
     return Mjcf(model, hashlib.sha256(document).hexdigest(), fields, notes)
 
 
-def _built(document: bytes, root: Element, path: Path) -> pin.Model:
-    """Return Pinocchio's model of the file.
+def _with_includes(document: bytes, path: Path) -> bytes:
+    """Return a document in which each <include> is replaced by the content of its file.
+
+    As in MuJoCo, the paths of files are relative to the folder of the main file, and no file is
+    included twice.
+    """
+    from xml.etree import ElementTree
+
+    included = {path.resolve()}
+
+    def read(element: ElementTree.Element, origin: Path) -> ElementTree.Element:
+        name = element.get("file", "")
+        file = path.parent / name
+        if not name:
+            raise UrdfError(f"{origin}: <include> has no attribute file")
+        if file.resolve() in included:
+            raise UrdfError(f"{origin}: <include> includes the file '{name}' twice")
+        included.add(file.resolve())
+        try:
+            content = file.read_bytes()
+        except OSError as error:
+            raise UrdfError(
+                f"{origin}: <include> names the file '{name}', which cannot be read: "
+                f"{error.strerror}"
+            ) from None
+        parse(content, str(file))  # raises an error with the line
+        root = ElementTree.fromstring(content)
+        expand(root, file)
+        return root
+
+    def expand(parent: ElementTree.Element, origin: Path) -> None:
+        children = list[ElementTree.Element]()
+        for child in parent:
+            if child.tag == "include":
+                children += read(child, origin)
+            else:
+                expand(child, origin)
+                children.append(child)
+        parent[:] = children
+
+    root = ElementTree.fromstring(document)
+    expand(root, path)
+    for compiler in root.iter("compiler"):
+        for key in ("meshdir", "assetdir"):
+            if key in compiler.attrib:
+                compiler.set(key, str(path.parent.resolve() / compiler.attrib[key]))
+    expanded: bytes = ElementTree.tostring(root, encoding="utf-8")
+    return expanded
+
+
+def _built(document: bytes, root: Element, path: Path, *, read: bool) -> pin.Model:
+    """Return Pinocchio's model of the document, which is the content of the file if `read`.
 
     Pinocchio reads only the first body of <worldbody>. Several bodies are put into one body.
     """
     bodies = [x for x in _children(root, "worldbody") if x.tag == "body"]
-    if len(bodies) < 2:
+    if len(bodies) < 2 and read:
         return pin.buildModelFromMJCF(str(path))
     for body in bodies:
         for child in body.children:
@@ -110,15 +165,22 @@ def _built(document: bytes, root: Element, path: Path) -> pin.Model:
                     "a free joint in a file with several bodies in <worldbody>; a robot has one "
                     "free body, so remove the other ones"
                 )
-    from tempfile import TemporaryDirectory
-
+    if len(bodies) < 2:
+        return _built_elsewhere(document, path)
     first = document.index(b"<body", document.index(b"<worldbody"))
     last = document.rindex(b"</worldbody")
     parts = (document[:first], document[first:last], document[last:])
+    return _built_elsewhere(b'%s<body name="base">%s</body>%s' % parts, path)
+
+
+def _built_elsewhere(document: bytes, path: Path) -> pin.Model:
+    """Return Pinocchio's model of a document that is not the content of the file at `path`."""
+    from tempfile import TemporaryDirectory
+
     with TemporaryDirectory() as folder:
-        wrapped = Path(folder, path.name)
-        wrapped.write_bytes(b'%s<body name="base">%s</body>%s' % parts)
-        return pin.buildModelFromMJCF(str(wrapped))
+        file = Path(folder, path.name)
+        file.write_bytes(document)
+        return pin.buildModelFromMJCF(str(file))
 
 
 def _gravity(root: Element) -> tuple[float, ...]:

@@ -174,7 +174,16 @@ class Robot(RobotData):
               base axes, and the force in inertial axes, or in orbital axes in orbit. In orbit,
               inertial axes are parallel to the orbital axes at t = 0.
 
-            A list of such mappings is their sum. The key ``plate`` is a mapping, or a list of
+            A list of such mappings is their sum. In orbit with a magnetic field, further keys are
+
+            - ``residual_dipole`` (3,) [A m^2]: a magnetic moment m in base axes, which exerts the
+              torque m x b on the base;
+            - ``field_scale`` and ``field_rotation`` (3,) [rad]: the true field is the field of the
+              orbit, rotated by a rotation vector in the axes ``lvlh`` and multiplied by
+              1 + field_scale. It acts on magnetorquers and on the residual dipole, and `BDot` and
+              `RateDamping` measure it. An `Allocation` knows only the field of the orbit.
+
+            The key ``plate`` is a mapping, or a list of
             mappings, of flat plates on which drag and solar pressure act, see (11.7) and (11.8):
 
             - ``area`` [m^2], ``normal`` (3,) and ``position`` (3,) [m] of the centre of pressure,

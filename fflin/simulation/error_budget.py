@@ -44,7 +44,12 @@ from fflin.dynamics.disturbance import phasors_of
 from fflin.dynamics.state import StateMap
 from fflin.dynamics.state_rows import attitude_rotations
 from fflin.linear.model import LinearModel
-from fflin.robot.disturbance import BASE, plates_of
+from fflin.robot.disturbance import (
+    BASE,
+    RESIDUAL_DIPOLE,
+    magnetic_values,
+    plates_of,
+)
 from fflin.robot.inputs import BaseForce, BaseTorque, Input
 from fflin.robot.joints import ROOT
 from fflin.simulation.motion import Motion
@@ -461,7 +466,38 @@ def _disturbances(
             value = state.rotation(lin.q) @ value
         key = name, rate
         total[key] = total.get(key, np.zeros(3, complex)) + value
+    for rate, torque in _residual_torques(robot, state, attitude).items():
+        value = torque
+        if axes[BaseTorque.GROUP]:
+            value = state.rotation(lin.q) @ torque
+        key = BaseTorque.GROUP, rate
+        total[key] = total.get(key, np.zeros(3, complex)) + value
     return total
+
+
+def _residual_torques(
+    robot: Robot, state: StateMap, attitude: Array
+) -> dict[float, Values]:
+    """Return {rate [rad/s]: phasor (3,) [N m]} of the torque on the residual dipole, in base axes.
+
+    The columns of `attitude` (3, 3) are the base axes in the axes of the orbital frame.
+    """
+    dipole = np.array(magnetic_values(robot.disturbance, RESIDUAL_DIPOLE))
+    if not dipole.any():
+        return {}
+    assert state.field is not None
+    assert state.field.magnetic is not None
+    phasors = state.field.magnetic.phasors()
+    if phasors is None:
+        warnings.warn(
+            f"'{robot.name}' has a residual dipole, whose torque the error budget contains only in "
+            "a circular orbit with field='dipole'; give its largest torque as "
+            "disturbance={'tau_b': ...}",
+            FflinWarning,
+            stacklevel=4,
+        )
+        return {}
+    return {rate: np.cross(dipole, flux @ attitude) for rate, flux in phasors.items()}
 
 
 def _variance(part: Contribution) -> Array:

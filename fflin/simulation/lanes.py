@@ -6,7 +6,7 @@ last run.
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from typing import TypeAlias
 
@@ -22,7 +22,7 @@ from fflin.control.loops import Loop, Sample, measured_at
 from fflin.control.policy import BDotForm, Form, OutputForm, PathForm, Policy, StateForm
 from fflin.control.sensor_errors import drift_generator, noise_generator
 from fflin.control.tracking import AT_THE_END, TrajectoryFeedback
-from fflin.dynamics.disturbance import Wave, waves_of
+from fflin.dynamics.disturbance import Wave, distortion, waves_of
 from fflin.dynamics.magnetic import MagneticField
 from fflin.dynamics.orbital import mean_motion
 from fflin.dynamics.state import StateMap
@@ -61,6 +61,9 @@ _MEMORY = 2**22  # [bytes] memory for recorded rows
 # Name, in `Runs`, of the vectors of `disturbances_of` with dispersed constants.
 DISTURBANCE = "disturbance"
 
+# Names, in `Runs`, of the residual dipoles and of the matrices that distort the magnetic field.
+RESIDUAL, DISTORTION = "residual", "distortion"
+
 # {name of an array of the loop: values (N, size), one row per run}; see `Dispersions.in_lanes`.
 Runs: TypeAlias = Mapping[str, Array]
 
@@ -86,7 +89,7 @@ def loop_name(plan: Plan, *, lanes: int) -> str:
     if is_extended(plan):
         name += "_extended"
     if plan.plant.constrained is not None:
-        return f"{name}_constrained"
+        name += "_constrained"
     return f"{name}_in_orbit" if plan.plant.field else name
 
 
@@ -241,7 +244,7 @@ class LaneLoop:
             # `stop.sign` is the sign of q0 at the start of the plan, or 0 if q0 is not checked. The
             # initial quaternions of dispersed runs have a positive q0.
             stop = stop._replace(sign=[abs(stop.sign[0])])
-        parts = packed(plan, stop, noisy="seed" in runs, dispersed=DISTURBANCE in runs)
+        parts = packed(plan, stop, noisy="seed" in runs, dispersed={*runs})
         self._plan = plan
         self._state = plan.plant.state
         self._ending = ending_of(plan, stop)
@@ -302,6 +305,8 @@ class LaneLoop:
             **robot.tree._asdict(),
             **robot.faults._asdict(),
             DISTURBANCE: robot.disturbance.vector,
+            RESIDUAL: self.parts.orbit.residual,
+            DISTORTION: self.parts.orbit.distortion,
             **plates,
         }
 
@@ -582,24 +587,24 @@ def packed(
     stop: loop.StopConditions,
     *,
     noisy: bool = False,
-    dispersed: bool = False,
+    dispersed: Collection[str] = (),
 ) -> loop.Arguments:
     """Return the arguments of `kernel.loop.advance` for a plan that the kernel supports.
 
     `stop.squares` (nv,) must contain the squared limits of the entries of v. If `noisy` is true,
-    the law stores the noise of SLOTS samples, even if the policy defines no noise. `dispersed` is
-    the argument of `mechanics_of`.
+    the law stores the noise of SLOTS samples, even if the policy defines no noise. `dispersed`
+    contains the names of the arrays that differ between the runs.
     """
     plant, times, method, u = plan.plant, plan.times, plan.method, plan.initial
     h, state = times.dt, plant.state
     size, (shift, speed) = 6 + state.robot.n, method.step_weights(h)
-    mechanics = mechanics_of(plant, dispersed=dispersed)
+    mechanics = mechanics_of(plant, dispersed=DISTURBANCE in dispersed)
     # The delay line needs no space for commands that arrive after the end of the run.
     delays = [min(delay, times.steps) for delay in times.delays]
     channel = channel_of(plan.limits, u, times.sample, delays)
     return loop.Arguments(
         robot=mechanics,
-        orbit=orbit_of(plant),
+        orbit=orbit_of(plant, dispersed=RESIDUAL in dispersed),
         method=loop.Method(
             h=h,
             origin=method.origins,
@@ -675,8 +680,11 @@ def mechanics_of(plant: Plant, *, dispersed: bool = False) -> forward.Mechanics:
     )
 
 
-def orbit_of(plant: Plant) -> orbit.Orbit:
-    """Return the kernel's parameters of the orbit of a plant; empty without an orbit."""
+def orbit_of(plant: Plant, *, dispersed: bool = False) -> orbit.Orbit:
+    """Return the kernel's parameters of the orbit of a plant; empty without an orbit.
+
+    `dispersed` states whether the residual dipole and the errors of the field differ between runs.
+    """
     none: orbit.Orbit = empty(orbit.ORBIT)
     field = plant.field
     path = plant.robot.orbit
@@ -695,7 +703,13 @@ def orbit_of(plant: Plant) -> orbit.Orbit:
     pole: Array = np.zeros(0)
     if field.magnetic is not None:
         dipole, pole = _dipole_of(field.magnetic, path.inclination, distance)
+    residual = plant.on_base.dipole
+    matrix = distortion(plant.robot, field)
+    if matrix is None and dispersed:
+        matrix = np.eye(3)
     return none._replace(
+        distortion=np.zeros(0) if matrix is None else matrix.ravel("F"),
+        residual=residual if dispersed or residual.any() else np.zeros(0),
         outwards=field.axes[:, 0],
         normal=field.axes[:, 2],
         mean_motion=[mean_motion(plant.robot)],

@@ -14,7 +14,8 @@ from fflin.base.names import by_name
 from fflin.base.validation import Array, ArrayLike, as_double, dimension, number, vector
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.coordinates import ANGULAR, LINEAR, forces_of
-from fflin.dynamics.disturbance import BaseDisturbance
+from fflin.dynamics.disturbance import BaseDisturbance, true_field
+from fflin.dynamics.magnetic import DistortedField
 from fflin.dynamics.state import StateMap
 from fflin.kernel.forward import ActuatorFaults, apply_faults
 from fflin.robot.inputs import lags_of
@@ -61,6 +62,10 @@ class Plant(Aba):
         self.disturbance = disturbance
         # Constraints of the robot, or None; written by `constrain`.
         self.constrained: Constrained | None = None
+        if state.field and state.field.magnetic:
+            field = true_field(robot, state.field)
+            if isinstance(field, DistortedField):
+                self.actuation.true_field = field
         # Disturbances of the robot itself.
         self.on_base = BaseDisturbance(robot, state.field)
         # Whether the warning about a disturbance given as an array was already issued.

@@ -17,11 +17,13 @@ from fflin.base.validation import (
     Array,
     as_double,
     function,
+    instance,
     positive,
     printable,
     truth,
     whole,
 )
+from fflin.control.linear_controller import LinearController
 from fflin.tuning.law import (
     Law,
     Matrices,
@@ -35,6 +37,7 @@ from fflin.tuning.law import (
 )
 from fflin.tuning.parameters import Given, Parameter, resolved
 from fflin.tuning.plant import Signals
+from fflin.tuning.state_space_start import tridiagonal_gain
 
 # Signals: a name, group or pattern, or several.
 Names: TypeAlias = str | Sequence[str]
@@ -959,11 +962,14 @@ class StateSpaceLaw(Structure):
         Frequency [rad/s] that scales A.
     name : str, optional
         First part of the names of the parameters.
+    start : LinearController, optional
+        Law of this order with which the first start begins, such as ``hinf(..).reduced(order)``.
 
     Raises
     ------
     InputError
-        If a name is unknown, or a number is invalid.
+        If a name is unknown, a number is invalid, or `start` has another order, measures other
+        outputs or has nearly dependent eigenvectors.
 
     Examples
     --------
@@ -976,12 +982,21 @@ class StateSpaceLaw(Structure):
     feedthrough: bool = True
     bandwidth: float = 1.0
     name: str = ""
+    start: LinearController | None = None
 
     def __post_init__(self) -> None:
         whole("order", self.order, 0)
         truth("feedthrough", self.feedthrough)
         positive("bandwidth", self.bandwidth, "rad/s")
         _require_name(self.name)
+        if self.start is None:
+            return
+        instance("start", self.start, LinearController, "a fflin.LinearController")
+        order = len(self.start.system.A)
+        if order != self.order:
+            raise InputError(
+                f"start has {order} states, but order is {self.order}; give a start of this order"
+            )
 
     def element(self, signals: Signals) -> Element:
         """Return the part of a law for the signals of a plant."""
@@ -1031,6 +1046,11 @@ class StateSpaceLaw(Structure):
         changes = np.zeros((len(places), *shape))
         for change, place in zip(changes, places, strict=True):
             change[place] = 1.0
+        if self.start is not None:
+            sizes = w * of_outputs, of_inputs
+            gain = tridiagonal_gain(self.start, measured, inputs, sizes)
+            for index, place in enumerate(places):
+                parameters[index] = replace(parameters[index], value=float(gain[place]))
 
         def law(values: Array, width: int) -> Law:
             gain = np.tensordot(values, changes, 1)
@@ -1050,12 +1070,16 @@ class StateSpaceLaw(Structure):
                     values[index] = gain[row, column]
             return values
 
-        start_of = of_gain if self.feedthrough else None
+        has_gain = self.feedthrough and self.start is None
+        start_of = of_gain if has_gain else None
         return Element(tuple(parameters), measured, inputs, law, start_of)
 
     def simpler(self) -> Structure | None:
-        """Return a law with one state less; a law needs a state or a feedthrough."""
-        if self.order > (0 if self.feedthrough else 1):
+        """Return a law with one state less; a law needs a state or a feedthrough.
+
+        A law with a given start has no simpler law.
+        """
+        if self.start is None and self.order > (0 if self.feedthrough else 1):
             return replace(self, order=self.order - 1)
         return None
 

@@ -29,6 +29,9 @@ _INSIDE = 5
 # Steps of a search for a scaling, and how often an interval is halved until the bound is raised.
 _STEPS, _HALVINGS = 60, 4
 
+# Largest number of searches without a scaling.
+_FAILURES = 60
+
 # Factors by which a bound is raised at first and later, and the largest ratio to the given level.
 _FIRST, _RAISE, _LARGEST = (1.001, 1.01, 1.02, 1.05), 1.1, 20.0
 
@@ -72,14 +75,15 @@ def gain_bound(channels: Channels, rates: Array, level: float) -> float:
     Returns
     -------
     float
-        Bound; infinite if no bound below 20 times `level` was found. Each interval of frequencies
-        is examined at five frequencies.
+        Bound; infinite if no bound below 20 times `level` was found in a limited number of
+        searches. Each interval of frequencies is examined at five frequencies.
     """
     edges = [0.0, *np.unique(rates[rates > 0.0]).tolist(), math.inf]
     waiting = [(a, b, 0) for a, b in pairwise(edges)][::-1]
     known: Scaling | None = None
     bound = level
     raises = list(_FIRST)
+    failures = 0
     while waiting:
         a, b, halved = waiting.pop()
         responses = _within(channels, a, b)
@@ -87,6 +91,9 @@ def gain_bound(channels: Channels, rates: Array, level: float) -> float:
         if holds:
             known = scaling
             continue
+        failures += 1
+        if failures > _FAILURES:
+            return math.inf
         if halved < _HALVINGS and math.isfinite(b):
             middle = 0.5 * (a + b)
             waiting += [(middle, b, halved + 1), (a, middle, halved + 1)]
@@ -154,12 +161,15 @@ def _with_groups(log_d: Array, channels: Channels) -> Array:
 
 def _largest(M: Values, scaling: Scaling) -> tuple[float, Array, Array]:
     """Return the largest eigenvalue for a scaling, and its derivatives by log d and h."""
-    d, h = np.exp(scaling.log_d), scaling.h
-    X = d[:, None] * M / d
-    turned = h[:, None] * X
-    form = X.conj().mT @ X + 1j * (turned - turned.conj().mT)
+    h = scaling.h
+    ratios = scaling.log_d[:, None] - scaling.log_d
+    # A step of the line search can be too long.
+    with np.errstate(all="ignore"):
+        X = np.exp(ratios) * M
+        turned = h[:, None] * X
+        form = X.conj().mT @ X + 1j * (turned - turned.conj().mT)
     if not np.isfinite(form).all():
-        return math.inf, np.zeros(len(d)), np.zeros(len(d))
+        return math.inf, np.zeros(len(h)), np.zeros(len(h))
     sizes, vectors = np.linalg.eigh(form)
     at = int(sizes[:, -1].argmax())
     X, v = X[at], vectors[at][:, -1]

@@ -73,9 +73,11 @@ class HeldForces:
 
     def turning(self, forces: Array) -> Array:
         """Return the derivative (6 + n, 6 + n) of J^T times forces (r,), due to rotations alone."""
-        constraints = self._closure.constraints
-        by_q = constraints.force_by_q(self._q, self._of_all_rows(forces))
-        return self._state.project(by_q)
+        still = np.zeros(self._state.robot.nv)
+        derivatives = self._closure.constraints.derivatives(
+            self._q, still, still, self._of_all_rows(forces)
+        )
+        return self._state.project(derivatives.force_by_q)
 
     def by_row_rates(self, c: Array) -> Array:
         """Return derivatives (6 + n + r, 6 + n) by q, because J depends on q.

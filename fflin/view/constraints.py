@@ -1,4 +1,4 @@
-"""Marks of a robot's constraints on the page, and the forces that the constraints exert."""
+"""Marks of a robot's constraints on the page, and their forces and torques."""
 
 from __future__ import annotations
 
@@ -18,12 +18,13 @@ from fflin.simulation.motion import Motion
 
 
 class Reaction(NamedTuple):
-    """Force of a constraint on its `frame` at N frames of an animation."""
+    """Force and torque of a constraint on its `frame` at N frames of an animation."""
 
     constraint: Constraint
     active: Array  # (N,): 1 if the robot has the constraint, 0 otherwise
     point: Array  # (N, 3) [m] origin of the frame in the world
     force: Array  # (N, 3) [N] in world axes
+    torque: Array  # (N, 3) [N m] about the origin of the frame, in world axes
 
 
 def constraint_marks(
@@ -70,20 +71,20 @@ def reactions(robot: Robot, motion: Motion, shown: Array) -> list[Reaction]:
         data = part_robot.create_data()
         for item in part_robot.constraints:
             if item.title not in reactions:
-                active, point, force = (
-                    np.zeros(len(shown)),
-                    *np.zeros((2, len(shown), 3)),
-                )
-                reactions[item.title] = Reaction(item, active, point, force)
+                active = np.zeros(len(shown))
+                vectors = np.zeros((3, len(shown), 3))
+                reactions[item.title] = Reaction(item, active, *vectors)
             reaction = reactions[item.title]
             reaction.active[rows] = 1.0
-            forces = _forces_of(item, motion)[shown[rows]]
-            for row, force in zip(rows, forces, strict=True):
+            forces = _recorded("force", item, motion)[shown[rows]]
+            torques = _recorded("torque", item, motion)[shown[rows]]
+            for row, force, torque in zip(rows, forces, torques, strict=True):
                 q = part.q[shown[row] - first]
                 pin.framesForwardKinematics(part_robot.model, data, q)
                 reaction.point[row] = _pose(part_robot, data, item.frame).translation
                 axes = _axes(part_robot, data, item)
                 reaction.force[row] = axes @ force
+                reaction.torque[row] = axes @ torque
     return list(reactions.values())
 
 
@@ -98,15 +99,18 @@ def _parts(robot: Robot, motion: Motion) -> Iterator[tuple[Robot, Motion, int]]:
         first += len(part.t)
 
 
-def _forces_of(item: Constraint, motion: Motion) -> Array:
-    """Return the force (N, 3) [N] of a constraint in its own axes; zero if it is not recorded."""
+def _recorded(kind: str, item: Constraint, motion: Motion) -> Array:
+    """Return the "force" or "torque" (N, 3) of a constraint in the axes of its placement.
+
+    It is zero if it is not recorded.
+    """
     names = list(motion.constraint_names)
-    forces = np.zeros((len(motion.t), 3))
+    vectors = np.zeros((len(motion.t), 3))
     for column, axis in enumerate("xyz"):
-        name = f"{item.title}.force.{axis}"
+        name = f"{item.title}.{kind}.{axis}"
         if name in names:
-            forces[:, column] = motion.constraint_forces[:, names.index(name)]
-    return forces
+            vectors[:, column] = motion.constraint_forces[:, names.index(name)]
+    return vectors
 
 
 def _pose(robot: Robot, data: pin.Data, name: str) -> pin.SE3:

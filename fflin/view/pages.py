@@ -332,9 +332,10 @@ def _magnetic(
 
 
 def _constraints(page: Page, items: Sequence[Reaction]) -> dict[str, object]:
-    """Return the marks of constraints, with the frames in which they act, and their force arrows.
+    """Return the marks of constraints, with the frames in which they act, and their arrows.
 
-    The forces of all constraints have one scale. Forces that never exceed THERE have no arrow.
+    The forces of all constraints have one scale, and so have their torques. Forces and torques that
+    never exceed THERE have no arrow.
     """
     active = {item.constraint.title: item.active for item in items}
     found = [item.constraint for item in items]
@@ -345,15 +346,25 @@ def _constraints(page: Page, items: Sequence[Reaction]) -> dict[str, object]:
     return {
         "constraints": marked,
         "reactions": [
-            {
-                "name": item.constraint.title,
-                "longest": REACTION * page.size,
-                "points": packed(item.point),
-                "values": packed(item.force),
-            }
+            _arrow(page, item, item.force)
             for item in items
             if _strongest(item.force) > THERE
         ],
+        "couples": [
+            _arrow(page, item, item.torque)
+            for item in items
+            if _strongest(item.torque) > THERE
+        ],
+    }
+
+
+def _arrow(page: Page, item: Reaction, values: Array) -> dict[str, object]:
+    """Return the arrow of the forces or torques (N, 3) of a constraint."""
+    return {
+        "name": item.constraint.title,
+        "longest": REACTION * page.size,
+        "points": packed(item.point),
+        "values": packed(values),
     }
 
 

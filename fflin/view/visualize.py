@@ -69,7 +69,7 @@ def visualize(
     - arrows for force and torque on the base, with their scale in the legend;
     - thrusters, with plumes whose lengths are proportional to u(t), and wheels at their frames;
     - constraints, as a bolt for a weld, a ring for a hinge and a ball for a spherical constraint,
-      while they act, and arrows for their forces, which have one scale;
+      while they act, and arrows for their forces and torques, each with one scale;
     - a translucent robot at the target, and the contour of the robot at the linear prediction.
       Both are shown only if they are more than 3 pixels away from the robot;
     - a time slider, camera views, and a panel with charts of errors and inputs over time. Angles

@@ -32,10 +32,3 @@ def test_draws_that_cannot_be_closed_are_refused():
     robot, q, v = dual_arm()
     with pytest.raises(fflin.InputError, match="smaller dispersion"):
         fflin.monte_carlo(robot, None, {"q_m": [3.0]}, q0=q, v0=v, **OPTIONS)
-
-
-def test_ranges_of_validity_are_refused():
-    robot, q, _ = dual_arm()
-    lin = fflin.linearize(robot, q)
-    with pytest.raises(fflin.InputError, match=r"not support constraints.*grip"):
-        fflin.validity(robot, lin, fflin.lqr(lin), samples=4)

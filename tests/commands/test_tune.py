@@ -125,3 +125,13 @@ def test_wrong_entries_are_refused_in_one_line(satellite):
     assert "velocities" in refused(
         "tune", satellite, "--vary", "*.density=0.1", "--velocity", "omega_b.x=0.1"
     )
+
+
+@pytest.mark.exhaustive
+def test_the_report_says_that_thrusters_produce_the_torque_of_the_law():
+    command = ["tune", "inspector", "--output", "base", "--starts", "1", "--goal"]
+    options = ["margin disk=0.5", "--law", "pd shared=true", "--inputs", "inspector"]
+    _, text, _ = run(*command, *options)
+    assert "fflin.Allocation" in text
+    _, text, _ = run(*command, *options[:3], "--inputs", "base")
+    assert "fflin.Allocation" not in text

@@ -5,9 +5,11 @@ import pytest
 from scipy.linalg import block_diag, solve_continuous_are, solve_discrete_are
 
 import fflin
+from fflin.control.mean_field import mean_model
 from fflin.control.optimal import differential_riccati as riccati
 from fflin.control.optimal import periodic_riccati
 from fflin.control.tvlqr import held_stages, loop_multipliers
+from fflin.robot.orbit import DIPOLES
 from tests.support.orbits import in_ellipse, in_orbit
 from tests.support.robots import free_body
 
@@ -93,6 +95,16 @@ def test_constant_models_give_the_solution_of_the_algebraic_equation(sampled):
         expected = solve_discrete_are(lin.A, lin.B, Qd, Rd, s=N)
     for P in schedule.P[:: len(schedule.P) // 4]:
         assert apart(P, expected) < 1e-9
+
+
+@pytest.mark.exhaustive
+def test_few_knots_give_the_continuous_solution_of_a_fast_loop():
+    satellite = fflin.load("cubesat_magnetic").replace(weights={})
+    costs = [
+        fflin.tvlqr(fflin.linearize_orbit(satellite, steps=n), Qf="periodic").P[0]
+        for n in (16, 64)
+    ]
+    assert apart(*costs) < 1e-3
 
 
 @pytest.mark.exhaustive
@@ -190,6 +202,60 @@ def test_default_weights_follow_from_limits_as_for_lqr():
     default = fflin.tvlqr(along, Qf="periodic", sample=along.period / 400)
     assert "from mass and size" in default.weights
     assert default.loop_multipliers[0] < 1e-6
+
+
+def magnetic(latitude, limits=(0.2, 0.2, 0.2)):
+    """Linear models of a magnetic satellite with a given argument of latitude at t = 0."""
+    orbit = fflin.CircularOrbit(
+        500e3, inclination=1.2, field="dipole", argument_of_latitude=latitude
+    )
+    rods = [
+        fflin.Magnetorquer(axis, max=limit)
+        for axis, limit in zip(np.eye(3), limits, strict=True)
+    ]
+    robot = fflin.load("cubesat", orbit=orbit, inputs=rods)
+    return fflin.linearize_orbit(robot, steps=8)
+
+
+def test_magnetorquers_have_the_mean_effect_of_the_field_over_one_period():
+    """With unit moments, the mean of the squared torque about an axis is that of |b|^2 - b_i^2."""
+    models = magnetic(0.3)
+    lin = mean_model(models)
+    s, c = np.sin(1.2), np.cos(1.2)
+    a = DIPOLES["earth"] / models.robot.orbit.radius**3
+    # squares of b = a (s cos u, -c, 2 s sin u) over one orbit
+    squares = a**2 * np.array([0.5 * s**2, c**2, 2.0 * s**2])
+    expected = np.diag(np.sqrt(squares.sum() - squares))
+    torque = lin.M[:3, :3] @ lin.B[6:9]
+    assert np.abs(torque - expected).max() < 1e-12 * a
+    assert np.array_equal(lin.A, models[0].A)
+
+
+def test_limits_weight_the_mean_effect_of_magnetorquers():
+    limits = np.array([0.1, 0.2, 0.3])
+    models = magnetic(0.3, limits)
+    lin = mean_model(models)
+    effect = sum((B * limits) @ (B * limits).T for B in models.B[:-1]) / 8
+    result = (lin.B * limits) @ (lin.B * limits).T
+    assert np.abs(result - effect).max() < 1e-13 * np.abs(effect).max()
+
+
+@pytest.mark.exhaustive
+def test_default_weights_of_magnetorquers_do_not_depend_on_the_start():
+    laws = []
+    for latitude in (0.0, 1.0):
+        models = magnetic(latitude)
+        laws.append(fflin.tvlqr(models, Qf="periodic", sample=models.period / 64))
+    one, other = laws
+    assert "mean effect over one period" in one.weights
+    assert one.Q == pytest.approx(other.Q, rel=1e-9, abs=1e-12)
+    assert one.R == pytest.approx(other.R, rel=1e-9)
+    assert one.loop_multipliers[0] == pytest.approx(other.loop_multipliers[0], rel=0.05)
+    assert one.loop_multipliers[0] < 0.2
+
+
+def test_models_without_magnetorquers_on_the_base_are_unchanged(along):
+    assert np.array_equal(mean_model(along).B, along[0].B)
 
 
 @pytest.mark.exhaustive

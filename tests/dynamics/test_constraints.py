@@ -118,7 +118,8 @@ def test_the_wrenches_and_their_derivative_are_those_of_the_jacobian(kind, to):
     np.testing.assert_allclose(constraints.jacobian(q).T @ forces, force, atol=1e-12)
     held = -pin.computeRNEADerivatives(robot.model, data, q, still, still, wrenches)[0]
     expected = along(robot, q, lambda q: constraints.jacobian(q).T @ forces)
-    slopes = held + constraints.force_by_q(q, forces)
+    turning = constraints.derivatives(q, still, still, forces).force_by_q
+    slopes = held + turning
     np.testing.assert_allclose(slopes, expected, atol=1e-7)
 
 

@@ -3,11 +3,15 @@
 import math
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
 import fflin
+from fflin.dynamics.disturbance import BaseDisturbance, true_field
 from fflin.dynamics.magnetic import MagneticField
+from fflin.dynamics.state import StateMap
 from fflin.robot.orbit import MAGNETIC_POLES
+from fflin.robot.summary import robot_info
 
 EARTH_RATE = 7.292115e-5  # [rad/s], WGS 84
 INCLINATION, NODE = 1.2, 0.7
@@ -178,3 +182,192 @@ def test_text_keeps_the_field(make):
     assert type(orbit).from_json(orbit.to_json()) == orbit
     assert type(orbit).from_json(make(field=tilted).to_json()).field is None
     assert "tilted_dipole" in orbit._repr_html_()
+
+
+def test_a_residual_dipole_exerts_the_torque_m_cross_b():
+    moment = np.array([0.02, -0.01, 0.03])
+    robot = with_rods(ORBITS[0](field="dipole"))
+    robot = robot.replace(disturbance={"residual_dipole": moment})
+    q = fflin.configuration(robot, rpy=(20.0, -30.0, 50.0))
+    state = StateMap(robot, frame="lvlh")
+    R = pin.XYZQUATToSE3(q[:7]).rotation
+    for t in (0.0, 900.0):
+        wrench = BaseDisturbance(robot, state.field).wrench(t, q)
+        torque = np.cross(moment, R.T @ state.field.magnetic.at(t))
+        assert wrench == pytest.approx(np.r_[np.zeros(3), torque], rel=1e-14)
+    # A magnetorquer with the same moment exerts the same torque.
+    lin = fflin.linearize(robot, q)
+    by_rods = lin.M[:3, :3] @ lin.B[6:9] @ moment
+    wrench = BaseDisturbance(robot, state.field).wrench(0.0, q)
+    assert by_rods == pytest.approx(wrench[3:], rel=1e-12)
+
+
+def test_the_true_field_is_rotated_and_scaled_in_lvlh_axes():
+    errors = {"field_scale": 0.25, "field_rotation": (0.0, 0.0, 0.3)}
+    robot = with_rods(ORBITS[0](field="dipole")).replace(disturbance=errors)
+    for frame in ("lvlh", "hill"):
+        state = StateMap(robot, frame=frame)
+        model = state.field.magnetic
+        true = true_field(robot, state.field)
+        # A rotation about z of lvlh, which points to the earth.
+        down = -state.field.axes[:, 0]
+        for t in (0.0, 900.0):
+            for name in ("at", "rate"):
+                b = getattr(model, name)(t)
+                across = b - down * (down @ b)
+                expected = 1.25 * (
+                    down * (down @ b)
+                    + math.cos(0.3) * across
+                    + math.sin(0.3) * np.cross(down, b)
+                )
+                assert getattr(true, name)(t) == pytest.approx(expected, rel=1e-13)
+
+
+def test_linear_models_and_equilibria_do_not_contain_the_disturbance():
+    errors = {
+        "residual_dipole": (0.1, 0.2, 0.3),
+        "field_scale": 0.25,
+        "field_rotation": (0.0, 0.0, 0.3),
+    }
+    robot = with_rods(ORBITS[0](field="dipole"))
+    disturbed = robot.replace(disturbance=errors)
+    one, other = fflin.linearize(robot), fflin.linearize(disturbed)
+    assert np.array_equal(one.B, other.B) and np.array_equal(one.f0, other.f0)
+    wheels = disturbed.replace(inputs=[fflin.BaseTorque(), *robot.inputs])
+    held = fflin.equilibrium(wheels, disturbed=True).u
+    expected = fflin.equilibrium(wheels.replace(disturbance=None)).u
+    assert held == pytest.approx(expected, abs=1e-18)
+
+
+def test_an_error_budget_contains_the_torque_of_the_residual_dipole():
+    """The torque m x b has a constant part and a part with the rate of the orbit."""
+    moment = np.array([0.02, -0.01, 0.03])
+    orbit = ORBITS[0](field="dipole")
+    robot = fflin.load("cubesat", orbit=orbit, inputs=[fflin.BaseTorque()])
+    disturbed = robot.replace(disturbance={"residual_dipole": moment})
+    q = fflin.configuration(robot, rpy=(20.0, -30.0, 50.0))
+    lin = fflin.linearize(robot, q, u=fflin.equilibrium(robot, q).u)
+    gain = fflin.lqr(lin)
+    budget = fflin.error_budget(gain, lin, robot=disturbed)
+    field = StateMap(robot, frame="lvlh").field.magnetic
+    R = pin.XYZQUATToSE3(q[:7]).rotation
+    # b is c + s sin(n t) + k cos(n t), here from its values at four quarters of an orbit.
+    quarters = [field.at(k * orbit.period / 4.0) @ R for k in range(4)]
+    mean = 0.25 * sum(quarters)
+    torque = np.cross(moment, mean)
+    cosine = np.cross(moment, 0.5 * (quarters[0] - quarters[2]))
+    sine = np.cross(moment, 0.5 * (quarters[1] - quarters[3]))
+    given = fflin.error_budget(gain, lin, disturbance={"tau_b": torque})
+    assert budget.constant == pytest.approx(given.constant, rel=1e-9)
+    hertz = 1.0 / orbit.period
+    waves = [
+        {"constant": torque},
+        {"amplitude": cosine, "frequency": hertz, "phase": math.pi / 2.0},
+        {"amplitude": sine, "frequency": hertz},
+    ]
+    waved = robot.replace(disturbance={"tau_b": waves})
+    expected = fflin.error_budget(gain, lin, robot=waved)
+    assert budget.total == pytest.approx(expected.total, rel=1e-9)
+
+
+def test_an_error_budget_warns_of_a_tilted_dipole():
+    robot = fflin.load("cubesat", orbit=ORBITS[0](field="tilted_dipole"))
+    disturbed = robot.replace(disturbance={"residual_dipole": (0.1, 0.0, 0.0)})
+    lin = fflin.linearize(robot, u=fflin.equilibrium(robot).u)
+    with pytest.warns(fflin.FflinWarning, match="only in a circular orbit with field"):
+        fflin.error_budget(fflin.lqr(lin), lin, robot=disturbed, noise={"q_b": 1e-5})
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"residual_dipole": 0.1}, "disturbance 'residual_dipole'"),
+        ({"field_scale": "large"}, "disturbance 'field_scale' is 'large', expected"),
+    ],
+)
+def test_invalid_disturbances_are_refused(given, message):
+    robot = with_rods(ORBITS[0](field="dipole"))
+    with pytest.raises(fflin.InputError, match=message):
+        robot.replace(disturbance=given)
+
+
+def test_a_residual_dipole_needs_a_field():
+    robot = fflin.load("cubesat", orbit=500e3)
+    with pytest.raises(fflin.InputError, match="needs a magnetic field, but 'cubesat'"):
+        robot.replace(disturbance={"residual_dipole": (0.1, 0.0, 0.0)})
+    with pytest.raises(fflin.UnknownNameError, match="disturbance to disperse"):
+        spreads = {"residual_dipole.disturbance": 0.1}
+        fflin.monte_carlo(robot, None, spreads, runs=2, duration=1.0, engine="python")
+
+
+@pytest.mark.parametrize(
+    "engine", ["python", pytest.param("compiled", marks=pytest.mark.compiled)]
+)
+@pytest.mark.parametrize("allocated", [False, True])
+def test_campaigns_draw_the_residual_dipole_and_the_errors_of_the_field(
+    engine, allocated
+):
+    if engine == "compiled":
+        pytest.importorskip("numba")
+    robot = with_rods(ORBITS[0](field="dipole"))
+    nominal = {"residual_dipole": (0.1, 0.0, 0.0), "field_scale": 0.1}
+    robot = robot.replace(disturbance=nominal)
+    law = fflin.BDot(1e4)
+    if allocated:
+        design = robot.replace(inputs=[fflin.BaseTorque()])
+        lin = fflin.linearize(design)
+        K = np.zeros((3, 12))
+        K[:, 6:9] = 1e-4 * np.eye(3)
+        law = fflin.Allocation(fflin.StateFeedback(lin, K), design)
+    spreads = {
+        "residual_dipole.disturbance": 0.05,
+        "field_scale.disturbance": 0.2,
+        "field_rotation.x.disturbance": 0.1,
+        "tau_b.y.disturbance": 1e-6,
+    }
+    options = {"v0": fflin.velocity(robot, {"omega_b": 0.02}), "dt": 5.0}
+    campaign = fflin.monte_carlo(
+        robot, law, spreads, runs=3, duration=60.0, engine=engine, **options
+    )
+    names = [f"residual_dipole.{axis}.disturbance" for axis in "xyz"]
+    names += ["field_rotation.x.disturbance", "field_scale.disturbance"]
+    assert {*names} < {*campaign.names}
+    at = [campaign.names.index(name) for name in (*names, "tau_b.y.disturbance")]
+    for run, drawn in enumerate(campaign.drawn[:, at].tolist()):
+        x, y, z, angle, scale, torque = drawn
+        total = {
+            "residual_dipole": (0.1 + x, y, z),
+            "field_scale": 0.1 + scale,
+            "field_rotation": (angle, 0.0, 0.0),
+            "tau_b": (0.0, torque, 0.0),
+        }
+        alone = fflin.simulate(
+            robot.replace(disturbance=total),
+            law,
+            duration=60.0,
+            engine="python",
+            **options,
+        )
+        assert campaign.q[run] == pytest.approx(alone.q[-1], abs=1e-12)
+        assert campaign.v[run] == pytest.approx(alone.v[-1], abs=1e-12)
+    motion = campaign.replay(0)
+    assert np.array_equal(motion.q[-1], campaign.q[0])
+
+
+def test_a_robot_file_contains_the_disturbance_of_the_field(tmp_path):
+    (tmp_path / "robot.toml").write_text(
+        """
+        urdf = "cubesat"
+        orbit = { altitude = 500e3, field = "tilted_dipole", node_longitude = 0.5 }
+
+        [disturbance]
+        residual_dipole = [0.01, 0, 0.02]
+        field_scale = 0.1
+        field_rotation = [0.05, 0, 0]
+        """
+    )
+    robot = fflin.load(tmp_path / "robot.toml")
+    assert robot.orbit.node_longitude == 0.5
+    assert robot.disturbance["residual_dipole"][0].values == (0.01, 0.0, 0.02)
+    assert robot.disturbance["field_scale"][0].values == (0.1,)
+    assert "0.01, 0, 0.02 A m^2 (base axes)" in " ".join(robot_info(robot).split())

@@ -10,12 +10,14 @@ import pinocchio as pin
 import pytest
 
 import fflin
+from fflin.dynamics.constraints import Constraints
 from fflin.kernel import loop
+from fflin.kernel.constraints import CONSTRAINTS
 from fflin.kernel.extension import EXTENSION
 from fflin.kernel.forward import ActuatorFaults, kept_at
 from fflin.kernel.tree import laid_out
 from fflin.simulation.extension import extension_of, is_extended
-from fflin.simulation.lanes import noises, packed
+from fflin.simulation.lanes import constraints_of, loop_name, noises, packed
 from fflin.simulation.plan import Plan, SimulationOptions
 from fflin.simulation.plant import Plant
 from fflin.simulation.run import STOPS, go, stop_conditions, stop_of
@@ -67,13 +69,14 @@ def advanced(plan, about=None, every=1, cuts=()):
     point is the initial position of the base. The loop is called again at the steps `cuts`.
     """
     parts = one_lane(laid_out(packed(plan, stop_conditions(plan)), loop.ARGUMENTS)[0])
-    advance, words = loop.advance, parts
+    words, held = parts, None
+    if plan.plant.constrained is not None:
+        held = one_lane(laid_out(constraints_of(plan), CONSTRAINTS)[0])
+        words = loop.ConstrainedArguments(parts, held)
     if is_extended(plan):
         extension = one_lane(laid_out(extension_of(plan), EXTENSION)[0])
-        advance = loop.advance_extended
-        words = loop.ExtendedArguments(parts, None, extension)
-    if plan.plant.field:
-        advance = getattr(loop, f"{advance.__name__}_in_orbit")
+        words = loop.ExtendedArguments(parts, held, extension)
+    advance = getattr(loop, loop_name(plan, lanes=8))
     point, kept, robot, times = parts.point, parts.reference, parts.robot, plan.times
     mass = plan.plant.robot.mass
     kept.per_mass[0], kept.weight[:] = 1.0 / mass, mass * robot.gravity
@@ -83,6 +86,8 @@ def advanced(plan, about=None, every=1, cuts=()):
         at, values = noises(plan, size, 0, times.steps)
         parts.law.added.reshape(-1, size)[at] = values
     width = len(point.q) + len(point.nu) + len(point.u) + 9
+    if held is not None:
+        width += len(held.forces)
     clock, pieces = np.zeros(1, dtype=int), []
     for last in (*cuts, times.steps):
         rows, first = np.zeros((times.steps, width)), clock[0]
@@ -93,8 +98,8 @@ def advanced(plan, about=None, every=1, cuts=()):
         assert not rows[count:].any()
         pieces.append(rows[:count])
     rows = np.concatenate(pieces)
-    ends = np.cumsum([len(point.q), len(point.nu), len(point.u), 6])
-    q, nu, u, momentum, center = np.split(rows, ends, axis=1)
+    ends = np.cumsum([len(point.q), len(point.nu), len(point.u), 6, 3])
+    q, nu, u, momentum, center, _ = np.split(rows, ends, axis=1)
     (linear, angular), last = kept_at(kept, clock[0] * times.dt)
     ending = point.q, point.nu, parts.method.u, (*linear, *angular), last
     pairs = zip((q, nu, u, momentum, center), ending, strict=True)
@@ -302,6 +307,34 @@ def test_springs_gravity_wheels_and_faulty_actuators_agree_with_pinocchio(method
     options = {"dt": 0.02, "duration": 0.3, "method": method}
     for project in (True, False):
         both(planned(robot, policy, faults, q0=q, v0=v, project=project, **options))
+
+
+ORBITS = {
+    "none": None,
+    "circular": 500e3,
+    "elliptic": {"perigee": 500e3, "eccentricity": 0.1},
+}
+
+
+@pytest.mark.parametrize("lag", [None, 0.2], ids=["direct", "lag"])
+@pytest.mark.parametrize("orbit", ORBITS)
+def test_closed_loops_agree_with_pinocchio_in_orbit_and_with_lags(orbit, lag):
+    weld = fflin.Weld("tool_left", "tool_right")
+    robot = fflin.load("dual_arm", orbit=ORBITS[orbit], constraints=[weld])
+    inputs = [fflin.BaseTorque(lag=lag), fflin.JointTorque("*", lag=lag)]
+    robot = robot.replace(inputs=inputs, stiffness=5.0, damping=0.1)
+    joints = {"left_1": 0.4, "left_2": 0.7, "right_1": -0.3, "right_2": -0.6}
+    q = fflin.configuration(robot, joints, rpy=(20.0, 10.0, 5.0))
+    frame = "lvlh" if orbit != "none" else None
+    lin = fflin.linearize(robot, q, frame=frame)
+    policy = fflin.StateFeedback(lin, 0.1 * np.ones(lin.B.T.shape))
+    rates = 0.1 * np.random.default_rng(0).normal(size=robot.nv)
+    q, v = fflin.closed(robot, q, rates)
+    result, _ = both(planned(robot, policy, q0=q, v0=v, duration=0.15, dt=0.05))
+    rows = Constraints(robot)
+    assert np.abs(rows.residual(result[0][-1])).max() < 1e-12
+    assert np.abs(rows.jacobian(q) @ result[1][0]).max() < 1e-12
+    assert np.abs(result[2]).max() > 0.01
 
 
 def test_a_body_moves_by_newtons_law_until_its_thrust_fails():

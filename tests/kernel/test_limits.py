@@ -12,9 +12,6 @@ from fflin.robot.joints import ROOT
 
 CUBESAT = fflin.load("cubesat")
 IN_ELLIPSE = CUBESAT.replace(orbit={"perigee": 500e3, "eccentricity": 0.1})
-CONSTRAINED_IN_ORBIT = fflin.load(
-    "dual_arm", orbit=500e3, constraints=[fflin.Weld("tool_left", "tool_right")]
-)
 
 
 def with_displaced_root():
@@ -56,9 +53,6 @@ TASKS = {
     "a joint of 'composite' does not": Task(robots=(with_displaced_axis(),)),
     "the root joint of 'displaced'": Task(
         robots=(with_displaced_root(),), simulated=True
-    ),
-    "the constraints of 'dual_arm' are simulated in orbit": Task(
-        robots=(CONSTRAINED_IN_ORBIT,), simulated=True
     ),
     "its sample time differs": Task(robots=(CUBESAT,), own_sample_time=True),
     "noise is evaluated at every stage": Task(robots=(CUBESAT,), noise_at_stages=True),

@@ -179,6 +179,57 @@ def test_the_magnetic_field_matches_the_python_engine(robots, eccentricity, fiel
                 assert np.abs(apart).max() < TOLERANCE * size
 
 
+FIELD_ERRORS = {
+    "residual_dipole": (20.0, -30.0, 10.0),
+    "field_scale": 0.3,
+    "field_rotation": (0.2, -0.1, 0.3),
+}
+
+
+@pytest.mark.parametrize("frame", ["lvlh", "hill"])
+def test_a_residual_dipole_and_errors_of_the_field_match_pinocchio(robots, frame):
+    _, options = moving(robots["planar_detumble"])
+    robot = with_torquers(robots["planar_detumble"])
+    disturbed = robot.replace(disturbance=FIELD_ERRORS)
+    free = go(planned(robot, frame=frame, **options))
+    run = agree(planned(disturbed, frame=frame, **options))
+    assert np.abs(free.v - run.v).max() > 1e-7
+    faults = {"limits": {f"magnetorquer_{k}": (-50.0, 50.0) for k in (1, 2)}}
+    lin = fflin.linearize(robot, frame=frame)
+    K = np.zeros((5, len(lin.x0)))
+    K[:2, 8:11] = 200.0
+    law = fflin.StateFeedback(lin, K)
+    agree(planned(disturbed, law, frame=frame, **faults, **options))
+
+
+@pytest.mark.parametrize("law", [fflin.BDot(300.0), fflin.RateDamping(1e-3)])
+def test_detumbling_laws_measure_the_true_field(robots, law):
+    _, options = moving(robots["cubesat"])
+    robot = with_torquers(robots["cubesat"])
+    run = agree(planned(robot.replace(disturbance=FIELD_ERRORS), law, **options))
+    # At the first instant, the state is the same, and the field is another one.
+    model = go(planned(robot, law, **options))
+    assert np.abs(run.u[0] - model.u[0]).max() > 0.01 * np.abs(model.u[0]).max()
+
+
+def test_an_allocation_knows_only_the_model_of_the_field(robots):
+    _, options = moving(robots["cubesat"])
+    robot = with_torquers(robots["cubesat"])
+    rods = [fflin.Magnetorquer(axis, max=50.0) for axis in np.eye(3)]
+    robot = robot.replace(inputs=rods)
+    design = robots["cubesat"].replace(orbit=robot.orbit, inputs=[fflin.BaseTorque()])
+    lin = fflin.linearize(design)
+    K = np.zeros((3, 12))
+    K[:, 6:9] = 1e-2 * np.eye(3)
+    law = fflin.Allocation(fflin.StateFeedback(lin, K), design)
+    errors = {name: FIELD_ERRORS[name] for name in ("field_scale", "field_rotation")}
+    run = agree(planned(robot.replace(disturbance=errors), law, **options))
+    model = go(planned(robot, law, **options))
+    assert np.abs(model.u[0]).max() > 1e-3
+    assert np.array_equal(run.u[0], model.u[0])
+    assert np.abs(run.v - model.v).max() > 1e-9
+
+
 def test_the_b_dot_law_in_an_ellipse_matches_the_python_engine(robots):
     robot, options = moving(robots["cubesat"])
     path = fflin.EllipticOrbit(

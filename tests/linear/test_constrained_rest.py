@@ -51,6 +51,27 @@ def test_models_at_rest_are_equal_to_the_general_equations(seed, frame):
     assert (fast > 0) == (rows == first.rank)
 
 
+@pytest.mark.parametrize("options", [{}, {"moving": True}, {"frame": "local"}])
+@pytest.mark.parametrize("seed", [0, 3, 5, 8])
+def test_models_in_motion_do_not_depend_on_the_points_before(seed, options):
+    """Only at later points, the independent coordinates give the tangent space."""
+    rng = np.random.default_rng(seed)
+    robot, q, _, _ = random_constraints(rng, count=1, loads=True)
+    linearizer = fflin.Linearizer(robot, **options)
+    first = linearizer(q)
+    regular = 0
+    for near in closed_points(robot, q, rng, 3):
+        point, v = fflin.closed(robot, near, rng.normal(size=robot.nv))
+        u = rng.normal(size=first.B.shape[1])
+        model = linearizer(point, v, u)
+        regular += linearizer._closure.tangent(point).partitioned
+        chosen = {**options, "independent": first.independent}
+        expected = fflin.linearize(robot, point, v, u, **chosen)
+        assert_equal(model, expected)
+    rows = sum(len(item.rows) for item in robot.constraints)
+    assert (regular > 0) == (rows == first.rank)
+
+
 def test_other_inputs_act_through_the_same_equations():
     rng = np.random.default_rng(3)
     robot, q, _, _ = random_constraints(rng, count=1, loads=False)

@@ -17,7 +17,16 @@ def lin(robot):
     return fflin.linearize(robot)
 
 
+def along(robot, lin):
+    motion = fflin.simulate(
+        robot, q0=lin.q, duration=0.2, dt=0.1, engine="python", progress=False
+    )
+    return fflin.linearize_trajectory(robot, motion.trajectory())
+
+
 CALLS = {
+    "batch.to": lambda robot, lin: fflin.sweep(robot, lin.q[None]).to("drake"),
+    "along.to": lambda robot, lin: along(robot, lin).to("pinocchio"),
     "from_tool": lambda robot, lin: fflin.from_tool(robot, "drake", lin.q),
     "generalized_jacobian": lambda robot, _: fflin.generalized_jacobian(
         robot, frame="tool_left"
@@ -25,11 +34,7 @@ CALLS = {
     "linearize_orbit": lambda robot, _: fflin.linearize_orbit(
         robot.replace(orbit=500e3)
     ),
-    "plan": lambda robot, _: fflin.plan(robot, {}, duration=10.0),
     "relative_equilibria": lambda robot, _: fflin.relative_equilibria(robot),
-    "to": lambda _, lin: lin.to("mujoco"),
-    "gain.to": lambda _, lin: fflin.lqr(lin).to("drake"),
-    "transform": lambda robot, lin: fflin.transform(robot, lin, "pinocchio"),
 }
 
 

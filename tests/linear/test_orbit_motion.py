@@ -329,3 +329,13 @@ def test_a_periodic_trajectory_must_close():
     made = fflin.Trajectory(free, t, q, v, u)
     with pytest.raises(fflin.InputError, match="no multipliers"):
         _ = fflin.linearize_trajectory(free, made).multipliers
+
+
+@pytest.mark.exhaustive
+def test_a_periodic_motion_with_too_few_knots_asks_for_more_of_them():
+    orbit = fflin.EllipticOrbit(perigee=500e3, eccentricity=0.3)
+    robot = fflin.load("servicer_7dof", orbit=orbit)
+    along = fflin.linearize_orbit(robot, steps=8)
+    assert "give more knots, with steps= of linearize_orbit" in " ".join(
+        str(along).split()
+    )

@@ -202,12 +202,50 @@ def test_a_command_reads_the_file(tmp_path):
     assert "A (2 x 2)" in out
 
 
+def test_included_files_are_read_as_one_file(tmp_path):
+    whole = tmp_path / "whole.xml"
+    whole.write_text(BARS)
+    start = BARS.index('<body name="l1"')
+    end = BARS.index("</worldbody>")
+    (tmp_path / "parts").mkdir()
+    bodies = BARS[start:end]
+    (tmp_path / "parts" / "bodies.xml").write_text(
+        f"<mujocoinclude>{bodies}</mujocoinclude>"
+    )
+    # Paths are relative to the main file, also in an included file.
+    (tmp_path / "parts" / "all.xml").write_text(
+        '<mujocoinclude><include file="parts/bodies.xml"/></mujocoinclude>'
+    )
+    split = tmp_path / "split.xml"
+    split.write_text(f'{BARS[:start]}<include file="parts/all.xml"/>{BARS[end:]}')
+    with pytest.warns(fflin.FflinWarning, match="not modelled"):
+        one, two = fflin.load(whole), fflin.load(split)
+    assert two.joint_names == one.joint_names
+    lin, again = (fflin.linearize(robot) for robot in (one, two))
+    np.testing.assert_array_equal(again.A, lin.A)
+    assert [item.title for item in two.constraints] == ["world", "pin"]
+
+
+def test_an_error_in_an_included_file_names_that_file(tmp_path):
+    (tmp_path / "part.xml").write_text("<mujocoinclude><body></mujocoinclude>")
+    path = tmp_path / "whole.xml"
+    path.write_text('<mujoco><include file="part.xml"/></mujoco>')
+    with pytest.raises(fflin.UrdfError, match=r"part\.xml.*not well-formed"):
+        fflin.load(path)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         (PENDULUM[:90], "not well-formed XML"),
         (PENDULUM.replace('"2"', '"two"'), "Pinocchio cannot build the model"),
-        ("<mujoco><include file='a.xml'/></mujoco>", "<include> is not supported"),
+        ("<mujoco><include file='a.xml'/></mujoco>", "cannot be read: No such file"),
+        ("<mujoco><include/></mujoco>", "<include> has no attribute file"),
+        (
+            "<mujoco><include file='bad.xml'/></mujoco>",
+            "includes the file 'bad.xml' twice",
+        ),
+        ("<mujoco><replicate/></mujoco>", "<replicate> is not supported"),
         (
             TWIN.format('<weld body1="a2" body2="c"/>'),
             "body2 is 'c', which the file does not define",

@@ -38,6 +38,42 @@ def test_both_engines_simulate_the_same_motion(case):
     )
 
 
+ORBITS = {
+    "circular": fflin.CircularOrbit(500e3),
+    "elliptic": {"perigee": 500e3, "eccentricity": 0.1},
+}
+
+
+@pytest.mark.parametrize("case", [*ORBITS, "lags"])
+def test_both_engines_simulate_a_loop_in_orbit(case):
+    robot, q, v = dual_arm()
+    robot = robot.replace(orbit=ORBITS.get(case, 500e3), stiffness=5.0, damping=0.1)
+    policy = None
+    if case == "lags":
+        robot = robot.replace(
+            inputs=[fflin.BaseTorque(lag=0.5), fflin.JointTorque("*", lag=0.2)]
+        )
+        lin = fflin.linearize(robot, q, frame="lvlh")
+        policy = fflin.StateFeedback(lin, 0.1 * np.ones(lin.B.T.shape))
+    times = {"duration": 20.0, "dt": 0.05}
+    motion = both(robot, policy, q0=q, v0=0.2 * v, project=False, **times)
+    residual, rate = off(robot, motion)
+    assert residual < 1e-12 and rate < 1e-12
+    # The Jacobi integral, whose error is of order 4 in the step.
+    assert motion.momentum_drift.max() < 1e-6
+
+
+def test_a_campaign_in_orbit_is_the_same_in_both_engines():
+    robot, q, v = dual_arm()
+    circling = robot.replace(orbit=500e3)
+    options = {"runs": 9, "duration": 0.2, "dt": 0.05, "q0": q, "v0": v}
+    python, compiled = (
+        fflin.monte_carlo(circling, None, SPREADS, engine=engine, **options)
+        for engine in ("python", "compiled")
+    )
+    np.testing.assert_allclose(compiled.x, python.x, rtol=0.0, atol=1e-11)
+
+
 def test_both_engines_regulate_in_independent_coordinates():
     robot, q, _ = dual_arm()
     lin = fflin.linearize(robot, q)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import fflin
-from fflin.uncertainty.gain_bound import Channels, gain_bound
+from fflin.uncertainty.gain_bound import Channels, Scaling, gain_bound, improved
 from tests.support.tuning import of_sweep
 
 RATES = np.geomspace(1e-2, 1e2, 60)
@@ -38,6 +38,15 @@ def test_the_bound_of_an_oscillator_is_its_gain_at_the_softest_spring(damping):
     assert gain_bound(channels, RATES, 1.001 * exact) == 1.001 * exact
     bound = gain_bound(channels, RATES, largest(1.0, damping))
     assert exact <= bound <= 1.15 * exact
+
+
+def test_a_scaling_that_overflows_is_not_accepted():
+    M = np.array([[[0.1, 500.0], [1e-3, 0.1]]], complex)
+    huge = Scaling(np.array([800.0, -800.0]), np.full(2, 1e300))
+    _, value = improved(M, huge, 2, np.zeros(0), 1.0)
+    assert value == math.inf
+    scaling, value = improved(M, Scaling(np.zeros(2), np.zeros(2)), 2, np.zeros(0), 1.0)
+    assert value <= 1.0 and np.isfinite(scaling.log_d).all()
 
 
 def test_a_range_with_an_unstable_loop_has_no_bound():

@@ -303,6 +303,27 @@ def test_a_reduced_controller_may_have_a_given_order_or_norm(optimal):
         optimal.reduced(10)
 
 
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("dt", [0.0, 0.5])
+def test_a_search_begins_at_a_reduced_controller_and_improves_it(robot, dt):
+    pytest.importorskip("slycot")
+    lin = fflin.linearize(robot)
+    model = lin.discretize(dt) if dt else lin
+    small = fflin.hinf(model, FULL, measured="q_b").reduced(8)
+    law = fflin.StateSpaceLaw(8, "q_b", "tau_b", start=small)
+    first = fflin.tune(model, law, FULL, starts=1, steps=1)
+    later = fflin.tune(model, law, FULL, starts=1, steps=10)
+    assert first.goals[0].worst <= small.gamma * (1.0 + 1e-9)
+    assert later.goals[0].worst <= first.goals[0].worst
+    for order, signals, word in (
+        (6, "q_b", "8 states"),
+        (8, "q_b.x", "start measures q_b.y"),
+    ):
+        with pytest.raises(fflin.InputError, match=word):
+            other = fflin.StateSpaceLaw(order, signals, "tau_b", start=small)
+            fflin.tune(model, other, FULL, starts=1, steps=1)
+
+
 def test_states_that_do_not_affect_the_goals_are_not_counted(optimal):
     A, B, C, D = optimal._design.law
     idle = np.zeros((len(A), 2))

@@ -75,6 +75,26 @@ def test_a_constraint_is_shown_only_in_its_phase():
     np.testing.assert_allclose(
         np.linalg.norm(reaction.force[in_phase], axis=1), sizes, rtol=1e-12
     )
+    torques = np.linalg.norm(held.constraint_forces[:, 3:], axis=1)
+    shown = np.linalg.norm(reaction.torque, axis=1)
+    np.testing.assert_allclose(shown[in_phase], torques, rtol=1e-12)
+    assert torques.min() > 0.0 and not shown[~in_phase].any()
+
+
+def test_the_torque_on_a_held_body_balances_its_weight_in_world_axes():
+    robot = free_body((3.0, 4.0, 5.0))
+    model = robot.model.copy()
+    lever = pin.SE3(pin.rpy.rpyToMatrix(0.3, 0.1, 0.2), np.array([0.4, 0.0, 0.0]))
+    model.addFrame(pin.Frame("edge", 1, lever, pin.FrameType.OP_FRAME))
+    robot = fflin.from_model(model, name="body")
+    weld = fflin.Weld("edge", placement=lever)
+    robot = robot.replace(gravity=(0, 0, -9.81), constraints=[weld])
+    motion = fflin.simulate(robot, duration=0.2, dt=0.1, engine="python")
+    (reaction,) = reactions(robot, motion, np.arange(len(motion.t)))
+    # The moment of the weight about the edge is -0.4 m g about y, and the weld balances it.
+    expected = np.tile((0, 0.4 * 9.81 * robot.mass, 0), (len(motion.t), 1))
+    size = 0.4 * 9.81 * robot.mass
+    np.testing.assert_allclose(reaction.torque, expected, atol=1e-9 * size)
 
 
 @pytest.mark.browser
@@ -88,15 +108,19 @@ def test_the_page_shows_the_constraint_and_its_force_while_they_act(watch, tmp_p
     assert "constraint grip" in labels
     (scale,) = [text for text in labels if "force of constraints" in text]
     assert scale == f"force of constraints (longest: {largest:#.2g} N)"
+    most = np.linalg.norm(held.constraint_forces[:, 3:], axis=1).max()
+    (torques,) = [text for text in labels if "torque of constraints" in text]
+    assert torques == f"torque of constraints (longest: {most:#.2g} N m)"
     visible = """(() => {
         const path = ['meshcat', 'robot', 'left_4', 'constraint 0'];
         const mark = viewer.scene_tree.find(path).object.children[0];
         const arrow = viewer.scene_tree.find(['meshcat', 'reactions', '0']).object;
-        return [mark.visible, arrow.children[0].visible];
+        const couple = viewer.scene_tree.find(['meshcat', 'couples', '0']).object;
+        return [mark.visible, arrow.children[0].visible, couple.children[0].visible];
     })()"""
     for time, expected in ((0.2, False), (0.6, True), (1.2, False)):
         watched.do(f"fflin.seek({time})")
-        assert watched.do(visible) == [expected, expected], time
+        assert watched.do(visible) == [expected] * 3, time
 
 
 @pytest.mark.browser

@@ -102,6 +102,7 @@ def _of_trajectory(shooting: Shooting, motion: Trajectory, start: Point) -> Knot
     q = q.copy()
     v = pace * v
     q[0], v[0] = start
+    q, v = shooting.near(q, v)
     return q, v, u.copy()
 
 
@@ -135,7 +136,7 @@ def _of_joints(
                 "joint positions in the order of robot.joint_names",
             )
     base = None
-    if conserves_momentum(robot):
+    if conserves_momentum(robot) and not robot.constraints:
         base = FloatingBase(shooting.state, start)
     return _along(shooting, base, times, joints, start, end)
 
@@ -146,6 +147,7 @@ def _needs_loops(shooting: Shooting, asked: Mask) -> bool:
     return (
         all(isinstance(item, JointTorque) for item in state.robot.inputs)
         and not shooting.wheels
+        and not state.robot.constraints
         and len(state.robot.inputs) > 1
         and bool(asked[state.groups.q_b].any())
     )
@@ -276,6 +278,7 @@ def _along(
         q[0] = start[0]
         v = state.spread(nu)
         v[0] = start[1]
+        q, v = shooting.near(q, v)
         return q, v, shooting.inputs(shooting.t, q, v)
     q, v = base.motion(times, joints, rates, base.rotations(times, joints))
     q[0], v[0] = start

@@ -8,7 +8,7 @@ import scipy.sparse as sp
 
 from fflin.base.errors import InputError, optional_package
 from fflin.base.validation import Array, Indices, Mask
-from fflin.control.optimal.shooting import Point, Shooting
+from fflin.control.optimal.shooting import Charts, Point, Shooting
 from fflin.linear.optimality import Optimality
 
 # A plan is accepted if the sum of its violations of the goal and the limits [rad, m, s] is at most
@@ -92,7 +92,8 @@ class Trial(NamedTuple):
 class Models(NamedTuple):
     """Linear models along a trial, and its limits as rows of the quadratic program."""
 
-    ends: Array  # Jacobians of the interval ends (N, nx, nx + 2 nu)
+    charts: Charts  # independent coordinates of the steps of the knots
+    ends: Array  # Jacobians of the interval ends (N, nz, nz + 2 nu)
     rows: sp.csr_array  # one row for each limit
     at_knots: tuple[Indices, Indices]  # knot and state of the first rows
     # interval, part and state of the other rows
@@ -135,6 +136,7 @@ class Search(NamedTuple):
     start: Point
     end: Point
     asked: Mask  # states whose value at the end is prescribed (nx,)
+    determining: Mask  # prescribed states (nx,) that determine all of them near the end
     bounds: Array  # limits of states (2, nx)
     limits: Array  # limits of inputs (2, nu)
     size: Array  # magnitudes of the limits of states (nx,), 0 for states without limits
@@ -338,7 +340,8 @@ class Search(NamedTuple):
         knots[0, 0] = -np.inf
         knots[1, 0] = np.inf
         to_end = shooting.between((q[-1], v[-1]), self.end)
-        knots[:, -1, self.asked] = np.clip(to_end, *knots[:, -1])[self.asked]
+        goal = self.determining
+        knots[:, -1, goal] = np.clip(to_end, *knots[:, -1])[goal]
         tighter = self.bounds + _TIGHTER * np.array((self.size, -self.size))
         inside = tighter[:, None, None] - shooting.inside(motions, self.parts)[:, :-1]
         return Trial(q, v, u, shooting.missed(q, v, motions), knots, inside)
@@ -356,28 +359,37 @@ class Search(NamedTuple):
         if not max(trial.outside(limited), trial.gap) < np.inf:
             return None
         try:
+            charts = self.shooting.charts(trial.q, trial.v)
             ends, inside = self.shooting.jacobians(
-                trial.q, trial.v, trial.u, self.parts
+                trial.q, trial.v, trial.u, self.parts, charts
             )
         except (InputError, np.linalg.LinAlgError):  # the motion has diverged
             return None
         # Soft limits apply to states at knots and to states within intervals. The latter depend on
         # x[k], u[k] and u[k + 1].
         knots, nu = trial.u.shape
-        nx = self.shooting.state.nx
-        nw = nx + nu  # variables (x, u) of a knot
+        nz = charts.kept.shape[1]
+        nw = (
+            nz + nu
+        )  # variables of a knot: the independent coordinates of its step, and u
         knot, state = np.nonzero(np.isfinite(trial.knots).any(axis=0))
-        at_knots = sp.eye_array(knots * nw, format="csr")[knot * nw + state]
+        columns = knot[:, None] * nw + np.arange(nz)
+        starts = np.arange(len(knot) + 1) * nz
+        at_knots = sp.csr_array(
+            (charts.T[knot, state].ravel(), columns.ravel(), starts),
+            (len(knot), knots * nw),
+        )
+        at_knots.eliminate_zeros()
         k, part, inner_state = np.nonzero(limited)
-        # A row of the compressed sparse matrix has nx + 2 nu entries.
+        # A row of the compressed sparse matrix has nz + 2 nu entries.
         entries = inside[k, part, inner_state]
-        columns = k[:, None] * nw + np.r_[:nw, nw + nx : 2 * nw]
-        starts = np.arange(len(k) + 1) * (nx + 2 * nu)
+        columns = k[:, None] * nw + np.r_[:nw, nw + nz : 2 * nw]
+        starts = np.arange(len(k) + 1) * (nz + 2 * nu)
         within = sp.csr_array(
             (entries.ravel(), columns.ravel(), starts), (len(k), knots * nw)
         )
         rows = sp.vstack((at_knots, within), format="csr")
-        return Models(ends, rows, (knot, state), (k, part, inner_state))
+        return Models(charts, ends, rows, (knot, state), (k, part, inner_state))
 
     def _step(
         self,
@@ -394,25 +406,30 @@ class Search(NamedTuple):
         limits are by default those of the trial.
         """
         u = trial.u
-        nx = len(near)
+        kept, T = models.charts
+        nz = kept.shape[1]
         ends = models.ends
         rows = models.rows
         missed = trial.missed if missed is None else missed
+        gaps_left = np.take_along_axis(missed, kept[1:], axis=1)
         room = models.distances(trial) if room is None else room
-        prices, of_x = np.full(room.shape[1], self.price), np.zeros((len(u), nx))
-        cost, g = np.hstack((of_x + near, self.cost)), np.hstack((of_x, effort))
-        scale = np.concatenate((np.ones(nx), self.cost.sum(axis=0) ** -0.5))
+        prices, of_x = np.full(room.shape[1], self.price), np.zeros((len(u), nz))
+        cost, g = np.hstack((of_x + near[kept], self.cost)), np.hstack((of_x, effort))
+        scale = np.concatenate((np.ones(nz), self.cost.sum(axis=0) ** -0.5))
         limits = self.limits[:, None] - u
         solution = solve_stages(
-            ends, missed, cost, g, limits, rows, room, prices, scale
+            ends, gaps_left, cost, g, limits, rows, room, prices, scale
         )
         if solution is None:
             return None
-        z, du, gaps, multipliers = solution
-        moved = rows @ np.hstack((z, du)).ravel()
+        steps, du, prices_of_gaps, multipliers = solution
+        moved = rows @ np.hstack((steps, du)).ravel()
+        z = (T @ steps[:, :, None])[:, :, 0]
+        gaps = np.zeros_like(missed)
+        np.put_along_axis(gaps, kept[1:], prices_of_gaps, axis=1)
         outside = float(excess(room - moved).sum())
         forces = (rows.T @ multipliers).reshape(len(u), -1)
-        gradient = effort + forces[:, nx:] + _by_costates(ends, forces[:, :nx])
+        gradient = effort + forces[:, nz:] + _by_costates(ends, forces[:, :nz])
         # A goal has equal limits. Its errors count as violations.
         slack = np.where(multipliers > 0.0, room[1], -room[0]) * (room[1] > room[0])
         products = np.abs(multipliers) * np.where(

@@ -2,19 +2,24 @@
 
 from collections.abc import Iterable
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
+from scipy.linalg import qr
 
+from fflin.base.errors import located
 from fflin.base.rotation import rotation_matrices
-from fflin.base.validation import Array
+from fflin.base.validation import Array, Indices, Mask
 from fflin.dynamics.aba import Aba
+from fflin.dynamics.closure import Closure
 from fflin.dynamics.coordinates import PIN_ANGULAR, PIN_LINEAR
 from fflin.dynamics.integrators import (
     DEFAULT_INTEGRATOR,
     CommutatorFree4,
     integrate_rows,
 )
+from fflin.dynamics.projection import ProjectedAba
 from fflin.dynamics.state import StateMap
 from fflin.linear.linearization import Linearizer
 from fflin.linear.trajectory import cubic
@@ -31,7 +36,22 @@ _STEPS = 16
 # of steps.
 _MOST_OF_JACOBIANS = 16
 
+# A prescribed state is determined by others if its pivot is below this fraction of the largest.
+_DETERMINED = 1e-6
+
 Point = tuple[Array, Array]
+
+
+class Charts(NamedTuple):
+    """Independent coordinates of the steps z of the knots, nz for each knot.
+
+    The constraints of the robot determine the other entries of z. Without constraints, all entries
+    are independent.
+    """
+
+    kept: Indices  # indices (N + 1, nz) of the independent entries of z
+    T: Array  # (N + 1, nx, nz): z of a knot as a linear function of its independent entries
+
 
 # Configurations (N, steps + 1, nq) and velocities (N, steps + 1, nv) of the motions over N
 # intervals. The first row of a motion is its knot, and each step adds a row.
@@ -58,6 +78,10 @@ class Shooting:
         self.steps = _FEWEST_STEPS
         self.h = np.diff(t)
         self._aba = Aba(self.state)
+        # Projection on the constraints of the robot, or None if it has none.
+        self._projected: ProjectedAba | None = None
+        if robot.constraints:
+            self._aba = self._projected = ProjectedAba(self.state)
         self._linearizer = Linearizer(robot, moving=True)
         free = robot.wheels if wheels is None else wheels
         self.wheels = [self.state.names.index(f"q_m.{name}") for name in free]
@@ -79,7 +103,43 @@ class Shooting:
         moved_q = integrate_rows(
             self.state.robot.model, q, self.state.spread(difference)
         )
-        return moved_q, v + self.state.spread(rates)
+        return self._closed(moved_q, v + self.state.spread(rates))
+
+    def _closed(self, q: Array, v: Array) -> Point:
+        """Return points (k, nq), (k, nv) on the constraints of the robot, near given points."""
+        if self._projected is None:
+            return q, v
+        return self._projected.closed(q, v)
+
+    def charts(self, q: Array, v: Array) -> Charts:
+        """Return the independent coordinates of the steps of the knots q, v."""
+        nx = self.state.nx
+        if self._projected is None:
+            kept = np.broadcast_to(np.arange(nx), (len(q), nx))
+            return Charts(kept, np.broadcast_to(np.eye(nx), (len(q), nx, nx)))
+        reductions = [
+            self._linearizer.reduction(*point) for point in zip(q, v, strict=True)
+        ]
+        kept = np.array([reduction.kept for reduction in reductions])
+        maps = np.array([reduction.T for reduction in reductions])
+        return Charts(kept, self._size[:, None] * maps / self._size[kept][:, None])
+
+    def determining(self, end: Point, asked: Mask) -> Mask:
+        """Return prescribed states (nx,) that determine all prescribed states near a goal.
+
+        `asked` (nx,) is True for the prescribed states. Without constraints, no state determines
+        another one.
+        """
+        if self._projected is None:
+            return asked
+        rows = np.flatnonzero(asked)
+        (T,) = self.charts(end[0][None], end[1][None]).T
+        R, order = qr(T[rows].T, mode="r", pivoting=True)
+        sizes = np.abs(R.diagonal())
+        rank = int((sizes > _DETERMINED * sizes.max(initial=0.0)).sum())
+        determining = np.zeros_like(asked)
+        determining[rows[order[:rank]]] = True
+        return determining
 
     def motions(self, q: Array, v: Array, u: Array, steps: int = 0) -> Motions:
         """Integrate each interval from its first knot; q, v and the inputs u have N + 1 rows each.
@@ -99,7 +159,8 @@ class Shooting:
             return self._aba.accelerations(q, v, first + t / h * change)
 
         for step in range(steps):
-            points.append(method.step(rate, step * method.dt, *points[-1]))
+            end = method.step(rate, step * method.dt, *points[-1])
+            points.append(self._closed(*end))
         configurations, speeds = zip(*points, strict=True)
         return np.stack(configurations, axis=1), np.stack(speeds, axis=1)
 
@@ -156,14 +217,20 @@ class Shooting:
                 break
 
     def jacobians(
-        self, q: Array, v: Array, u: Array, parts: int = 1
+        self,
+        q: Array,
+        v: Array,
+        u: Array,
+        parts: int = 1,
+        charts: Charts | None = None,
     ) -> tuple[Array, Array]:
         """Return the Jacobians of the interval ends, and of points within the intervals.
 
-        The first array (N, nx, nx + 2 nu) contains the Jacobians of the interval ends with respect
-        to three vectors: the step z of the first knot, the inputs at the first knot, and the inputs
-        at the next knot. The second array (N, parts - 1, nx, nx + 2 nu) contains the Jacobians of
-        the points that divide each interval into equal parts.
+        The first array (N, nz, nz + 2 nu) contains the Jacobians of the interval ends, in the
+        independent coordinates of the next knot, with respect to three vectors: the step of the
+        first knot in its independent coordinates, the inputs at the first knot, and the inputs at
+        the next knot. The second array (N, parts - 1, nx, nz + 2 nu) contains the Jacobians of the
+        points that divide each interval into equal parts.
         """
         # Integrate dZ/dt = A Z + G along the motions by Runge-Kutta steps. Z contains the Jacobians
         # of all intervals, and G = [0, (1 - s) B, s B], because the input is (1 - s) times the
@@ -172,6 +239,9 @@ class Shooting:
         N = len(self.h)
         nx = len(self._size)
         nu = u.shape[1]
+        if charts is None:
+            charts = self.charts(q, v)
+        nz = charts.kept.shape[1]
         steps = min(self.steps // 4, _MOST_OF_JACOBIANS)
         stages = 2 * steps + 1  # of an interval; neighbouring steps share a stage
         s = np.arange(stages) / (2.0 * steps)
@@ -182,15 +252,17 @@ class Shooting:
         v = v[:, ::2]
         inputs = u[:-1, None] + s[:, None] * np.diff(u, axis=0)[:, None]
         points = (rows.reshape(-1, rows.shape[-1]) for rows in (q, v, inputs))
-        models = self._linearizer.along(*points)
-        A = models["A"].reshape(N, stages, nx, nx)
-        B = models["B"].reshape(N, stages, nx, nu)
+        along, driven = self._models(*points)
+        A = along.reshape(N, stages, nx, nx)
+        B = driven.reshape(N, stages, nx, nu)
         A = self._size[:, None] * A / self._size
         s = s[:, None, None]
-        G = np.concatenate((np.zeros_like(A), (1.0 - s) * B, s * B), axis=3)
+        by_step = np.zeros((N, stages, nx, nz))
+        G = np.concatenate((by_step, (1.0 - s) * B, s * B), axis=3)
 
         h = self.h[0] / steps
-        Z: Array = np.tile(np.eye(nx, nx + 2 * nu), (N, 1, 1))
+        Z: Array = np.zeros((N, nx, nz + 2 * nu))
+        Z[:, :, :nz] = charts.T[:-1]
         # Points within the interval, in steps from its beginning. The Jacobians at these points are
         # interpolated by a cubic polynomial over each step.
         inner_points = np.arange(1, parts) / parts * steps
@@ -207,7 +279,15 @@ class Shooting:
             in_step = (inner_points >= step) & (inner_points < step + 1)
             powers = (inner_points[in_step] - step)[:, None] ** np.arange(4)
             inside.append(np.einsum("ij,kjlm->kilm", powers, coefficients))
-        return Z, np.concatenate(inside, axis=1)
+        ends = np.take_along_axis(Z, charts.kept[1:, :, None], axis=1)
+        return ends, np.concatenate(inside, axis=1)
+
+    def _models(self, q: Array, v: Array, u: Array) -> tuple[Array, Array]:
+        """Return A (k, nx, nx) and B (k, nx, nu) of the errors about k points."""
+        if self._projected is not None:
+            return self._linearizer.tangent_along(q, v, u)
+        models = self._linearizer.along(q, v, u)
+        return models["A"], models["B"]
 
     def guess(self, start: Point, end: Point) -> tuple[Array, Array, Array]:
         """Return knots q, v on a cubic curve between two points, and approximate inputs u."""
@@ -246,13 +326,28 @@ class Shooting:
             rate[:] = pin.Jexp3(turn) @ rate
         v[:, PIN_LINEAR] = (v[:, None, PIN_LINEAR] @ rotation_matrices(q[:, 3:7]))[:, 0]
         q[-1], v[-1] = end
+        q, v = self.near(q, v)
         return q, v, self.inputs(self.t, q, v)
+
+    def near(self, q: Array, v: Array) -> Point:
+        """Return the knots on the constraints that are nearest to q, v; `InputError` if none are.
+
+        The joints stay within their position limits.
+        """
+        if self._projected is None:
+            return q, v
+        closure = Closure(self.state)
+        closed = q.copy()
+        for row, t in zip(closed, self.t.tolist(), strict=True):
+            with located(f"the motion at which the search begins, at t = {t:g} s"):
+                row[:] = closure.nearest(row)
+        return self._closed(closed, v)
 
     def inputs(self, t: Array, q: Array, v: Array) -> Array:
         """Return inputs (K, nu) that approximately cause a motion q (K, nq), v (K, nv)."""
-        u = np.zeros((len(q), len(self._linearizer().u0)))
+        u = np.zeros((len(q), len(self._aba.actuation.names)))
         wanted = np.gradient(v, t, axis=0) - self._aba.accelerations(q, v, u)
-        by_u = self._linearizer.along(q, v, u)["B"][:, self.state.nx // 2 :]
+        by_u = self._models(q, v, u)[1][:, self.state.nx // 2 :]
         rates = self.state.velocities(wanted)[..., None]
         # The wheels accelerate as needed. Wheels are light, so with their rows, the least-squares
         # problem would be about standing wheels instead of the motion of the base and the joints.

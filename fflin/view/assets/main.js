@@ -23,15 +23,18 @@ function extent(points) {
   return Math.max(...high.map((x, k) => x - low[k]));
 }
 
-// The entries of constraints and of their forces, which share one scale.
-function constraintsOf({ constraints, reactions }) {
+// The entries of constraints, of their forces and of their torques; each kind has one scale.
+function constraintsOf({ constraints, reactions, couples }) {
   if (!constraints.length) return [];
   const names = constraints.map(({ name }) => name).join(", ");
   const label = constraints.length > 3 ? `${constraints.length} constraints` : `constraint${constraints.length > 1 ? "s" : ""} ${names}`;
   const entries = [{ label, colour: CONSTRAINT, paths: constraints.map(({ path }, k) => [...path, `constraint ${k}`]) }];
-  if (!reactions.length) return entries;
-  const scale = `force of constraints (longest: ${figure(strongest(reactions), 2)} N)`;
-  return [...entries, { label: scale, colour: CONSTRAINT, paths: [["meshcat", "reactions"]] }];
+  for (const [kind, unit, arrows, node] of [["force", "N", reactions, "reactions"], ["torque", "N m", couples, "couples"]]) {
+    if (!arrows.length) continue;
+    const scale = `${kind} of constraints (longest: ${figure(strongest(arrows), 2)} ${unit})`;
+    entries.push({ label: scale, colour: CONSTRAINT, paths: [["meshcat", node]] });
+  }
+  return entries;
 }
 
 // The entries of the magnetic field, and of moments and torque of magnetorquers.
@@ -135,8 +138,8 @@ function main() {
 
   info.t = floats(info.t);
   decodeOrbit(info);
-  for (const each of [...info.trails, ...info.followed, ...info.reactions]) each.points = floats(each.points);
-  for (const each of [...info.arrows, ...info.plumes, ...info.reactions, ...info.readouts]) each.values = floats(each.values);
+  for (const each of [...info.trails, ...info.followed, ...info.reactions, ...info.couples]) each.points = floats(each.points);
+  for (const each of [...info.arrows, ...info.plumes, ...info.reactions, ...info.couples, ...info.readouts]) each.values = floats(each.values);
   if (info.field) for (const key of ["values", "torque"]) info.field[key] = floats(info.field[key]);
   for (const each of info.moments) each.values = floats(each.values);
   for (const each of info.constraints) each.active = floats(each.active);

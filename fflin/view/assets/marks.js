@@ -13,7 +13,7 @@ function largest(values, size) {
   return Math.sqrt(square);
 }
 
-const strongest = (reactions) => Math.max(0, ...reactions.map(({ values }) => largest(values, 3)));
+const strongest = (arrows) => Math.max(0, ...arrows.map(({ values }) => largest(values, 3)));
 
 function flat(colour) {
   return new THREE.MeshBasicMaterial({ color: new THREE.Color(colour).convertSRGBToLinear(), toneMapped: false });
@@ -113,16 +113,26 @@ function reactionArrow({ points, values, longest, most, size }) {
   return group;
 }
 
+// The torque of a constraint about the frame on which it acts; all constraints have one scale.
+function coupleArrow({ points, size, ...each }) {
+  const group = torqueArrow({ ...each, size, colour: CONSTRAINT, radius: 0.06 * size });
+  const { show } = group;
+  group.show = (i) => {
+    group.position.fromArray(points, 3 * i);
+    show(i);
+  };
+  return group;
+}
+
 // An arrow along the axis with an arc about it, both as long as the torque is large.
-function torqueArrow({ colour, values, longest, size }) {
-  const most = largest(values, 3);
+function torqueArrow({ colour, values, longest, size, most = largest(values, 3), radius = 0.17 * size }) {
   const group = new THREE.Group();
   const material = seenThrough(colour);
-  const axis = arrow(colour, 0.007 * size, material);
-  const radius = 0.17 * size;
+  const thickness = 0.04 * radius;
+  const axis = arrow(colour, thickness, material);
   const arc = new THREE.Group();
-  const ring = new THREE.Mesh(new THREE.TorusGeometry(radius, 0.007 * size, 10, 60, 1.6 * Math.PI), material);
-  const tip = new THREE.Mesh(new THREE.ConeGeometry(0.022 * size, 0.06 * size, 18), material);
+  const ring = new THREE.Mesh(new THREE.TorusGeometry(radius, thickness, 10, 60, 1.6 * Math.PI), material);
+  const tip = new THREE.Mesh(new THREE.ConeGeometry(0.13 * radius, 0.35 * radius, 18), material);
   ring.renderOrder = tip.renderOrder = 5;
   tip.position.set(radius * Math.cos(1.6 * Math.PI), radius * Math.sin(1.6 * Math.PI), 0);
   tip.rotation.z = 1.6 * Math.PI;
@@ -253,6 +263,8 @@ function makeMarks(viewer, info) {
   info.moments.forEach((each) => add([...each.path, `moment ${each.name}`], momentArrow({ ...each, size })));
   const most = strongest(info.reactions);
   info.reactions.forEach((each, k) => add(["meshcat", "reactions", `${k}`], reactionArrow({ ...each, most, size })));
+  const mostTorque = strongest(info.couples);
+  info.couples.forEach((each, k) => add(["meshcat", "couples", `${k}`], coupleArrow({ ...each, most: mostTorque, size })));
   info.plumes.forEach((each, k) => add([...each.path, `plume ${k}`], plume({ ...each, size })));
   return (i) => {
     wrench.position.copy(base.position);

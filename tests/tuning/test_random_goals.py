@@ -1,0 +1,92 @@
+"""Random plants, laws and goals: a goal that is called met is met in a sweep of other robots."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+
+import fflin
+from tests.support.tuning import of_sweep
+
+TORQUE, NOISE = 0.01, 1e-4
+FREQUENCIES = np.geomspace(1e-3, 1e3, 2000)
+
+
+def random_plant(rng):
+    """A satellite with flexible panels, and its uncertain parameters."""
+    robot = fflin.load(
+        "servicer_7dof",
+        lock=["joint_*"],
+        inputs=[fflin.BaseTorque()],
+        outputs=[fflin.BasePose()],
+        stiffness={"panel_*": 10.0 ** rng.uniform(1.0, 3.0)},
+        damping={"panel_*": 10.0 ** rng.uniform(-1.5, 0.7)},
+    )
+    ranges = {
+        "base.density": rng.uniform(0.05, 0.4),
+        "panel_left.density": rng.uniform(0.05, 0.3),
+        "panel_*.stiffness": {
+            "range": rng.uniform(0.05, 0.4),
+            "tied": bool(rng.random() < 0.5),
+        },
+    }
+    chosen = rng.choice(list(ranges), rng.integers(1, 4), replace=False)
+    return fflin.uncertain(robot, {str(key): ranges[str(key)] for key in chosen})
+
+
+def random_law(rng):
+    """A PD or PID controller, maybe with filters."""
+    law = fflin.PD("q_b", "tau_b", shared=bool(rng.random() < 0.7))
+    if rng.random() < 0.2:
+        law = fflin.PID("q_b", "tau_b", shared=True)
+    if rng.random() < 0.4:
+        law = fflin.Notch((0.5, 10.0)) * law
+    return fflin.LowPass((0.5, 30.0), order=int(rng.integers(1, 3))) * law
+
+
+def random_goals(rng):
+    """A margin, a gain and a gain of the command."""
+    pointing = 10.0 ** rng.uniform(-4.0, -2.5)
+    above, below = rng.uniform(4.0, 15.0), 10.0 ** rng.uniform(-1.0, 1.0)
+    return [
+        fflin.Margin(rng.uniform(0.4, 0.9), hard=bool(rng.random() < 0.6)),
+        fflin.MaxGain({"tau_b": TORQUE}, {"q_b": pointing}),
+        fflin.RollOff({"q_b": NOISE}, {"tau_b": 1.0}, above=above, below=below),
+    ]
+
+
+def swept_values(policy, goals, lin, dt):
+    """Values of the goals in a sweep, without the code of tuning."""
+    margin, pointing, command = goals
+    disk = fflin.margins(policy, lin).disk
+    values = [margin.disk / disk]
+    if dt:
+        return values
+    gains = of_sweep(policy, (lin.A, lin.B, lin.C, lin.D), FREQUENCIES)
+    values.append(gains[:, 0, 0].max() * TORQUE / pointing.outputs["q_b"])
+    high = FREQUENCIES >= command.above
+    values.append(gains[high, 1, 1].max() * NOISE / command.below)
+    return values
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("seed", range(6))
+def test_a_goal_that_is_called_met_is_met_by_other_robots_of_the_ranges(seed):
+    rng = np.random.default_rng(seed)
+    uncertain, law, goals = random_plant(rng), random_law(rng), random_goals(rng)
+    dt = rng.uniform(0.05, 0.3) if seed % 4 == 3 else None
+    tuned = fflin.tune(uncertain, law, goals, dt=dt, starts=1, steps=60, seed=seed)
+    size = len(uncertain.blocks)
+    corners = np.array(list(itertools.product((-1.0, 1.0), repeat=size)))
+    draws, _ = uncertain.draws(200, seed=1000 + seed)
+    largest = np.zeros(1 if dt else 3)
+    for deltas in np.vstack((corners, draws)):
+        lin = fflin.linearize(uncertain.at(uncertain.values(deltas)))
+        model = lin.discretize(dt) if dt else lin
+        largest = np.maximum(largest, swept_values(tuned, goals, model, dt))
+    for goal, value in zip(tuned.goals, largest.tolist(), strict=False):
+        # Draws of another seed can be a little worse than the examined models.
+        assert value <= goal.worst * 1.002
+        assert not (goal.met and goal.worst < 0.998) or value <= 1.0
+        assert math.isnan(goal.bound) or value <= goal.bound
