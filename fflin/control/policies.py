@@ -43,17 +43,18 @@ from fflin.control.policy import (
 )
 from fflin.control.sensed_laws import sensed
 from fflin.control.sensors import timing_of_robot
-from fflin.dynamics.coordinates import Chart, Frame
+from fflin.dynamics.coordinates import LINEAR, Chart, Frame
 from fflin.dynamics.integrators import held_exponential
 from fflin.dynamics.outputs import Measuring
 from fflin.dynamics.state import Actuation, StateMap, selection
 from fflin.dynamics.state_rows import readout
-from fflin.kernel.allocation import nearest, nearest_unbounded
+from fflin.kernel.allocation import LIGHT, nearest, nearest_unbounded
 from fflin.linear.fit import about_point, require_configuration_size, require_fit
 from fflin.linear.holding import held_if_possible, wheel_notes
 from fflin.linear.model import LinearModel, gain_map
 from fflin.linear.trajectory import Trajectory
 from fflin.robot.fields import input_limits, limits_of
+from fflin.robot.inputs import BaseForce, Thruster
 from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:
@@ -568,9 +569,13 @@ class Allocation(Policy):
     thrusters and motors of the simulated robot then produce the generalised force that is closest
     to the commanded force, without negative thrust and without exceeding an input limit. The
     squared distance between the two forces is e^T M e. Here e is the difference between the
-    accelerations that the two forces cause, and M is the inertia of the robot. So a force on the
-    base that was not commanded is an error, too. If thrusters exert torque only together with a
-    force, the torque therefore differs from the command; use pairs of opposite thrusters.
+    accelerations that the two forces cause, and M is the inertia of the robot.
+
+    If `design` has inputs that push the robot, such as a force on the base, a force that was not
+    commanded is an error, too. Otherwise the acceleration of the centre of mass in e is multiplied
+    by 0.001. So thrusters also realise a torque that they exert only together with a force. Among
+    the inputs that exert the torque, those with the smallest force are used. The force moves
+    passive joints; motors of joints compensate for it.
 
     Parameters
     ----------
@@ -713,6 +718,12 @@ class Allocation(Policy):
         return AllocatedPolicy(self, robot)
 
 
+def translation_weight(design: Robot) -> float:
+    """Return the weight of the acceleration of the centre of mass, for an `Allocation`."""
+    pushes = any(isinstance(item, BaseForce | Thruster) for item in design.inputs)
+    return 1.0 if pushes else LIGHT
+
+
 class AllocatedPolicy(BoundLaw):
     """Policy that realises the commands of an `Allocation` with the inputs of a robot."""
 
@@ -733,6 +744,7 @@ class AllocatedPolicy(BoundLaw):
         self._data = robot.create_data()
         self._design_data = allocation.design.create_data()
         self._limits = input_limits(robot, limits_of(robot))
+        self._excess = 1.0 - translation_weight(allocation.design)
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -749,7 +761,7 @@ class AllocatedPolicy(BoundLaw):
         """Return the inputs (nu,) whose generalised force is nearest to the commanded force.
 
         All inputs are within their limits. The difference d of the two forces has the length
-        sqrt(d' M^-1 d), with the inertia M of the design.
+        sqrt(d' M^-1 d), with the inertia M of the design and the weight `translation_weight`.
         """
         state = self._design.state
         chart = state.unchecked_chart(q)
@@ -757,6 +769,10 @@ class AllocatedPolicy(BoundLaw):
         force = self._design.columns(self._data, q, _flux(self._design, t)) @ command
         columns = self._columns(self._robot, chart, q, t)
         M = state.project(pin.crba(state.robot.model, self._design_data, q).T)
+        # The columns of M for a translation, divided by the mass, are the forces that accelerate
+        # the whole robot without rotation.
+        excess = self._excess * columns[LINEAR] / M[LINEAR, LINEAR][0, 0]
+        columns = columns - M[:, LINEAR] @ excess
         # With M = L L', the length of d is the Euclidean norm of L^-1 d.
         L = np.linalg.cholesky(M)
         scaled = np.linalg.solve(L, np.column_stack((columns, force)))

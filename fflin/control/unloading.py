@@ -49,9 +49,9 @@ def unload_wheels(law: LawT, design: Robot, rate: float) -> LawT:
 
     Thrusters that push in one direction only produce the external torque by `Allocation`. Choose k
     such that ``k * momentum`` is below the torque of the thrusters, because saturated thrusters
-    disturb the attitude. The thrusters must also be able to exert the torque without a force on the
-    base, because `Allocation` counts this force as an error. A constant external torque T leaves
-    the momentum T/k in the wheels.
+    disturb the attitude. If the thrusters exert a torque only together with a force, give a design
+    without `BaseForce`, for which `Allocation` lets them push the robot. A constant external torque
+    T leaves the momentum T/k in the wheels.
 
     Parameters
     ----------

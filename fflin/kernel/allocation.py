@@ -27,6 +27,11 @@ from fflin.kernel.vectors import Entries, called, load, root, store
 # scaled inputs x. If several x produce the same force, the second term selects the x with the
 # smallest norm.
 LEAST = 1e-7
+
+# Weight of the acceleration of the centre of mass, if no input of the design pushes the robot.
+# Then the torque is exact, even if thrusters exert it only together with a force. Among the inputs
+# that exert the torque, those with the smallest force are used.
+LIGHT = 1e-3
 _LOW, _HIGH, _FREE, _TRIED = 0, 1, 2, 4
 
 
@@ -58,13 +63,19 @@ class LeastSquares(
     """
 
 
-class Allocation(namedtuple("Allocation", "asking giving point work problem back")):
+class Allocation(
+    namedtuple("Allocation", "asking giving point work translation weight problem back")
+):
     """Allocation of commands for the inputs of the robot `asking` to the inputs of `giving`.
 
     The two robots differ only in their inputs. `point` holds q and inputs: first the inputs
     of `asking`, later the inputs of `giving`. `work` is work space. If `problem` has no inputs,
     nothing is allocated. `back` is the problem of `write_difference`: it finds the inputs of
     `asking` for a given force.
+
+    `weight` (1,) is the weight of the acceleration of the centre of mass, see `LIGHT`.
+    `translation` is work space for three columns of M, one after the other: the generalised forces
+    that accelerate the whole robot without rotation.
     """
 
 
@@ -75,6 +86,7 @@ ALLOCATION = Struct(
     **_ROBOTS,
     point=POINT,
     work=LANED,
+    translation=LANED,
     problem=LEAST_SQUARES,
     back=LEAST_SQUARES,
 )
@@ -186,8 +198,9 @@ def allocate(allocation, orbit, point, commanded, t):
     """Write to `point.u` the inputs of `giving` that replace a command for the inputs of `asking`.
 
     Within their bounds, these inputs minimise e^T M e, where e is the difference between their
-    accelerations and the accelerations of the command. If the problem has no inputs, the command is
-    written unchanged. In orbit, magnetorquers act in the field at the time t [s]; `orbit` is None
+    accelerations and the accelerations of the command. The acceleration of the centre of mass in e
+    is multiplied by `allocation.weight`. If the problem has no inputs, the command is written
+    unchanged. In orbit, magnetorquers act in the field at the time t [s]; `orbit` is None
     without an orbit.
     """
     if len(allocation.problem.least) == 0:
@@ -200,6 +213,7 @@ def allocate(allocation, orbit, point, commanded, t):
     columns = problem.columns
     vec.copy(point.q, 0, work_point.q, 0, len(work_point.q))
     configure(work, asking, work_point.q)
+    _write_translation(work, tree, allocation.translation)
     factorise(work, tree)
     if orbit is not None:
         write_now(orbit, t)
@@ -212,6 +226,7 @@ def allocate(allocation, orbit, point, commanded, t):
         for index in range(count):
             store(work_point.pushing, index, 1.0 if index == unit else 0.0)
         _write_force(work, giving, work_point, columns, unit * size)
+        _reduce_translation(allocation, columns, unit * size, size)
     for column in range(count + 1):
         _scale(work, tree, columns, column * size)
     for lane in range(vec.lane_count(point.u)):
@@ -261,6 +276,34 @@ def _write_columns(work, tree, orbit, point):
         write_columns(work, tree, model_flux_at(orbit, point.q))
     else:
         write_columns(work, tree, None)
+
+
+def _write_translation(work, tree, translation):
+    """Write the columns of M for the velocity of the base, from the packed M."""
+    packed = tree.offsets.packed
+    size = len(tree.row)
+    for k in range(size):
+        for axis in range(3):
+            # The packed M is the lower triangle, and the base has the rows 0 to 5.
+            row, column = max(k, 3 + axis), min(k, 3 + axis)
+            entry = load(work, packed + tree.row[row] + column)
+            store(translation, axis * size + k, entry)
+
+
+def _reduce_translation(allocation, columns, at, size):
+    """Multiply the acceleration of the centre of mass that a generalised force causes by `weight`.
+
+    The force begins at columns[at]. Its entries 3 to 5 are the sum of all external forces.
+    """
+    translation = allocation.translation
+    excess = 1.0 - allocation.weight[0]
+    mass = load(translation, 3)
+    push = vec.times(vec.get3(columns, at + 3), excess / mass)
+    for k in range(size):
+        part = push[0] * load(translation, k)
+        part = part + push[1] * load(translation, size + k)
+        part = part + push[2] * load(translation, 2 * size + k)
+        store(columns, at + k, load(columns, at + k) - part)
 
 
 def _scale(work, tree, columns, at):
