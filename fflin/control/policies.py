@@ -12,7 +12,7 @@ import pinocchio as pin
 
 from fflin.base import html
 from fflin.base.errors import InputError
-from fflin.base.validation import Array, frozen, instance, shaped
+from fflin.base.validation import Array, Vector, frozen, instance, shaped
 from fflin.control.channel import Law
 from fflin.control.delayed import is_delayed, law_with_memory
 from fflin.control.following import Following
@@ -54,7 +54,7 @@ from fflin.linear.holding import held_if_possible, wheel_notes
 from fflin.linear.model import LinearModel, gain_map
 from fflin.linear.trajectory import Trajectory
 from fflin.robot.fields import input_limits, limits_of
-from fflin.robot.inputs import BaseForce, Thruster
+from fflin.robot.inputs import BaseForce, JointTorque, Thruster
 from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:
@@ -572,10 +572,10 @@ class Allocation(Policy):
     accelerations that the two forces cause, and M is the inertia of the robot.
 
     If `design` has inputs that push the robot, such as a force on the base, a force that was not
-    commanded is an error, too. Otherwise the acceleration of the centre of mass in e is multiplied
-    by 0.001. So thrusters also realise a torque that they exert only together with a force. Among
-    the inputs that exert the torque, those with the smallest force are used. The force moves
-    passive joints; motors of joints compensate for it.
+    commanded is an error, too. Otherwise a translation of the robot counts only one thousandth, so
+    thrusters also realise a torque that they exert only together with a force. Among the inputs
+    that exert the torque, those with the smallest force are used. The force moves passive joints;
+    motors hold their joints against it.
 
     Parameters
     ----------
@@ -718,10 +718,18 @@ class Allocation(Policy):
         return AllocatedPolicy(self, robot)
 
 
-def translation_weight(design: Robot) -> float:
-    """Return the weight of the acceleration of the centre of mass, for an `Allocation`."""
-    pushes = any(isinstance(item, BaseForce | Thruster) for item in design.inputs)
-    return 1.0 if pushes else LIGHT
+def translation_excess(design: Robot, robot: Robot) -> Vector:
+    """Return the part (6 + n,) of a translation's force that is no error of an `Allocation`.
+
+    It is zero if an input of the design pushes the robot, and for joints without a motor.
+    """
+    excess = np.zeros(6 + robot.n)
+    if any(isinstance(item, BaseForce | Thruster) for item in design.inputs):
+        return excess
+    motors = {item.joint for item in robot.inputs if isinstance(item, JointTorque)}
+    excess[:6] = 1.0 - LIGHT
+    excess[6:] = [(1.0 - LIGHT) * (name in motors) for name in robot.joint_names]
+    return excess
 
 
 class AllocatedPolicy(BoundLaw):
@@ -744,7 +752,8 @@ class AllocatedPolicy(BoundLaw):
         self._data = robot.create_data()
         self._design_data = allocation.design.create_data()
         self._limits = input_limits(robot, limits_of(robot))
-        self._excess = 1.0 - translation_weight(allocation.design)
+        excess = translation_excess(allocation.design, robot)
+        self._excess = excess[:, np.newaxis]
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -761,7 +770,7 @@ class AllocatedPolicy(BoundLaw):
         """Return the inputs (nu,) whose generalised force is nearest to the commanded force.
 
         All inputs are within their limits. The difference d of the two forces has the length
-        sqrt(d' M^-1 d), with the inertia M of the design and the weight `translation_weight`.
+        sqrt(d' M^-1 d), with the inertia M of the design. `translation_excess` is left out of d.
         """
         state = self._design.state
         chart = state.unchecked_chart(q)
@@ -769,10 +778,10 @@ class AllocatedPolicy(BoundLaw):
         force = self._design.columns(self._data, q, _flux(self._design, t)) @ command
         columns = self._columns(self._robot, chart, q, t)
         M = state.project(pin.crba(state.robot.model, self._design_data, q).T)
-        # The columns of M for a translation, divided by the mass, are the forces that accelerate
-        # the whole robot without rotation.
-        excess = self._excess * columns[LINEAR] / M[LINEAR, LINEAR][0, 0]
-        columns = columns - M[:, LINEAR] @ excess
+        # The columns of M for a translation are the forces that accelerate the whole robot by
+        # 1 m/s^2 without rotation.
+        translation = columns[LINEAR] / M[LINEAR, LINEAR][0, 0]
+        columns = columns - self._excess * M[:, LINEAR] @ translation
         # With M = L L', the length of d is the Euclidean norm of L^-1 d.
         L = np.linalg.cholesky(M)
         scaled = np.linalg.solve(L, np.column_stack((columns, force)))

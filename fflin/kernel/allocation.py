@@ -28,9 +28,10 @@ from fflin.kernel.vectors import Entries, called, load, root, store
 # smallest norm.
 LEAST = 1e-7
 
-# Weight of the acceleration of the centre of mass, if no input of the design pushes the robot.
-# Then the torque is exact, even if thrusters exert it only together with a force. Among the inputs
-# that exert the torque, those with the smallest force are used.
+# Weight of a translation of the robot, if no input of the design pushes the robot. Then the torque
+# about the centre of mass is exact, even if thrusters exert it only together with a force. Among
+# the inputs that exert the torque, those with the smallest force are used. In a translation, motors
+# hold their joints; passive joints count as if the force did not reach them.
 LIGHT = 1e-3
 _LOW, _HIGH, _FREE, _TRIED = 0, 1, 2, 4
 
@@ -64,7 +65,7 @@ class LeastSquares(
 
 
 class Allocation(
-    namedtuple("Allocation", "asking giving point work translation weight problem back")
+    namedtuple("Allocation", "asking giving point work translation excess problem back")
 ):
     """Allocation of commands for the inputs of the robot `asking` to the inputs of `giving`.
 
@@ -73,9 +74,9 @@ class Allocation(
     nothing is allocated. `back` is the problem of `write_difference`: it finds the inputs of
     `asking` for a given force.
 
-    `weight` (1,) is the weight of the acceleration of the centre of mass, see `LIGHT`.
     `translation` is work space for three columns of M, one after the other: the generalised forces
-    that accelerate the whole robot without rotation.
+    that accelerate the whole robot without rotation. `excess` (6 + n,) is the part of these forces
+    that does not count as an error, see `LIGHT`.
     """
 
 
@@ -198,10 +199,9 @@ def allocate(allocation, orbit, point, commanded, t):
     """Write to `point.u` the inputs of `giving` that replace a command for the inputs of `asking`.
 
     Within their bounds, these inputs minimise e^T M e, where e is the difference between their
-    accelerations and the accelerations of the command. The acceleration of the centre of mass in e
-    is multiplied by `allocation.weight`. If the problem has no inputs, the command is written
-    unchanged. In orbit, magnetorquers act in the field at the time t [s]; `orbit` is None
-    without an orbit.
+    accelerations and the accelerations of the command. A translation of the robot counts in part,
+    see `Allocation.excess`. If the problem has no inputs, the command is written unchanged. In
+    orbit, magnetorquers act in the field at the time t [s]; `orbit` is None without an orbit.
     """
     if len(allocation.problem.least) == 0:
         vec.copy(commanded, 0, point.u, 0, len(point.u))
@@ -291,18 +291,17 @@ def _write_translation(work, tree, translation):
 
 
 def _reduce_translation(allocation, columns, at, size):
-    """Multiply the acceleration of the centre of mass that a generalised force causes by `weight`.
+    """Subtract the part `excess` of the translation that a generalised force causes.
 
     The force begins at columns[at]. Its entries 3 to 5 are the sum of all external forces.
     """
     translation = allocation.translation
-    excess = 1.0 - allocation.weight[0]
-    mass = load(translation, 3)
-    push = vec.times(vec.get3(columns, at + 3), excess / mass)
+    push = vec.times(vec.get3(columns, at + 3), 1.0 / load(translation, 3))
     for k in range(size):
         part = push[0] * load(translation, k)
         part = part + push[1] * load(translation, size + k)
         part = part + push[2] * load(translation, 2 * size + k)
+        part = part * allocation.excess[k]
         store(columns, at + k, load(columns, at + k) - part)
 
 

@@ -19,7 +19,7 @@ from fflin.base.rotation import rotation_matrix
 from fflin.base.validation import Array, Indices, Mask, shaped, vector
 from fflin.control.channel import channel_of
 from fflin.control.loops import Loop, Sample, measured_at
-from fflin.control.policies import translation_weight
+from fflin.control.policies import translation_excess
 from fflin.control.policy import BDotForm, Form, OutputForm, PathForm, Policy, StateForm
 from fflin.control.sensor_errors import drift_generator, noise_generator
 from fflin.control.tracking import AT_THE_END, TrajectoryFeedback
@@ -881,7 +881,7 @@ def _allocation(
         point=point,
         work=np.zeros(max(asks.tree.offsets.size, giving.tree.offsets.size)),
         translation=np.zeros(3 * size),
-        weight=np.array([translation_weight(asking.robot)]),
+        excess=translation_excess(asking.robot, plant.robot),
         problem=allocation.least_squares(least, most, size),
         back=allocation.least_squares(-free, free, size),
     )

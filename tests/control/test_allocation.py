@@ -1,6 +1,7 @@
 """Allocation of a torque to thrusters that exert it only together with a force."""
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
 import fflin
@@ -10,13 +11,14 @@ PLACES = ((0.5, 0.0, 0.4), (-0.5, 0.0, 0.4), (0.0, 0.5, 0.4), (0.0, -0.5, 0.4))
 TORQUE = np.array([0.3, -0.2, 0.0])
 
 
-def robots(*, limit=100.0, force=False):
+def robots(*, limit=100.0, force=False, passive=()):
     """Return a robot with the thrusters, and the robot for the design."""
     thrusters = [
         fflin.Thruster("base", place, (0, 0, 1), max=limit) for place in PLACES
     ]
     robot = fflin.load("servicer_7dof")
-    motors = [fflin.JointTorque(name) for name in robot.joint_names]
+    driven = [name for name in robot.joint_names if name not in passive]
+    motors = [fflin.JointTorque(name) for name in driven]
     wanted = [fflin.BaseTorque(), fflin.BaseForce()] if force else [fflin.BaseTorque()]
     return (
         robot.replace(inputs=[*thrusters, *motors]),
@@ -32,7 +34,8 @@ def posture(robot):
 
 def accelerations(robot, design, commanded):
     """Return M, commanded and attained accelerations (6 + n,), and all inputs."""
-    commanded = np.concatenate((commanded, np.zeros(robot.n)))
+    motors = len(robot.inputs) - len(PLACES)
+    commanded = np.concatenate((commanded, np.zeros(motors)))
     q = posture(robot)
     v = np.zeros(robot.nv)
     law = fflin.Allocation(lambda t, q, v: commanded, design)
@@ -54,6 +57,15 @@ def test_a_torque_without_a_wanted_force_is_exact_although_the_thrusters_push():
     # Opposite thrusters would only add force.
     assert min(thrust[0], thrust[1]) < 1e-6 * thrust.max()
     assert min(thrust[2], thrust[3]) < 1e-6 * thrust.max()
+
+
+@pytest.mark.parametrize("passive", [(), ("panel_left", "panel_right")])
+def test_the_thrusters_exert_the_torque_about_the_centre_of_mass(passive):
+    robot, design = robots(passive=passive)
+    thrust = accelerations(robot, design, TORQUE)[-1][:4]
+    center = pin.centerOfMass(robot.model, robot.create_data(), posture(robot))
+    moment = np.cross(np.array(PLACES) - center, (0.0, 0.0, 1.0)).T @ thrust
+    assert moment == pytest.approx(TORQUE, abs=1e-5)
 
 
 def test_a_design_with_a_force_counts_an_unwanted_force_as_an_error():
