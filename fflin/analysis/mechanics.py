@@ -12,7 +12,7 @@ import numpy as np
 from fflin.analysis import ranks
 from fflin.base.errors import FflinWarning, InputError
 from fflin.base.validation import Array, Indices, Values, instance
-from fflin.linear.model import LinearModel, refuse_delayed
+from fflin.linear.model import LinearModel, refuse_delayed, refuse_fixed
 
 # K or D counts as not symmetric if its relative asymmetry exceeds this. D counts as indefinite if
 # it has eigenvalues of both signs whose moduli exceed this fraction of the largest modulus.
@@ -42,6 +42,7 @@ def checked(lin: LinearModel) -> LinearModel:
     instance("lin", lin, LinearModel, "a fflin.LinearModel")
     lin.require_unchanged()
     refuse_delayed(lin, "this analysis")
+    refuse_fixed(lin, "this analysis")
     nx = len(lin.A)
     if lin.M.shape != (nx // 2, nx // 2) or nx % 2:
         raise InputError(

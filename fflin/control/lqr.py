@@ -43,7 +43,7 @@ from fflin.control.weights import (
 )
 from fflin.dynamics.state import selection
 from fflin.linear.holding import held, is_held
-from fflin.linear.model import LinearModel, refuse_frozen
+from fflin.linear.model import LinearModel, refuse_fixed, refuse_frozen
 
 # A relative residual above _COARSE gives a warning, and a residual above _USELESS raises an error.
 _COARSE, _USELESS = 1e-8, 1e-3
@@ -494,6 +494,7 @@ def at_fixed_point(lin: LinearModel) -> LinearModel:
     """
     instance("lin", lin, LinearModel, "a fflin.LinearModel").require_unchanged()
     refuse_frozen(lin, "a design about a fixed point")
+    refuse_fixed(lin, "a design")
     if is_held(lin):
         return lin
     advice = (

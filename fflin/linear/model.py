@@ -838,6 +838,15 @@ def refuse_sampled(dt: float, do: str) -> None:
         )
 
 
+def refuse_fixed(lin: LinearModel, what: str) -> None:
+    """Raise `InputError` for a model without states, of a robot whose constraints fix it."""
+    if not len(lin.A):
+        raise InputError(
+            f"{what} needs a model with states, but the constraints of '{lin.robot}' leave no "
+            "coordinate free; remove a constraint"
+        )
+
+
 def refuse_frozen(lin: LinearModel, what: str) -> None:
     """Raise `InputError` for a model that holds at one time only.
 

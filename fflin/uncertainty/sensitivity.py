@@ -15,7 +15,7 @@ from fflin.base.validation import Array, FrozenArrays, instance, numbers, shaped
 from fflin.base.writing import as_path
 from fflin.control.gain import Gain, gain_matrix
 from fflin.linear.files import record_of
-from fflin.linear.model import LinearModel, refuse_delayed, refuse_frozen
+from fflin.linear.model import LinearModel, refuse_delayed, refuse_fixed, refuse_frozen
 from fflin.uncertainty.derivatives import ModelDerivatives
 from fflin.uncertainty.lagging_derivatives import LaggingDerivatives
 from fflin.uncertainty.parameters import Parameter, Parameters
@@ -407,6 +407,7 @@ def sensitivity(lin: LinearModel) -> Sensitivity:
             "the model was loaded from a file, which contains no robot; linearise the robot again"
         )
     refuse_frozen(lin, "sensitivity")
+    refuse_fixed(lin, "sensitivity")
     if lin.delay.any():
         refuse_delayed(lin, "sensitivity")
     if robot.orbit and lin.frame == "local":
