@@ -504,7 +504,8 @@ def designed(
     robot = load_robot(arguments)
     design = robot_of_design(robot, arguments.allocate)
     lin = model_to_regulate(design, arguments, *point_of(design, arguments))
-    return robot, design, lin, gain_of(lin, arguments, allocated=design is not robot)
+    gain = gain_of(lin, arguments, robot, allocated=design is not robot)
+    return robot, design, lin, gain
 
 
 def tuning_of(
@@ -593,10 +594,19 @@ def weights_of(arguments: Namespace) -> dict[str, object]:
     return {"rule": arguments.weights, **given}
 
 
+def single_weights(arguments: Namespace) -> set[str]:
+    """Return the names in --q, --r and --bryson."""
+    return {name for name, _ in (*arguments.q, *arguments.r, *arguments.bryson)}
+
+
 def gain_of(
-    lin: fflin.LinearModel, arguments: Namespace, *, allocated: bool = False
+    lin: fflin.LinearModel,
+    arguments: Namespace,
+    robot: fflin.Robot,
+    *,
+    allocated: bool = False,
 ) -> fflin.Gain:
-    """Return the regulator of a model.
+    """Return the regulator of a model of `robot`, or of its robot for the design.
 
     The options --weights, --q, --r and --bryson define the weights, and --integral the integrated
     signals. With --sample or --delay, the model is first discretised. If `allocated` is true, the
@@ -610,10 +620,11 @@ def gain_of(
         sample = delay
     if sample is not None:
         lin = lin.discretize(sample, delay=delay)
+    weights = weights_of(arguments)
     try:
-        return fflin.lqr(
+        gain = fflin.lqr(
             lin,
-            weights=weights_of(arguments),
+            weights=weights,
             wheel_speeds=arguments.wheel_speeds,
             integral_action=integral,
         )
@@ -622,6 +633,14 @@ def gain_of(
         if allocated:
             message += "; --no-allocate weights single thrusters"
         raise UnknownNameError(message) from None
+    if not lin.weights or robot.weights:
+        return gain
+    # The weights of the model are the default weights of `robot_of_design`.
+    from fflin.control.magnetic_weights import described, magnetic_weights
+
+    defaults = magnetic_weights(robot)["bryson"]
+    rule = described(gain.weights, defaults, single_weights(arguments))
+    return replace(gain, weights=rule)
 
 
 def _phase_of(robot: fflin.Robot, arguments: Namespace) -> PhaseStart | None:
@@ -897,7 +916,7 @@ def about_point(
         sign = -1.0 if arguments.negative_feedback else 1.0
         feedback = fflin.LinearController(arguments.controller, lin, sign=sign)
     else:
-        gain = gain or gain_of(lin, arguments, allocated=design is not robot)
+        gain = gain or gain_of(lin, arguments, robot, allocated=design is not robot)
         feedback = _state_feedback(sampled_for(gain, lin), gain)
     if design is not robot:
         return fflin.Allocation(feedback, design), feedback, None

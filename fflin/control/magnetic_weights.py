@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import numpy as np
 
 from fflin.control.authority import point_properties
@@ -14,7 +16,7 @@ from fflin.robot.robot import Robot
 _TORQUE, _RATE, _ATTITUDE = 1.72, 0.58, 0.267
 
 
-def magnetic_weights(robot: Robot) -> dict[str, object]:
+def magnetic_weights(robot: Robot) -> dict[str, dict[str, float]]:
     """Return the entries of `weights` of a robot in orbit, for a regulator of the base torque.
 
     They make the loop as slow as the orbit.
@@ -28,3 +30,22 @@ def magnetic_weights(robot: Robot) -> dict[str, object]:
     for axis, value in zip("xyz", inertia.tolist(), strict=True):
         bryson[f"q_b.{axis}"] = min(1.0, _ATTITUDE * largest / value)
     return {"bryson": bryson}
+
+
+def described(rule: str, defaults: Collection[str], given: Collection[str]) -> str:
+    """Return the description of weights, which states which weights are defaults.
+
+    `rule` describes all single weights as given, although the user set only those named in `given`.
+    `defaults` are the names of the entries of `magnetic_weights`.
+    """
+    names, separator, others = rule.partition(" as given; ")
+    if not separator:
+        return rule
+    weighted = names.split(", ")
+    automatic = [name for name in weighted if name in defaults and name not in given]
+    if not automatic:
+        return rule
+    parts = [f"{', '.join(automatic)}: default for magnetorquers"]
+    if rest := [name for name in weighted if name not in automatic]:
+        parts.append(f"{', '.join(rest)} as given")
+    return "; ".join((*parts, others))

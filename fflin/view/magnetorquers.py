@@ -9,6 +9,7 @@ import numpy as np
 
 from fflin.base.rotation import rotation_matrices
 from fflin.base.validation import Array
+from fflin.dynamics.disturbance import true_field
 from fflin.dynamics.state import Actuation, StateMap
 from fflin.robot.inputs import Magnetorquer
 from fflin.robot.joints import ROOT, find_frame
@@ -49,12 +50,14 @@ def rods(robot: Robot, nodes: Sequence[Path]) -> list[Rod]:
 def fluxes(state: StateMap, t: Array) -> Array:
     """Return the magnetic flux density (N, 3) [T] at times t (N,) [s], in world axes.
 
-    There is no row if the robot has no magnetorquers.
+    It is the true field, which contains `field_scale` and `field_rotation` of the robot's
+    disturbance. There is no row if the robot has no magnetorquers.
     """
-    actuation = Actuation(state)
-    if not actuation.torquers:
+    field = state.field
+    if not Actuation(state).torquers or field is None:
         return np.zeros((0, 3))
-    return np.array([actuation.flux(time) for time in t.tolist()])
+    magnetic = true_field(state.robot, field)
+    return np.array([magnetic.at(time) for time in t.tolist()])
 
 
 def moments(state: StateMap, u: Array) -> Array:

@@ -1,10 +1,12 @@
 """Default weights of a regulator whose torque only magnetorquers produce."""
 
+from argparse import Namespace
+
 import numpy as np
 import pytest
 
 import fflin
-from fflin.commands.builders import robot_of_design
+from fflin.commands.builders import gain_of, robot_of_design
 from fflin.control.magnetic_weights import magnetic_weights
 
 
@@ -37,6 +39,33 @@ def test_given_weights_and_other_actuators_have_no_default_weights_for_slow_loop
     wheel = fflin.ReactionWheel((0, 0, 1), "base", inertia=1e-5)
     steered = without_weights().replace(inputs=[*robot.inputs, wheel])
     assert not robot_of_design(steered, None).weights
+
+
+def test_the_description_separates_default_weights_from_given_weights():
+    robot = without_weights()
+    design = robot_of_design(robot, None)
+    lin = fflin.linearize(design)
+    options = {"weights": None, "integral": None, "sample": 10.0, "wheel_speeds": None}
+    single = {"q": [], "r": [], "bryson": []}
+    default = gain_of(lin, Namespace(**options, **single), robot, allocated=True)
+    start = "omega_b, tau_b, q_b.x, q_b.y, q_b.z: default for magnetorquers; all other"
+    assert default.weights.startswith(start)
+    single["r"] = [("tau_b", 1e15)]
+    mixed = gain_of(lin, Namespace(**options, **single), robot, allocated=True)
+    start = (
+        "omega_b, q_b.x, q_b.y, q_b.z: default for magnetorquers; tau_b as given; all"
+    )
+    assert mixed.weights.startswith(start)
+
+
+def test_weights_of_the_robot_file_are_described_as_given():
+    robot = fflin.load("cubesat_magnetic")
+    lin = fflin.linearize(robot_of_design(robot, None))
+    options = {"weights": None, "integral": None, "sample": 10.0, "wheel_speeds": None}
+    single = {"q": [], "r": [], "bryson": []}
+    gain = gain_of(lin, Namespace(**options, **single), robot, allocated=True)
+    assert "as given" in gain.weights
+    assert "default for magnetorquers" not in gain.weights
 
 
 @pytest.mark.compiled

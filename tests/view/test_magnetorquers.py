@@ -53,6 +53,16 @@ def test_an_arrow_has_its_longest_length_at_the_limit_or_at_the_largest_moment(f
     assert scales(robot, values) == [0.2, 0.2, largest]
 
 
+def test_the_arrow_of_the_field_is_the_true_field():
+    satellite = fflin.load("cubesat_magnetic")
+    t = np.array([0.0, 500.0, 2000.0])
+    assumed = fluxes(StateMap(satellite), t)
+    errors = {"field_scale": 0.5, "field_rotation": [0.0, np.pi / 2, 0.0]}
+    true = fluxes(StateMap(satellite.replace(disturbance=errors)), t)
+    x, y, z = assumed.T  # a rotation of 90 deg about y maps x to -z, and z to x
+    np.testing.assert_allclose(true, 1.5 * np.column_stack((z, y, -x)), atol=1e-19)
+
+
 def test_a_robot_without_magnetorquers_has_no_field_on_its_page():
     robot = fflin.load("cubesat", orbit=500e3)
     assert fluxes(StateMap(robot), np.zeros(3)).shape == (0, 3)
