@@ -15,7 +15,7 @@ from fflin.base.validation import Array, FrozenArrays, instance, numbers, shaped
 from fflin.base.writing import as_path
 from fflin.control.gain import Gain, gain_matrix
 from fflin.linear.files import record_of
-from fflin.linear.model import LinearModel, refuse_delayed, refuse_fixed, refuse_frozen
+from fflin.linear.model import LinearModel, refuse_delayed, refuse_frozen
 from fflin.uncertainty.derivatives import ModelDerivatives
 from fflin.uncertainty.lagging_derivatives import LaggingDerivatives
 from fflin.uncertainty.parameters import Parameter, Parameters
@@ -306,7 +306,7 @@ class Sensitivity:
         )
         shown = self.parameters.ranked(only)
         lin = self.lin
-        sizes = [max(np.abs(x).max(), 1e-300) for x in (self.lin.A, self.lin.B)]
+        sizes = [np.abs(x).max(initial=1e-300) for x in (self.lin.A, self.lin.B)]
         rows = []
         for one, dA, dB in zip(self.parameters.values(), self.dA, self.dB, strict=True):
             small = one.part.partition(".")[0] in ("com", "position")
@@ -316,7 +316,7 @@ class Sensitivity:
             if small:
                 step = 0.01
             effect = [
-                step * np.abs(d).max() / size
+                step * np.abs(d).max(initial=0.0) / size
                 for d, size in zip((dA, dB), sizes, strict=True)
             ]
             if one.name in shown and max(effect) > 0.0:
@@ -407,7 +407,6 @@ def sensitivity(lin: LinearModel) -> Sensitivity:
             "the model was loaded from a file, which contains no robot; linearise the robot again"
         )
     refuse_frozen(lin, "sensitivity")
-    refuse_fixed(lin, "sensitivity")
     if lin.delay.any():
         refuse_delayed(lin, "sensitivity")
     if robot.orbit and lin.frame == "local":

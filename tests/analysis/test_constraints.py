@@ -101,7 +101,6 @@ def test_sampled_models_keep_their_independent_states(dt):
         fflin.lqr,
         fflin.modes,
         fflin.momentum_reduction,
-        fflin.sensitivity,
     ],
 )
 def test_a_model_without_states_is_refused(function):
@@ -111,3 +110,4 @@ def test_a_model_without_states_is_refused(function):
     assert lin.state_names == ()
     with pytest.raises(fflin.InputError, match="leave no coordinate free"):
         function(lin)
+    assert "none of these parameters changes A or B" in str(fflin.sensitivity(lin))
