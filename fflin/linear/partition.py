@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fflin.base.errors import ConstraintError, listed
+from fflin.base.errors import ConstraintError, InputError, listed
 from fflin.base.validation import Array, Indices, Vector
 from fflin.linear.constrained import Motions
 
@@ -35,6 +35,11 @@ class Partition(NamedTuple):
     ) -> Partition:
         """Return the partition with the names of the first part and of all later parts."""
         nx = len(first)
+        if len(later) != nx * len(times):
+            raise InputError(
+                f"switched_names has {len(later)} names, expected {nx} for each of the "
+                f"{len(times)} times in switches"
+            )
         groups = [later[k : k + nx] for k in range(0, len(later), nx)]
         return cls(times, (first, *groups))
 

@@ -64,8 +64,8 @@ def test_a_weld_without_a_frame_is_refused():
 
 
 def test_a_command_without_support_for_constraints_refuses_them():
-    message = refused("validity", *GRASP)
-    assert "ranges of validity do not support constraints" in message
+    message = refused("linearize", *GRASP, "--orbit", "5e5", "--periodic", "4")
+    assert "do not support constraints" in message
 
 
 @pytest.mark.exhaustive
