@@ -118,16 +118,29 @@ def browser():
         yield browser
 
 
-@pytest.fixture(scope="module")
-def brief_validity():
-    """Shorten the runs of `validity`, for tests that do not judge how accurate they are.
-
-    The runs predict one time constant instead of three, in longer steps, and have settled at a
-    fifth of the start. So a region takes a tenth of the time.
-    """
+@contextlib.contextmanager
+def _brief_validity():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("fflin.campaign.settling._CONSTANTS", 1.0)
         patch.setattr("fflin.campaign.settling._STEP_PREDICTED", 1.0)
         patch.setattr("fflin.campaign.settling._STEP", 1.0)
         patch.setattr("fflin.campaign.settling.SETTLED", 0.2)
+        yield
+
+
+@pytest.fixture
+def brief_validity():
+    """Shorten the runs of `validity`, for a test that does not judge how accurate they are.
+
+    The runs predict one time constant instead of three, in longer steps, and have settled at a
+    fifth of the start. So a region takes a tenth of the time.
+    """
+    with _brief_validity():
+        yield
+
+
+@pytest.fixture(scope="module")
+def brief_validity_in_module():
+    """Shorten the runs of `validity` in all tests of a module, as `brief_validity` does."""
+    with _brief_validity():
         yield

@@ -716,8 +716,9 @@ def periodic_end(
 # multiplier 1, with rounding errors.
 _LARGEST_MULTIPLIER = 1.001
 
-# Number of times that the intervals between knots are halved for a rough periodic solution.
-_HALVINGS = 3
+# For a rough periodic solution, the intervals between knots are halved until their number is at
+# least this. A loop of magnetorquers that is 80 times as fast as the orbit needs 512 intervals.
+_INTERVALS = 1024
 
 # Entries of transition matrices below this fraction of the largest one are rounding errors.
 _UNCOUPLED = 1e-12
@@ -782,19 +783,17 @@ def _rough_cost(times: Array, at: Callable[[Array], Array]) -> Array:
     The maps between the knots `times` (k,) [s] are not accurate if the cost changes fast. Then the
     doubling may fail, and is repeated with more knots. Raise `LinAlgError` if it fails always.
     """
-    for _ in range(_HALVINGS):
+    while True:
         maps = periodic_riccati.interval_maps(at, times)
         try:
             return periodic_riccati.periodic_cost(
                 periodic_riccati.over_period(iter(maps[::-1]))
             )
         except np.linalg.LinAlgError:
-            middle = 0.5 * (times[1:] + times[:-1])
-            times = np.sort(np.concatenate((times, middle)))
-    maps = periodic_riccati.interval_maps(at, times)
-    return periodic_riccati.periodic_cost(
-        periodic_riccati.over_period(iter(maps[::-1]))
-    )
+            if len(maps) >= _INTERVALS:
+                raise
+        middle = 0.5 * (times[1:] + times[:-1])
+        times = np.sort(np.concatenate((times, middle)))
 
 
 def _swept(maps: Array, P: Array) -> Array:

@@ -52,7 +52,7 @@ class Constraints(
     namedtuple(
         "Constraints",
         "first second first_pose second_pose pair component location jacobian basis triangle "
-        "error roots change multipliers forces least at packed",
+        "error roots change multipliers forces squares least at packed",
     )
 ):
     """Constraints between k pairs of frames, with r independent rows, and their work space.
@@ -73,8 +73,10 @@ class Constraints(
       `multipliers` (r,): its multipliers.
     - `forces` (r,): the forces [N] and moments [N m] on the second frame in axes of the first
       frame, which the constraints exert at the first stage of the latest step.
+    - `squares` (r,): the squared lengths of the columns of Z at the start; before, zeros.
     - `least` (1,): the smallest fraction of a column of Z that is orthogonal to the columns before
-      it, squared. If it is zero, the rows are not independent.
+      it, squared, or the smallest of its squared length at the start. If it is zero, the rows are
+      not independent.
     - `at` (nq,): a displaced configuration. `packed`: a copy of the packed M.
     """
 
@@ -330,6 +332,13 @@ def factorise(work, tree, constraints):
         bodies.solve_inwards(work, tree, basis, at)
         for k in range(size):
             store(basis, at + k, load(basis, at + k) * load(roots, k))
+        # A row that vanishes as a whole has only rounding errors, which can seem independent.
+        square = _product(basis, at, basis, at, size)
+        start = load(constraints.squares, row)
+        start = chosen(0.0, start, start, square)
+        store(constraints.squares, row, start)
+        fraction, least = square / start, load(constraints.least, 0)
+        store(constraints.least, 0, chosen(fraction, least, fraction, least))
     orthonormalise(
         basis, constraints.triangle, constraints.least, len(constraints.error)
     )

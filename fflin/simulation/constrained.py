@@ -222,6 +222,7 @@ class Constrained:
             change=np.zeros(size),
             multipliers=np.zeros(r),
             forces=np.zeros(r),
+            squares=np.zeros(r),
             least=np.ones(1),
             at=np.zeros(nq),
             packed=np.zeros(len(tree.path)),

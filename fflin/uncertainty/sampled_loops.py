@@ -169,7 +169,8 @@ class SampledLoops:
         return self._closed(row)[0][0]
 
     def _undamped(self, row: Array) -> float:
-        poles = np.linalg.eigvals(self._transition(row))
+        # Negative real poles have complex rates, so the logarithm is complex.
+        poles = np.linalg.eigvals(self._transition(row)).astype(complex)
         # A pole at z = 0 has no rate. It is the pole of a delay, and as damped as possible.
         rates = np.log(poles[np.abs(poles) > np.finfo(float).tiny])
         ratios = rates.real / np.maximum(np.abs(rates), 1e-300)

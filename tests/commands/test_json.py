@@ -144,7 +144,7 @@ CASES = {
 
 
 @pytest.fixture(scope="module")
-def python(tmp_path_factory, brief_validity):
+def python(tmp_path_factory, brief_validity_in_module):
     folder = tmp_path_factory.mktemp("json")
     (folder / "u.toml").write_text('[dispersions]\n"q_m" = 0.05\n"omega_b.z" = 0.02\n')
     robot = fflin.load(ROBOT)

@@ -21,6 +21,7 @@ from fflin.simulation.lanes import constraints_of, loop_name, noises, packed
 from fflin.simulation.plan import Plan, SimulationOptions
 from fflin.simulation.plant import Plant
 from fflin.simulation.run import STOPS, go, stop_conditions, stop_of
+from tests.simulation.test_constraints import turning
 from tests.support.marks import exhaustive
 from tests.support.motions import HOME, displaced
 from tests.support.motions import motion as trajectory
@@ -335,6 +336,15 @@ def test_closed_loops_agree_with_pinocchio_in_orbit_and_with_lags(orbit, lag):
     assert np.abs(rows.residual(result[0][-1])).max() < 1e-12
     assert np.abs(rows.jacobian(q) @ result[1][0]).max() < 1e-12
     assert np.abs(result[2]).max() > 0.01
+
+
+@pytest.mark.parametrize("start", [0.1, 0.2])
+def test_a_row_that_vanishes_as_a_whole_ends_the_run(start):
+    # When all links are on one line, the row along them has only rounding errors.
+    robot, q, v = turning(start)
+    q, *_ = advanced(planned(robot, q0=q, v0=v, duration=0.4, dt=0.05))
+    # The initial state, and the steps to the line.
+    assert len(q) == 1 + round(start / 0.05)
 
 
 def test_a_body_moves_by_newtons_law_until_its_thrust_fails():
