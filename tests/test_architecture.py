@@ -67,3 +67,19 @@ def test_the_package_and_its_citation_have_the_same_version():
         re.search(r"^  version = \{(.*)\},$", start, re.M),
     ]
     assert [match and match[1] for match in result] == [fflin.__version__] * 3
+
+
+def test_no_constant_of_a_module_replaces_another_with_the_same_name():
+    package = Path(fflin.__file__).parent
+    twice = []
+    for path in package.rglob("*.py"):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        names = [
+            target.id
+            for node in tree.body
+            if isinstance(node, ast.Assign)
+            for target in node.targets
+            if isinstance(target, ast.Name)
+        ]
+        twice += [(path.name, name) for name in names if names.count(name) > 1]
+    assert not twice

@@ -2,7 +2,7 @@
 
 import io
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
@@ -179,3 +179,15 @@ def require_matplotlib() -> None:
         why = str(error).partition(";")[0]
         message = f"matplotlib cannot be loaded: {why}; correct MPLBACKEND"
         raise MissingPackageError(message) from None
+
+
+def legend_below(panel: Axes, names: Sequence[str], title: str) -> None:
+    """Draw a legend below the figure, with a name for each of the first curves of a panel."""
+    panel.figure.legend(
+        panel.get_lines()[: len(names)],
+        names,
+        title=title,
+        loc="outside lower center",
+        ncols=2,
+        fontsize=letters_of(1.3 * len(names), 200.0),
+    )

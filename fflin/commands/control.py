@@ -59,7 +59,7 @@ _MAGNETIC = (
     "faster loop is unstable; simulate several orbits to see whether the loop is stable"
 )
 
-_ALLOCATED = (
+_TORQUE_OF_OTHERS = (
     "the law commands a torque on the base, which thrusters or magnetorquers produce: `fflin "
     "simulate` and `montecarlo` allocate it, in Python fflin.Allocation does; "
     "--no-allocate tunes a law that commands each of them"
@@ -107,7 +107,7 @@ def tune(arguments: Namespace) -> Report:
     tuned = fflin.tune(plant, structure, goals, **settings)
     text = str(tuned)
     if allocated:
-        text += f"\n\n{folded([_ALLOCATED])}"
+        text += f"\n\n{folded([_TORQUE_OF_OTHERS])}"
     files: dict[Path | None, Callable[[Path], object]] = {
         arguments.output_file: tuned.save,
         arguments.plot: lambda path: fflin.plot_tuned(tuned, path),

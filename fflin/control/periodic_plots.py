@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fflin.base.figures import Axes, Figure, cycle, drawing, letters_of
+from fflin.base.figures import Axes, Figure, cycle, drawing, legend_below
 from fflin.base.process import in_one_thread
 from fflin.base.validation import Array, Values
 from fflin.control.loop_margins import Margins
@@ -111,14 +111,7 @@ def plot_periodic(
         for panel in (sizes, sensitivity, together):
             end = math.pi / closed.dt / len(closed.laws)
             panel.set(xlabel="frequency [rad/s]", xlim=(lifted.w[0], end))
-        figure.legend(
-            sizes.get_lines()[: len(names)],
-            names,
-            title="margins at each input: gain factors, delay",
-            loc="outside lower center",
-            ncols=2,
-            fontsize=letters_of(1.3 * len(names), 200.0),
-        )
+        legend_below(sizes, names, "margins at each input: gain factors, delay")
         figure.suptitle(_title(margins), x=0.02, ha="left")
     return figure
 

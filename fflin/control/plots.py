@@ -15,6 +15,7 @@ from fflin.base.figures import (
     Figure,
     cycle,
     drawing,
+    legend_below,
     letters_of,
     logarithmic,
 )
@@ -469,14 +470,7 @@ def _plot_closed(
             ylabel="[dB]",
             xlim=(w[0], w[-1]),
         )
-        figure.legend(
-            sizes.get_lines()[: len(names)],
-            names,
-            title="margins at each input: phase, gain factors, delay",
-            loc="outside lower center",
-            ncols=2,
-            fontsize=letters_of(1.3 * len(names), 200.0),
-        )
+        legend_below(sizes, names, "margins at each input: phase, gain factors, delay")
         time = f", sampled at {closed.dt:g} s" if closed.dt else ""
         if margins.delay:
             time += f", delay {margins.delay:g} s"

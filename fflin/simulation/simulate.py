@@ -315,11 +315,8 @@ def controller_of(policy: object) -> str:
     """Return the name of a controller, or "no control" without a policy."""
     if policy is None:
         return "no control"
-    kind = type(policy).__name__
-    if kind in _CONTROLLERS:
-        return _CONTROLLERS[kind]
-    inner = getattr(policy, "policy", None)
-    return "controller" if inner is None else controller_of(inner)
+    law = policy.inner if isinstance(policy, Policy) else policy
+    return _CONTROLLERS.get(type(law).__name__, "controller")
 
 
 def motion_of(plan: Plan, run: Recording, foresees: Predictor | None = None) -> Motion:

@@ -183,6 +183,9 @@ def test_thrusters_that_are_to_pull_are_warned_of_where_they_are_designed_with(c
         assert says(err, "fflin: warning: ", "negative thrust", "x_plus_top")
         code, out, err = run(capsys, "cubesat")
         assert (code, err) == (0, "") and "negative thrust" not in out
+        code, out, err = run(capsys, "cubesat", "--inputs", "cubesat")
+        assert (code, err) == (0, "")
+        assert "tau_b and F_b are realised by the thrusters" in " ".join(out.split())
 
 
 @pytest.mark.exhaustive

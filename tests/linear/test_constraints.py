@@ -273,16 +273,21 @@ def mimicking(tmp_path):
     return fflin.load(path, constraints=[fflin.Spherical("la")], gravity=(1, 2, 3))
 
 
-@pytest.mark.exhaustive
-@pytest.mark.parametrize("make", [in_orbit, flexible, with_wheels, mimicking])
-def test_constraints_agree_on_robots_of_every_kind(make, tmp_path):
+def moving(make, tmp_path, rng):
+    """Return a robot of one of the kinds above, with a point in motion and its inputs."""
     robot = make(tmp_path) if make is mimicking else make()
-    rng = np.random.default_rng(5)
     joints = {name: 0.3 for name in robot.joint_names[:1]}
     q = fflin.configuration(robot, joints, rpy=(10, 20, 30))
     nu = 0.05 * rng.normal(size=6 + robot.n)
     q, v = fflin.closed(robot, q, fflin.StateMap(robot).spread(nu))
     u = rng.normal(size=len(fflin.linearize(robot, q).u0))
+    return robot, q, v, u
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("make", [in_orbit, flexible, with_wheels, mimicking])
+def test_constraints_agree_on_robots_of_every_kind(make, tmp_path):
+    robot, q, v, u = moving(make, tmp_path, np.random.default_rng(5))
     check = fflin.check(robot, fflin.linearize(robot, q, v, u))
     assert check.ok, check
 

@@ -84,14 +84,20 @@ def parallelogram(crank, coupler, length, width, gravity=9.81):
     )
 
 
-def strut(mass, length, stiffness):
-    """Two rods in line, with a spring between them, hinged at both ends and pressed by a slider."""
+def hinged_rods(mass, length):
+    """The model of two rods in line, which a slider can press."""
     build = Build(rod(mass, length))
     build.frame("foot", build.base, at())
     small = pin.Inertia(0.1, np.zeros(3), 0.01 * np.eye(3))
     knee = build.add(1, pin.JointModelRZ(), at(x=length), "knee", rod(mass, length))
     shoe = build.add(knee, pin.JointModelRZ(), at(x=length), "shoe", small)
     build.add(shoe, pin.JointModelPX(), at(), "slide", small)
+    return build
+
+
+def strut(mass, length, stiffness):
+    """Two rods in line, with a spring between them, hinged at both ends and pressed by a slider."""
+    build = hinged_rods(mass, length)
     return build.robot(
         "strut",
         constraints=[fflin.Hinge("foot"), fflin.Weld("slide")],

@@ -7,7 +7,13 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from tests.linear.test_constraints import flexible, in_orbit, mimicking, with_wheels
+from tests.linear.test_constraints import (
+    flexible,
+    in_orbit,
+    mimicking,
+    moving,
+    with_wheels,
+)
 from tests.support.constrained import (
     Build,
     at,
@@ -209,13 +215,8 @@ def test_random_robots_have_the_derivatives_of_differences(first):
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("make", [in_orbit, flexible, with_wheels, mimicking])
 def test_robots_of_every_kind_have_the_derivatives_of_differences(make, tmp_path):
-    robot = make(tmp_path) if make is mimicking else make()
     rng = np.random.default_rng(5)
-    joints = {name: 0.3 for name in robot.joint_names[:1]}
-    q = fflin.configuration(robot, joints, rpy=(10, 20, 30))
-    nu = 0.05 * rng.normal(size=6 + robot.n)
-    q, v = fflin.closed(robot, q, fflin.StateMap(robot).spread(nu))
-    u = rng.normal(size=len(fflin.linearize(robot, q).u0))
+    robot, q, v, u = moving(make, tmp_path, rng)
     lin = fflin.linearize(robot, q, v, u)
 
     def relinearised(other):

@@ -3,7 +3,6 @@
 from itertools import product
 
 import numpy as np
-import pinocchio as pin
 import pytest
 
 import fflin
@@ -11,11 +10,9 @@ from fflin.uncertainty.derivatives import UNITS
 from tests.linear.test_constraints import flexible, mimicking, with_wheels
 from tests.support.commands import run
 from tests.support.constrained import (
-    Build,
-    at,
+    hinged_rods,
     parallelogram,
     random_constraints,
-    rod,
 )
 from tests.support.marks import exhaustive
 
@@ -161,12 +158,7 @@ def test_a_parallelogram_is_a_fraction_of_its_masses():
 
 def pressed_strut(mass, length, stiffness, load):
     """Two rods between hinges, with a spring at the knee, pressed by a spring that is strained."""
-    build = Build(rod(mass, length))
-    build.frame("foot", build.base, at())
-    small = pin.Inertia(0.1, np.zeros(3), 0.01 * np.eye(3))
-    knee = build.add(1, pin.JointModelRZ(), at(x=length), "knee", rod(mass, length))
-    shoe = build.add(knee, pin.JointModelRZ(), at(x=length), "shoe", small)
-    build.add(shoe, pin.JointModelPX(), at(), "slide", small)
+    build = hinged_rods(mass, length)
     press = 1e3
     return build.robot(
         "pressed_strut",
