@@ -14,7 +14,7 @@ from scipy.linalg import block_diag
 
 from fflin.analysis.ranks import DECAY
 from fflin.base import html, svg
-from fflin.base.errors import InputError, listed, require_known
+from fflin.base.errors import FflinError, InputError, listed, require_known
 from fflin.base.names import group_of, input_keys, with_units, without_past
 from fflin.base.record import Design
 from fflin.base.tables import cut, folded, grid, matrix, signals
@@ -527,15 +527,23 @@ def _constrained_model(gain: Gain, state: StateMap, made: str) -> LinearModel:
     require_same(made, state, "state", tuple(names), units_of_all)
     require_same(made, state, "input", gain.input_names, gain.input_units)
     q, v = state.to_pinocchio(np.array([values[name] for name in state.names]))
-    return linearize(
-        state.robot,
-        q,
-        v,
-        gain.u0,
-        frame=state.frame,
-        reference=state.reference,
-        independent=states[: len(states) // 2],
-    )
+    independent = states[: len(states) // 2]
+    try:
+        return linearize(
+            state.robot,
+            q,
+            v,
+            gain.u0,
+            frame=state.frame,
+            reference=state.reference,
+            independent=independent,
+        )
+    except FflinError as error:
+        raise InputError(
+            f"{made} with {len(independent)} independent coordinates, which do not describe the "
+            "given robot with its constraints; give the robot with the constraints of the gain, "
+            f"or make the gain again ({error})"
+        ) from error
 
 
 def sampled_for(gain: Gain, lin: LinearModel) -> LinearModel:

@@ -70,6 +70,17 @@ def test_gains_with_and_without_constraints_are_told_apart(tmp_path):
 
 @needs_compiler
 @pytest.mark.exhaustive
+@pytest.mark.parametrize(
+    "other", [fflin.Hinge("tool_left", "tool_right"), fflin.Weld("base")]
+)
+def test_a_gain_of_other_constraints_is_refused(other, tmp_path):
+    robot, q = arms(GRIP)
+    lin = fflin.linearize(robot, q)
+    gain = reloaded(fflin.lqr(lin), tmp_path)
+    with pytest.raises(fflin.InputError, match="the constraints of the gain"):
+        model_of(gain, arms(other)[0], "the gain was made", lin.reference)
+
+
 def test_c_code_of_a_saved_gain_flies_like_the_policy(tmp_path):
     robot, q = arms(GRIP)
     lin = fflin.linearize(robot, q).discretize(0.1)
