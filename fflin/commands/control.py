@@ -257,7 +257,7 @@ def simulate(arguments: Namespace) -> Report:
             "impulse": impact.impulse,
             "energy_lost": impact.energy_lost,
         }
-        text += f"\n{folded([f'impact at the start: {impact.told}'])}"
+        text += f"\n{folded([f'impact at the start: {impact.summary}'])}"
     record["margins"], line = _margins_of(policy, settings)
     if line:
         text += f"\n{folded([line])}"

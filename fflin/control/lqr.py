@@ -230,7 +230,7 @@ def _with_margin(
     return replace(
         design,
         weights=f"{design.weights}; {change}",
-        _slower=partial(redesign, since=change.factor),
+        _slower=partial(redesign, before=change.factor),
     )
 
 
@@ -246,11 +246,12 @@ def _slower(
     weights: Rule | None,
     wheel_speeds: bool | None,
     integral_action: Integrated | None,
-    since: float = 1.0,
+    before: float = 1.0,
 ) -> Gain:
-    """Return a regulator with default weights, whose bandwidth is divided by ``since * factor``.
+    """Return a regulator with default weights, whose bandwidth is divided by ``before * factor``.
 
-    The regulator without these factors has already given all warnings.
+    `before` is the factor of the regulator that is made slower. This regulator has already given
+    all warnings.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FflinWarning)
@@ -259,7 +260,7 @@ def _slower(
             weights=weights,
             wheel_speeds=wheel_speeds,
             integral_action=integral_action,
-            slower=since * factor,
+            slower=before * factor,
         )
 
 

@@ -279,7 +279,7 @@ def _goal_point(
 
 
 def _on_constraints(state: StateMap, start: Point, end: Point) -> tuple[Point, Point]:
-    """Return start and goal on the constraints of the robot, if it has some.
+    """Return start and goal on the constraints of the robot, if it has any.
 
     Raise `ConstraintError` if one of them is far from the constraints.
     """

@@ -75,13 +75,13 @@ class Impact(FrozenArrays):
         )
 
     def __str__(self) -> str:
-        return folded([f"{self.robot.name}, {self.robot.n} joints: {self.told}"])
+        return folded([f"{self.robot.name}, {self.robot.n} joints: {self.summary}"])
 
     def _repr_html_(self) -> str:
-        return html.result_card(self, html.paragraph(self.told))
+        return html.result_card(self, html.paragraph(self.summary))
 
     @property
-    def told(self) -> str:
+    def summary(self) -> str:
         """One-line summary of the event, its impulse and the lost energy."""
         impulses = zip(np.abs(self.impulse).tolist(), self._units, strict=True)
         value, unit = max(impulses, default=(0.0, "N m s"))
@@ -341,7 +341,7 @@ class Capture(Impact):
     prefix: str
 
     @property
-    def told(self) -> str:
+    def summary(self) -> str:
         """One-line summary of the event, its impulse and the lost energy."""
         force, torque = (np.linalg.norm(half) for half in np.split(self.impulse[:6], 2))
         return (

@@ -384,7 +384,7 @@ class Motion(StatesAndInputs, Design):
                 q = part.q
                 v = part.v
                 event = part.event
-                note = f"{whole.t[-1]:g} s: {part.told}"
+                note = f"{whole.t[-1]:g} s: {part.summary}"
                 whole = replace(whole, notes=(*whole.notes, note))
             else:
                 instance("a phase", part, Motion, "a Motion, or an Impact before one")

@@ -154,7 +154,7 @@ class Plant(Aba):
         return rate, push
 
     def constrain(self, q: Array, v: Array) -> tuple[Array, Array]:
-        """Return an initial q (nq,) and v (nv,) on the constraints of the robot, if it has some.
+        """Return an initial q (nq,) and v (nv,) on the constraints of the robot, if it has any.
 
         From then on, `constrained` is set. Raise `ConstraintError` if q or v is far from them.
         """
