@@ -247,9 +247,9 @@ ABOUT: dict[str, str] = {
     "gravity": "uniform gravity in world axes [m/s^2]; zero by default",
     "passive": "joint without a motor: the default inputs do not include a torque at this joint",
     "inputs": "inputs of the robot: a TOML file of inputs, a bundled name such as cubesat, "
-    "`joints` (joint torques only), `base` (base torque and force only) or `wheels` (reaction "
-    "wheels of the robot file only). The default is the "
-    "inputs in robot.toml or, if there are none, base torque, base force and all joint torques",
+    "`joints` (joint torques only), `base` (base torque and force only) or `wheels` (wheels "
+    "only). The default is the inputs in robot.toml or, if there are none, base torque, base "
+    "force and all joint torques",
     "output": "outputs of the model: state (default), base, star_tracker, joints, rates, "
     "joints:NAME, rates:NAME (a joint or a pattern), com, momentum, frame:NAME (pose and "
     "velocity), pose:NAME, velocity:NAME, gyroscope:NAME, accelerometer:NAME, relative:NAME:TO "
