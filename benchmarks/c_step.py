@@ -2,8 +2,8 @@
 
 ``python -m benchmarks.c_step`` exports an integral law that estimates the bias of its gyroscope and
 knows the delay of its loop. It prints the ratio of the instructions of a step to those of a bare
-product of the matrix [A B; C D] of the law with a vector, and the ratio of their CPU times. It needs
-a C compiler, and valgrind for the instructions.
+product of the matrix [A B; C D] of the law with a vector, and the ratio of their CPU times. It
+needs a C compiler, and valgrind for the instructions.
 """
 
 import shutil
