@@ -810,14 +810,16 @@ def _remembered_asymmetry(gain: Gain, S: Array, scale: Array) -> Loop:
     The law remembers its own commands, and not the changed inputs, which are on their way in the
     plant.
     """
-    A, B = S @ gain.A @ S.T, S @ gain.B
+    A = S @ gain.A @ S.T
+    B = S @ gain.B
     names = gain.regulated or gain.state_names
     law = law_with_memory(gain.K @ S.T, A, B, gain.dt, names, gain.input_names)
     measured = selection(law.inputs, names)
     D = law.D @ measured
     memory = law.B @ measured
     F = np.block([[A + B @ D, B @ law.C], [memory, law.A]])
-    G = np.vstack((B, np.zeros((len(law.A), len(B.T))))) / scale
+    unaffected = np.zeros((len(law.A), B.shape[1]))
+    G = np.vstack((B, unaffected)) / scale
     H = scale[:, None] * np.hstack((D, law.C))
     return as_continuous(F, G, H, 0.5 * np.eye(len(H)), gain.dt)
 

@@ -375,14 +375,17 @@ class _Estimating(Loop):
 
     def _step(self, t: float, z: Array, measure: Measure) -> tuple[Array, Array]:
         """Return the command and the next estimate."""
-        policy, e = self.policy, self.policy.estimator
-        nx = len(policy.lin.A)
-        w = z[nx : nx + policy.Pi.shape[1]]
-        target = policy.target(policy.horizon.window(t), w)
-        du = target.u + self.receding.step(t, z[:nx] - target.x, target)
-        u = policy.lin.u0 + du
-        innovation = measure(u) - policy.lin.y0 - e.C @ z - e.D @ du
-        return u, e.A @ z + e.B @ du + e.L @ innovation
+        policy = self.policy
+        lin, estimator = policy.lin, policy.estimator
+        nx = len(lin.A)
+        x = z[:nx]
+        disturbance = z[nx : nx + policy.Pi.shape[1]]
+        target = policy.target(policy.horizon.window(t), disturbance)
+        du = target.u + self.receding.step(t, x - target.x, target)
+        u = lin.u0 + du
+        innovation = measure(u) - lin.y0 - estimator.C @ z - estimator.D @ du
+        following = estimator.A @ z + estimator.B @ du + estimator.L @ innovation
+        return u, following
 
 
 @dataclass(eq=False, repr=False)

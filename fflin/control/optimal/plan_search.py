@@ -214,11 +214,11 @@ class Search(NamedTuple):
             if converged and (limited == known).all():
                 break
         iterations += iteration + 1
-        # A dearer search does not help if the solver failed.
-        dear = self.price >= _LARGEST_PRICE or step is None
-        if _ENDS < trial.outside(limited) <= _HOPELESS and not dear:
-            dearer = self._replace(price=_RAISE * self.price)
-            return dearer.best(trial.q, trial.v, trial.u, iterations)
+        # A larger penalty does not help if the solver failed.
+        final = self.price >= _LARGEST_PRICE or step is None
+        if _ENDS < trial.outside(limited) <= _HOPELESS and not final:
+            stricter = self._replace(price=_RAISE * self.price)
+            return stricter.best(trial.q, trial.v, trial.u, iterations)
         trial = self._closed(trial, limited, first, left)
         return trial, self._optimality(trial, limited, first, iterations)
 
