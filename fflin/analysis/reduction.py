@@ -358,7 +358,7 @@ def wheel_inputs(lin: LinearModel) -> tuple[str, ...]:
 def ignorable_wheels(lin: LinearModel) -> tuple[Indices, Indices]:
     """Return two index arrays of wheels whose angles do not affect the other states.
 
-    The first array contains all such wheels. The second array contains those of them whose speeds
+    The first array contains all such wheels. The second array contains the wheels whose speeds
     do not affect the other states either.
     """
     nv = len(lin.M)

@@ -460,7 +460,7 @@ class Campaign(FrozenArrays):
         ------
         InputError
             If the run does not exist, or the campaign was loaded from a file and the robot or an
-            option is missing or is not that of the campaign.
+            option is missing or differs from the campaign.
 
         Warns
         -----

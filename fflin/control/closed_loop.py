@@ -278,7 +278,7 @@ class ClosedLoop:
         poles = np.linalg.eigvals(F)
         if self.dt:
             return bool(np.abs(poles).max(initial=0.0) < 1.0 - _ROUNDING)
-        # The poles of the approximation of a short delay are fast, and are no scale for others.
+        # The poles of the approximation of a short delay are fast, so they set no scale for the others.
         largest = self.own_rates().max(initial=0.0)
         return bool(poles.real.max(initial=-np.inf) < -_ROUNDING * largest)
 

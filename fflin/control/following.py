@@ -330,7 +330,7 @@ class ReferencePath:
         self._at_rest: Array = np.zeros(robot.nv)
         self._aba: Aba | None = None
         if law.senses_outputs and any(x.FEELS_ACCELERATION for x in robot.outputs):
-            # The reference accelerations are those of the robot of the trajectory.
+            # The reference accelerations belong to the robot of the trajectory.
             self._aba = Aba(StateMap(law.trajectory.robot, frame="local"))
         terms = law.terms
         if not law.senses_outputs:

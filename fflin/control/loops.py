@@ -211,7 +211,7 @@ class Loop(BoundLaw):
     def observe(self, t: float, q: Array, v: Array, a: Array, weights: Array) -> None:
         """Advance the sensors with a lag by a stage of the integrator with the acceleration a.
 
-        `weights` are those of `SensorLag.advance`.
+        `weights` are the weights of `SensorLag.advance`.
         """
         assert self.lag is not None
         _, measure, near = self.at(t)

@@ -72,7 +72,7 @@ def margins(
         sampled law.
     delay : float, optional
         Delay [s] of all inputs. A delay of `lin`, see `LinearModel.discretize`, is added. By
-        default, the delay is that of `lin`. If `lin` has none, it is the delay of the policy's
+        default, the delay of `lin` is used. If `lin` has none, it is the delay of the policy's
         model, as in `simulate`. Likewise, if `lin` has no lags, the loop has the lags of its
         robot, and a warning states lags for which the law was not designed. If the robot has no
         lags either, the loop has the lags of the policy's model.
@@ -88,7 +88,7 @@ def margins(
     Raises
     ------
     InputError
-        If the policy is not linear about a point, or its signals are not those of the model.
+        If the policy is not linear about a point, or its signals differ from the signals of the model.
 
     References
     ----------
@@ -120,7 +120,7 @@ def closed_loop(
     sample: float | None,
     at: Place = "inputs",
 ) -> ClosedLoop:
-    """Return the loop of a linear policy and a model; the arguments are those of `margins`."""
+    """Return the loop of a linear policy and a model; see `margins` for the arguments."""
     lin, delay = delayed_model(policy, lin, delay)
     if sample is not None:
         sample = positive("sample", sample, "s")

@@ -176,7 +176,7 @@ class MultirateCompensator(_Periodic):
     E : ndarray (N, nz, nu)
         Gain of the anti-windup, as in `Compensator`.
     poles : ndarray of complex
-        Poles of the closed loop over one period: those of the gain and of the estimator.
+        Poles of the closed loop over one period: poles of the gain and of the estimator.
     y0, u0 : ndarray
         Outputs and inputs at the operating point.
     dt : float

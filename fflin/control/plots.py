@@ -67,7 +67,7 @@ _LABEL_SIZE = (0.075, 0.055)
 
 _POINTS = 400
 
-# Discrete-time poles z below this magnitude are those of delays, and no rates.
+# Discrete-time poles z below this magnitude belong to delays, and have no rate.
 _DEADBEAT = 1e-6
 
 # Rates below this fraction of the largest frequency are rounding errors.

@@ -719,7 +719,7 @@ class Allocation(Policy):
 
 
 def translation_excess(design: Robot, robot: Robot) -> Vector:
-    """Return the part (6 + n,) of a translation's force that is no error of an `Allocation`.
+    """Return the part (6 + n,) of a translation's force that is not an error of an `Allocation`.
 
     It is zero if an input of the design pushes the robot, and for joints without a motor.
     """

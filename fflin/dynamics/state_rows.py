@@ -133,7 +133,7 @@ def attitude_errors(x: Array, target: Array) -> Array:
 
 
 def attitude_rotations(x: Array, target: Array) -> Array:
-    """Return the rotation vectors (N, 3) [rad] from the attitudes of targets to those of states.
+    """Return the rotation vectors (N, 3) [rad] from attitudes of targets to attitudes of states.
 
     The vectors are in target axes. `target` is one state (nx,), or one for each row of x (N, nx).
     """

@@ -50,7 +50,7 @@ _FLOAT = {
 _INVALID = 2  # status of a call, as in templates/header.h
 _LARGEST = 2**26  # [bytes] largest size of each file of a law
 
-# Valid names, without those of headers that the code or the C library includes.
+# Valid names, without the names of headers that the code or the C library includes.
 _NAME = r"(?!(features|float|math|std\w*)$)[A-Za-z][A-Za-z0-9_]{0,40}"
 
 

@@ -424,7 +424,7 @@ def linearize_trajectory(
 def along(motion: Trajectory, partition: Partition | None = None) -> LinearTrajectory:
     """Return the error dynamics of a trajectory, linearised about all knots.
 
-    The coordinates of a robot with constraints are those of the partition, or are chosen.
+    If the robot has constraints, `partition` gives the coordinates. By default, they are chosen.
     """
     robot = motion.robot
     if partition is None:

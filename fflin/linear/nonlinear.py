@@ -144,10 +144,9 @@ def jacobians(
 ) -> tuple[Array, list[Array]]:
     """Return the Jacobian of f at a point by central differences, and repetitions of it.
 
-    The repetitions have smaller steps than the given ones. Their curved variables, if there are
-    any, differ by a negligible fraction of the steps, so that their rounding errors are
-    independent. The differences between the Jacobians show the truncation error and the rounding
-    error of the first one.
+    The repetitions have smaller steps than `steps`. They displace the curved variables by a
+    negligible fraction of the steps, so that their rounding errors are independent. The differences
+    between the Jacobians show the truncation error and the rounding error of the first one.
     """
     again = []
     for ratio, sign in _REPETITIONS:

@@ -233,8 +233,8 @@ def saturated(
 ) -> tuple[Saturated, ...]:
     """Return the inputs and wheel speeds that reach a nonzero limit, longest saturation first.
 
-    The inputs in `pulsed` are thrusters that are off or on, so a pulse at the limit is no
-    saturation.
+    The inputs in `pulsed` are thrusters that are off or on, so a pulse at the limit does not
+    count as saturation.
     """
     held, full = np.diff(t, append=t[-1:]), list[Saturated]()
     for curve in signals:

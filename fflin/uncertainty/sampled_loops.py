@@ -240,7 +240,7 @@ class SampledLoops:
 class PeriodicLoops(SampledLoops):
     """Closed loops of a law whose matrices repeat after N > 1 samples.
 
-    Gains are those of the system whose sample is one period, which has the signals of N samples.
+    Gains are computed for the system whose sample is one period, which has the signals of N samples.
     """
 
     def _best_scale(self, row: Array) -> Array:

@@ -95,7 +95,7 @@ class Worst(html.Reported):
     Attributes
     ----------
     damping : Found
-        Least damping ratio of a pole. The poles of a periodic law are those of one period, with the
+        Least damping ratio of a pole. The poles of a periodic law are computed over one period, with the
         smallest of their possible frequencies.
     margin : Found
         Least disk margin at the inputs; 0 if a loop is unstable. For policies and sampled gains, it
@@ -113,7 +113,7 @@ class Worst(html.Reported):
         Factor by which all ranges may be scaled about their middles with the loop still stable. A
         value of 1 or more covers the whole set. It follows from an upper bound of the structured
         singular value over intervals of frequency, evaluated at five frequencies in each. NaN for a
-        sampled law, because the sampled model is no LFT: the worst loops are then those that the
+        sampled law, because the sampled model is not an LFT: the worst loops are then those that the
         search finds, without a guarantee.
     """
 
@@ -228,7 +228,7 @@ def _continuous_loops(
         if isinstance(gain, Policy):
             middle = loops.at_inputs(np.zeros(len(lft.repeats)), nu)
             scale = largest_scaled_gain(middle)[2]
-        # The inputs of the loop are those of the robot, and then the rates of the states of a
+        # The inputs of the loop are the inputs of the robot, and then the rates of the states of a
         # controller, which cannot be disturbed. `Channel` goes from the scaled inputs to the scaled
         # (S - T)/2, or to the outputs of the robot.
         no_rates = np.zeros(len(K) - nu)
@@ -268,7 +268,7 @@ def _sampled_loops(
 def _around(lft: LFT, gain: object) -> tuple[LFT, Array, Sequence[str]]:
     """Return the LFT with the states of a controller, K of u = -K x, and the judged states.
 
-    The inputs of the result are those of the robot, and then the rates of the controller's states.
+    The inputs of the result are the robot's inputs, and then the rates of the controller's states.
     """
     law = None
     if isinstance(gain, Compensator):

@@ -191,7 +191,7 @@ def _centre(M: Values, y: Array, t: float) -> Array:
         both = right @ N.conj().T
         gradient = 2.0 * (both.diagonal() - t * P.diagonal() + 1.0).real
         # With X = diag(e^(2 y)), S = t X - M^H X M and its derivative C_i = t E_i - m_i^H m_i, the
-        # second derivatives are those of -log det S + sum(2 y) by 2 y, times four.
+        # second derivatives are four times the second derivatives of -log det S + sum(2 y) by 2 y.
         cross = np.abs(right) ** 2
         curvature = t * t * np.abs(P) ** 2 - t * (cross + cross.T) + np.abs(both) ** 2
         curvature = 4.0 * (

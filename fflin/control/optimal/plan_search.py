@@ -204,7 +204,7 @@ class Search(NamedTuple):
                     break
                 near = np.maximum(_LESS * near, _LEAST * first)
                 continue
-            # With a large Levenberg-Marquardt cost, a small reduction is no sign of a minimum.
+            # With a large Levenberg-Marquardt cost, a small reduction does not indicate a minimum.
             converged = small and bool((near <= 1.1 * _LEAST * first).all())
             if small or gain >= _MUCH * saved:
                 near = np.maximum(_LESS * near, _LEAST * first)
@@ -403,7 +403,7 @@ class Search(NamedTuple):
         """Return the optimal steps of the knots and of the inputs, or None if there are none.
 
         `effort` is the gradient of the effort. The gaps `missed` and the distances `room` from the
-        limits are by default those of the trial.
+        limits are by default the gaps and distances of the trial.
         """
         u = trial.u
         kept, T = models.charts
