@@ -26,9 +26,9 @@ if TYPE_CHECKING:
 class ToolBatch(Design):
     r"""Linear models ``dx/dt = f0 + A (x - x0) + B (u - u0)`` in another tool's coordinates.
 
-    The models are converted from a `LinearBatch`. See `ToolModel` for the state x. ``tool_batch[i]`` is
-    the `ToolModel` of point i. The outputs are not converted, so it has none; for one model with
-    its outputs, convert ``batch[i].to(tool)`` of the `LinearBatch`.
+    The models are converted from a `LinearBatch`. See `ToolModel` for the state x.
+    ``tool_batch[i]`` is the `ToolModel` of point i. The outputs are not converted, so it has none;
+    for one model with its outputs, convert ``batch[i].to(tool)`` of the `LinearBatch`.
 
     Attributes
     ----------

@@ -56,7 +56,7 @@ def margins(
     three channels. For more, the result also contains the smallest destabilising change that was
     found.
 
-    The loop of measured outputs contains their sampling times and delays. If the law is periodic,
+    The loop of measured outputs contains their sample times and delays. If the law is periodic,
     as `MultirateFeedback` is, an oscillation has N frequencies at once, where N is the number of
     samples of the period. Its disk margin allows independent factors at each of them, as unknown
     dynamics of the channels cause them. The factors of the gain margins are constant, and the delay
@@ -77,7 +77,7 @@ def margins(
         robot, and a warning states lags for which the law was not designed. If the robot has no
         lags either, the loop has the lags of the policy's model.
     sample : float, optional
-        Sampling time [s] with which a continuous law is executed.
+        Sample time [s] with which a continuous law is executed.
     at : {"inputs", "outputs"}, optional
         Whether the inputs or the measured outputs are changed.
 
@@ -88,7 +88,8 @@ def margins(
     Raises
     ------
     InputError
-        If the policy is not linear about a point, or its signals differ from the signals of the model.
+        If the policy is not linear about a point, or its signals differ from the signals of the
+        model.
 
     References
     ----------
@@ -256,7 +257,7 @@ def laws_in_loop(
         if missing:
             what = f"the law measures {missing[0]}, which the model does not contain"
         else:
-            what = "the inputs of the law are not those of the model"
+            what = "the law and the model have different inputs"
         raise InputError(
             f"{what}; give the model of the robot for which the law was designed, with the same "
             "inputs and outputs"
@@ -271,7 +272,7 @@ def with_sensors(laws: list[System], lin: LinearModel) -> list[System]:
     if lin._robot is None:
         if len(laws) > 1:
             raise InputError(
-                "the model has no robot, so the sampling times and delays of its outputs are "
+                "the model has no robot, so the sample times and delays of its outputs are "
                 "unknown; give the model of fflin.linearize(robot)"
             )
         return laws

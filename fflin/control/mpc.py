@@ -118,7 +118,7 @@ def mpc(
     horizon : int
         Number N of samples in the horizon.
     sample : float
-        Sampling time h [s] of the controller; by default the sampling time of a sampled model.
+        Sample time h [s] of the controller; by default the sample time of a sampled model.
     dt : float
         Former name of `sample`.
     limits : "urdf", float, mapping or list of them, optional
@@ -190,7 +190,7 @@ def mpc(
         sample = dt
     if sample is None:
         if not lin.dt:
-            raise InputError("sample is missing; give the sampling time [s]")
+            raise InputError("sample is missing; give the sample time [s]")
         sample = lin.dt
     dt = number("sample", sample)
     # The design starts from the continuous model or trajectory. If lin is sampled, its sampling
@@ -327,7 +327,7 @@ class OutputMpc(OutputSensing, Mpc):
 
     @property
     def sample_time(self) -> float:
-        """Sampling time [s]."""
+        """Sample time [s]."""
         return self.lin.dt
 
     def bind(self, robot: Robot) -> Command:

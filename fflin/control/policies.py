@@ -230,7 +230,7 @@ class LinearLaw(Feedback):
 
     @property
     def sample_time(self) -> float:
-        """Sampling time [s]; 0 in continuous time."""
+        """Sample time [s]; 0 in continuous time."""
         return self.system.dt or 0.0
 
     def linear_law(self) -> System | None:
@@ -516,7 +516,7 @@ def _require_designed_for(gain: Gain, lin: LinearModel) -> None:
     same = {
         "states": gain.model_states == lin.state_names,
         "inputs": gain.input_names == lin.input_names,
-        "sampling time": bool(np.isclose(gain.dt, lin.dt)),
+        "sample time": bool(np.isclose(gain.dt, lin.dt)),
         "delay": _is_same_delay(gain, lin),
         "frame": gain.frame == lin.frame,
         "point": len(gain.model_states) == len(lin.x0)
@@ -624,7 +624,7 @@ class Allocation(Policy):
 
     @property
     def sample_time(self) -> float:
-        """Sampling time [s] of the inner policy."""
+        """Sample time [s] of the inner policy."""
         return self.inner.sample_time
 
     @property

@@ -1,4 +1,4 @@
-"""Sampled laws in series with sensors that have their own sampling times and delays."""
+"""Sampled laws in series with sensors that have their own sample times and delays."""
 
 from __future__ import annotations
 

@@ -217,7 +217,7 @@ class CLaw(Policy):
     name : str
         The `name` given to `write_c`, with which all names in the C code begin.
     dt : float
-        Sampling time [s] of the control law; 0 in continuous time.
+        Sample time [s] of the control law; 0 in continuous time.
     frame : str
         Axes of the inputs on the base, as in `LinearModel`.
     origin : pin.SE3 or None
@@ -286,7 +286,7 @@ class CLaw(Policy):
 
     @property
     def sample_time(self) -> float:
-        """Sampling time [s]; 0 in continuous time."""
+        """Sample time [s]; 0 in continuous time."""
         return self.dt
 
     @property

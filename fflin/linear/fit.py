@@ -246,7 +246,7 @@ def line_up(gain: Gain | GainBatch, lin: LinearModel) -> Array:
     Raises
     ------
     InputError
-        If gain and model have different frames or sampling times, or if each of them has states or
+        If gain and model have different frames or sample times, or if each of them has states or
         inputs that the other lacks, because they then belong to different robots.
 
     Examples

@@ -54,7 +54,7 @@ class LinearTrajectory(Trajectory):
     state_names, input_names, output_names : tuple of str
         Names of dx, du and dy.
     dt : float
-        Sampling time [s], during which du is constant; 0 in continuous time.
+        Sample time [s], during which du is constant; 0 in continuous time.
     period : float
         Time [s] after which the motion and the models repeat; 0 if they do not repeat.
     multipliers : ndarray (nx,)
@@ -304,7 +304,7 @@ class LinearTrajectory(Trajectory):
         Parameters
         ----------
         dt : float
-            Sampling time [s]. The duration must be a multiple of dt.
+            Sample time [s]. The duration must be a multiple of dt.
 
         Raises
         ------

@@ -134,7 +134,7 @@ def simulate(
         Whether the projection after each step restores momentum and centre of mass.
     sample : float, optional
         Sample time [s] of the policy, a multiple of dt; u is held between samples. The default is
-        the sampling time of the policy's model. If this model is in continuous time, the policy is
+        the sample time of the policy's model. If this model is in continuous time, the policy is
         evaluated at every stage of every integration step.
     delay : float or mapping, optional
         Time [s] from a sample until its command takes effect, a multiple of dt: one for all inputs,

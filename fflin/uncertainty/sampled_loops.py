@@ -47,7 +47,7 @@ class SampledLaw(NamedTuple):
 
     @property
     def system(self) -> System:
-        """The law at the first sample, which has the signals and the sampling time of all."""
+        """The law at the first sample, which has the signals and the sample time of all."""
         return self.systems[0]
 
     @property
@@ -240,7 +240,8 @@ class SampledLoops:
 class PeriodicLoops(SampledLoops):
     """Closed loops of a law whose matrices repeat after N > 1 samples.
 
-    Gains are computed for the system whose sample is one period, which has the signals of N samples.
+    Gains are computed for the system whose sample is one period, which has the signals of N
+    samples.
     """
 
     def _best_scale(self, row: Array) -> Array:
@@ -296,7 +297,7 @@ def measured_signals(lft: LFT, law: SampledLaw) -> Array:
     missing = [name for name in needed if name not in names]
     if missing or system.outputs != lft.input_names:
         raise InputError(
-            "the inputs and outputs of the law are not those of the robot; give the law of this "
+            "the law and the robot have different inputs and outputs; give the law of this "
             "robot"
         )
     if not law.outputs:

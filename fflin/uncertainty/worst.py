@@ -95,8 +95,8 @@ class Worst(html.Reported):
     Attributes
     ----------
     damping : Found
-        Least damping ratio of a pole. The poles of a periodic law are computed over one period, with the
-        smallest of their possible frequencies.
+        Least damping ratio of a pole. The poles of a periodic law are computed over one period,
+        with the smallest of their possible frequencies.
     margin : Found
         Least disk margin at the inputs; 0 if a loop is unstable. For policies and sampled gains, it
         has the best scaling of the inputs, as in `margins`. For a continuous `Gain`, the inputs are
@@ -113,8 +113,8 @@ class Worst(html.Reported):
         Factor by which all ranges may be scaled about their middles with the loop still stable. A
         value of 1 or more covers the whole set. It follows from an upper bound of the structured
         singular value over intervals of frequency, evaluated at five frequencies in each. NaN for a
-        sampled law, because the sampled model is not an LFT: the worst loops are then those that the
-        search finds, without a guarantee.
+        sampled law, because the sampled model is not an LFT: the worst loops are then those that
+        the search finds, without a guarantee.
     """
 
     damping: Found
@@ -304,7 +304,7 @@ def _around(lft: LFT, gain: object) -> tuple[LFT, Array, Sequence[str]]:
     names = law.inputs, law.outputs
     if names != (signals, lft.input_names):
         raise InputError(
-            "the inputs and outputs of the law are not those of the robot; give the law of this "
+            "the law and the robot have different inputs and outputs; give the law of this "
             "robot"
         )
     regulated = gain.fed_back if isinstance(gain, Policy) else regulated_states(gain)
