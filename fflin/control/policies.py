@@ -285,8 +285,8 @@ class LinearLaw(Feedback):
         keep their speeds. If the inputs are delayed, the robot waits at the start for the longest
         delay, so that each input of the trajectory acts at its time.
 
-        The matrices of the law remain those about its point. They fit a trajectory if its rates are
-        small compared with the bandwidth of the law, and if the joints stay near the point. For
+        The law keeps the matrices about its point. They fit a trajectory if the trajectory's rates
+        are small compared with the bandwidth of the law, and if the joints stay near the point. For
         other trajectories, use `tvlqr` and `tvkalman`.
 
         Parameters

@@ -252,7 +252,7 @@ def _lines(timing: SensorTiming) -> tuple[list[_Line], int]:
 def sensor_systems(timing: SensorTiming) -> Iterator[tuple[Array, Array, Array, Array]]:
     """Yield the matrices of the sensors at each sample: states s' = A s + B y, received C s + D y.
 
-    All values are deviations from those before the first measurement arrives.
+    All values are deviations from the values before the first measurement arrives.
     """
     lines, size = _lines(timing)
     ny = len(lines)

@@ -122,7 +122,7 @@ class HeldSystem:
     def applied(self, s: float) -> tuple[Array, Array]:
         """Return the maps of the states (nu, size) and of the commands (nu, nu) to the inputs.
 
-        The inputs are those that act at the time s [s] after a sample, 0 <= s < h.
+        The inputs act at the time s [s] after a sample, 0 <= s < h.
         """
         nu = self.B.shape[1]
         of_states = np.zeros((nu, self.size))

@@ -181,7 +181,7 @@ def outputs(
     ----------
     robot : Robot
         Robot with the same states, inputs and outputs as the model. Its masses may differ from
-        those with which the model was computed.
+        the masses with which the model was computed.
     lin : LinearModel
         Model that defines the reference and the operating point.
     q, v : array_like (nq,), (nv,)

@@ -640,7 +640,7 @@ class LinearModel(ModelHeader, StateSpace):
         :math:`A_d = E + A h` and :math:`B_d = B h + A B h^2/2`, with the identity E; see (2.2) of
         docs/derivation.md.
 
-        A and B are those at the operating point over the whole sample. If this point moves, as a
+        A and B of the operating point are used over the whole sample. If this point moves, as a
         joint that turns, they change meanwhile, so the result has an error that grows with the
         square of `dt` (1 % of A at 20 ms and 2 rad/s). For a motion, use
         `LinearTrajectory.discretize`.

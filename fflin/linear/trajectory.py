@@ -514,7 +514,7 @@ class Trajectory(Design):
     def to_pandas(self) -> DataFrame:
         """Return t, q, v and u as a pandas data frame, with the times as its index.
 
-        The columns are those of the .csv file that `save` writes.
+        The columns are the columns of the .csv file that `save` writes.
 
         Raises
         ------

@@ -105,7 +105,7 @@ class Worst(html.Reported):
         Largest gain over all frequencies from a disturbance at the inputs to the outputs. Outputs
         that depend on states which the gain does not regulate are excluded.
     unstable : int
-        Number of unstable loops among those tried.
+        Number of unstable loops among the loops tried.
     tried, excluded : int
         Number of loops tried, and of draws and corners excluded because they are not physically
         realisable.

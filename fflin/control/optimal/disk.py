@@ -27,7 +27,7 @@ _CENTRES = 60
 _NEWTON = 30
 
 # The search over frequency ends after _DIVISIONS intervals. An interval narrower than _NARROW times
-# its frequency is not divided. Of the frequencies of the poles, it starts at those that are apart
+# its frequency is not divided. It starts at frequencies of poles that are apart
 # by the factor _APART.
 _DIVISIONS = 400
 _NARROW = 1e-9
@@ -329,8 +329,8 @@ def largest_scaled_gain(loop: Loop) -> tuple[float, float, Array]:
     The result also contains the frequency [rad/s] at which it occurs, and the scaling there.
 
     The value is bounded at a few frequencies near the poles. A fixed scaling then bounds it at all
-    frequencies but those between the crossings of its gain, which follow from eigenvalues. These
-    intervals are searched in the same way, with the best scaling at their middle.
+    frequencies except between the crossings of its gain, which follow from eigenvalues. The
+    intervals between crossings are searched in the same way, with the best scaling at their middle.
     """
     poles = np.linalg.eigvals(loop.F)
     starts = {0.0, np.inf, *np.abs(poles).tolist(), *np.abs(poles.imag).tolist()}
