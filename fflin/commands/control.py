@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import fflin
 from fflin.base.errors import FileError, InputError
 from fflin.base.names import chosen, input_keys
-from fflin.base.process import Progress
+from fflin.base.process import Progress, Status
 from fflin.base.tables import folded
 from fflin.commands import DONE, FELL_SHORT
 from fflin.commands.builders import (
@@ -104,7 +104,8 @@ def tune(arguments: Namespace) -> Report:
     example: fflin tune satellite.toml --law 'pd shared=true' --goal 'margin disk=0.75' -o law.npz
     """
     robot, plant, structure, goals, settings, allocated = tuning_of(arguments)
-    tuned = fflin.tune(plant, structure, goals, **settings)
+    with closing(Status()) as line:
+        tuned = fflin.tune(plant, structure, goals, **settings, progress=line.say)
     text = str(tuned)
     if allocated:
         text += f"\n\n{folded([_TORQUE_OF_OTHERS])}"
