@@ -53,6 +53,7 @@ def test_errors_along_a_trajectory_are_in_deg_and_mm(robots):
     assert f"joints {np.degrees(joints):.2g} deg" in text
 
 
+@pytest.mark.exhaustive
 def test_a_run_of_a_campaign_is_named(flown):
     robot, policy, _ = flown
     options = {"runs": 6, "seed": 3, "duration": 2.0, "dt": 0.005}
