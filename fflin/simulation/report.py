@@ -16,6 +16,7 @@ from fflin.base.tables import folded, grid
 from fflin.base.validation import Array, Indices, Mask
 from fflin.dynamics.impact import Impact
 from fflin.robot.inputs import Thruster
+from fflin.simulation.rotation_rates import RotationRates
 
 if TYPE_CHECKING:
     from fflin.simulation.motion import Motion
@@ -487,6 +488,10 @@ def _outcome(motion: Motion, kinds: list[ErrorSize]) -> bool | None:
     """Return whether a motion settled; None if it has no fixed target."""
     if motion.stopped:
         return False
+    if rates := _rates(motion):
+        if rates.is_short:
+            return None
+        return bool(np.isfinite(rates.slow_after(rates.bound)))
     if motion.tracked or not kinds:
         return None
     return all(kind.settled is not None for kind in _judged(kinds))
@@ -584,7 +589,9 @@ def _largest_forces(motion: Motion) -> list[str]:
 def _heading(motion: Motion, kinds: list[ErrorSize]) -> list[str]:
     """Return the first lines of the report: the verdict, the run, the orbit and the notes."""
     results = []
-    if kinds or motion.stopped:
+    if (rates := _rates(motion)) and not motion.stopped:
+        results.append(rates.summary())
+    elif kinds or motion.stopped:
         results.append(verdict(motion, kinds))
     if fast := _fast_wheels(motion):
         results.append(fast)
@@ -602,6 +609,13 @@ def _heading(motion: Motion, kinds: list[ErrorSize]) -> list[str]:
     if motion.orbit:
         lines.append(str(motion.orbit))
     return [*lines, *motion.notes]
+
+
+def _rates(motion: Motion) -> RotationRates | None:
+    """Return the rotation rates of a motion whose controller only detumbles, or None."""
+    if not motion._detumbling or motion.orbit is None:
+        return None
+    return RotationRates(motion.t, motion.q, motion.v, motion.frame, motion.orbit)
 
 
 def motion_record(motion: Motion) -> dict[str, object]:
@@ -766,6 +780,8 @@ def _initial_to_final(kind: ErrorSize) -> str:
 def headline(motion: Motion) -> str:
     """Return a line for the page of a motion: what moves the robot, and how the motion ends."""
     parts = [motion._about] if motion._about else []
+    if (rates := _rates(motion)) and not motion.stopped:
+        return ", ".join((*parts, *rates.parts()))
     kinds = [kind for kind in error_sizes(motion) if kind.title in _PLACES]
     judged = [kind for kind in kinds if kind.steered and kind.largest > THERE]
     if judged and not motion.tracked:

@@ -17,6 +17,7 @@ from fflin.base.names import group_of, input_keys
 from fflin.base.process import LONG_RUN
 from fflin.base.rotation import conjugate
 from fflin.base.validation import Array, ArrayLike, instance
+from fflin.control.bdot import BDot, RateDamping
 from fflin.control.loops import PredictedLaw
 from fflin.control.policy import BoundLaw, Command, Policy, Predictor
 from fflin.control.sensor_errors import note_on_errors
@@ -308,6 +309,8 @@ _CONTROLLERS = {
     "Mpc": "MPC",
     "OutputMpc": "output feedback, MPC",
     "TrajectoryMpc": "trajectory tracking, MPC",
+    "BDot": "B-dot",
+    "RateDamping": "rate damping",
 }
 
 
@@ -317,6 +320,12 @@ def controller_of(policy: object) -> str:
         return "no control"
     law = policy.inner if isinstance(policy, Policy) else policy
     return _CONTROLLERS.get(type(law).__name__, "controller")
+
+
+def is_detumbling(policy: object) -> bool:
+    """Return whether a policy reduces the rotation rate, and has no attitude as its target."""
+    law = policy.inner if isinstance(policy, Policy) else policy
+    return isinstance(law, BDot | RateDamping)
 
 
 def motion_of(
@@ -388,6 +397,7 @@ def motion_of(
         urdf_sha256=robot.urdf_sha256,
         _robot=robot,
         _about=controller_of(plan.policy),
+        _detumbling=is_detumbling(plan.policy),
         wheels=tuple(plan.flown),
         wheel_inertias=np.array(list(plan.flown.values())),
         modes=tuple(map(attrgetter("name"), robot.modes)),

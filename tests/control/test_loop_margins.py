@@ -544,6 +544,7 @@ def test_a_gain_of_another_delay_or_of_a_negative_one_is_refused():
         replace(gain, delay=-gain.delay)
 
 
+@pytest.mark.exhaustive
 def test_the_margins_of_an_allocation_are_those_of_its_inner_policy():
     robot, lin = satellite()
     late = lin.discretize(0.25, delay=0.1)

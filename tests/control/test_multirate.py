@@ -214,6 +214,7 @@ def test_the_simulated_loop_equals_one_with_queues():
     assert attitude.max() < 1e-8
 
 
+@pytest.mark.exhaustive
 def test_a_constant_torque_leaves_no_attitude_error():
     """The loop of the exact sampled plant with queues settles at zero, over one period."""
     _, lin = satellite()
