@@ -160,6 +160,7 @@ def dual_arm_around_payload():
     return held, q, v, 5.0 * rng.normal(size=6 + held.n)
 
 
+@pytest.mark.exhaustive
 def test_two_arms_around_a_payload_agree_with_both_computations():
     robot, q, v, u = dual_arm_around_payload()
     lin = fflin.linearize(robot, q, v, u)
