@@ -411,7 +411,7 @@ def _motions(
 def _joined(
     campaign: Campaign, completed: Indices, figures: list[Pointing]
 ) -> CampaignPointing:
-    """Return the figures of all runs; those of stopped runs are infinite."""
+    """Return the figures of all runs; the figures of stopped runs are infinite."""
     count = len(campaign)
 
     def all_runs(values: Sequence[object]) -> Array:

@@ -67,7 +67,7 @@ _LABEL_SIZE = (0.075, 0.055)
 
 _POINTS = 400
 
-# Discrete-time poles z below this magnitude are those of delays, and no rates.
+# Discrete-time poles z below this magnitude belong to delays, and have no rate.
 _DEADBEAT = 1e-6
 
 # Rates below this fraction of the largest frequency are rounding errors.
@@ -314,7 +314,7 @@ def plot_poles(
     path : str or Path, optional
         File to write, .png, .pdf or .svg. See `plot_motion` for possible errors.
     dt : float
-        Sampling time [s], if the poles are given as numbers. If it is not 0, the unit circle is
+        Sample time [s], if the poles are given as numbers. If it is not 0, the unit circle is
         drawn.
     title : str
         Title of the figure.
@@ -375,7 +375,7 @@ def plot_loops(
     delay : float, optional
         Delay [s] of all inputs, as in `margins`.
     sample : float, optional
-        Sampling time [s] with which a continuous law is executed.
+        Sample time [s] with which a continuous law is executed.
     axes : matplotlib.axes.Axes, optional
         Axes of a grid, as of ``pyplot.subplots``, in whose place the figure is drawn.
 

@@ -218,7 +218,7 @@ def channel_of(goal: Goal, ends: Ends, plant: Plant) -> Channel:
 
 
 def _held_noise(channel: Channel) -> Channel:
-    """Return a channel whose white noise is that of the samples of a sampled model.
+    """Return a channel whose white noise equals the noise of the samples of a sampled model.
 
     The noise passes a lag sqrt(T) / (1 + s T/2) for the sample time T. The variance of the
     continuous output is then the variance of the samples.

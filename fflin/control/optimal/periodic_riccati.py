@@ -23,7 +23,7 @@ _SWEEPS = 4
 
 
 def sample_transition(weights: Array, whole: Array) -> Array:
-    """Return the transition (3, nx, nx) of a sample: T, G and W, see `transitions` of the room.
+    """Return T, G and W (3, nx, nx) of a sample, as `differential_riccati.transitions` does.
 
     `weights` (nx + nu, nx + nu) is the cost matrix of the sample for the error and the input, and
     `whole` (nx, nx + nu) maps both to the next error. The cross term of the cost is removed first.
