@@ -124,19 +124,23 @@ def orthonormalise(basis: Array, triangle: Array, least: Array, rows: int) -> No
     size = len(basis) // rows
     for i in range(rows):
         at = i * size
-        before = _product(basis, at, basis, at, size)
-        for j in range(i):
-            part = _product(basis, j * size, basis, at, size)
-            store(triangle, j * rows + i, part)
-            _add(basis, at, -part, basis, j * size, size)
+        # The squared length remains on the diagonal of R until column i is orthonormal.
+        store(triangle, i * rows + i, _product(basis, at, basis, at, size))
+    for i in range(rows):
+        at = i * size
         square = _product(basis, at, basis, at, size)
-        fraction = square / before
+        fraction = square / load(triangle, i * rows + i)
         store(least, 0, chosen(fraction, load(least, 0), fraction, load(least, 0)))
         length = root(square)
         store(triangle, i * rows + i, length)
         inverse = 1.0 / length
         for index in range(size):
             store(basis, at + index, load(basis, at + index) * inverse)
+        # The processor computes the parts of all later columns at the same time.
+        for j in range(i + 1, rows):
+            part = _product(basis, at, basis, j * size, size)
+            store(triangle, i * rows + j, part)
+            _add(basis, j * size, -part, basis, at, size)
 
 
 def respond(
@@ -322,16 +326,25 @@ def write_jacobian(work, robot, constraints):
 def factorise(work, tree, constraints):
     """Write Q and R for the present J; `bodies.factorise` must have factorised M."""
     basis, roots = constraints.basis, constraints.roots
-    size = len(tree.row)
-    for k in range(size):
-        at = tree.offsets.scaled + tree.row[k] + tree.depth[k]
-        store(roots, k, root(load(work, at)))
+    rows, size = len(constraints.error), len(tree.row)
+    packed, scaled = tree.offsets.packed, tree.offsets.scaled
     vec.copy(constraints.jacobian, 0, basis, 0, len(basis))
-    for row in range(len(constraints.error)):
+    # D^(-1/2) L^-T J^T as in `bodies.solve_inwards`, for all columns of J^T at once: each entry of
+    # L is read only once.
+    for k in range(size - 1, -1, -1):
+        row = tree.row[k]
+        for t in range(tree.depth[k]):
+            entry, above = load(work, packed + row + t), tree.path[row + t]
+            for i in range(rows):
+                at = i * size
+                vec.add(basis, at + above, -entry * load(basis, at + k))
+        scale = root(load(work, scaled + row + tree.depth[k]))
+        store(roots, k, scale)
+        for i in range(rows):
+            at = i * size + k
+            store(basis, at, load(basis, at) * scale)
+    for row in range(rows):
         at = row * size
-        bodies.solve_inwards(work, tree, basis, at)
-        for k in range(size):
-            store(basis, at + k, load(basis, at + k) * load(roots, k))
         # A row that vanishes as a whole has only rounding errors, which can seem independent.
         square = _product(basis, at, basis, at, size)
         start = load(constraints.squares, row)
@@ -339,9 +352,7 @@ def factorise(work, tree, constraints):
         store(constraints.squares, row, start)
         fraction, least = square / start, load(constraints.least, 0)
         store(constraints.least, 0, chosen(fraction, least, fraction, least))
-    orthonormalise(
-        basis, constraints.triangle, constraints.least, len(constraints.error)
-    )
+    orthonormalise(basis, constraints.triangle, constraints.least, rows)
 
 
 @called
