@@ -52,7 +52,7 @@ class Constraints(
     namedtuple(
         "Constraints",
         "first second first_pose second_pose pair component location jacobian basis triangle "
-        "error roots change multipliers forces squares least at packed",
+        "error roots change multipliers forces squares least at packed twist",
     )
 ):
     """Constraints between k pairs of frames, with r independent rows, and their work space.
@@ -78,6 +78,7 @@ class Constraints(
       it, squared, or the smallest of its squared length at the start. If it is zero, the rows are
       not independent.
     - `at` (nq,): a displaced configuration. `packed`: a copy of the packed M.
+    - `twist` (6,): the relative twist of a pair of frames, in axes of the first frame.
     """
 
 
@@ -266,16 +267,16 @@ def _add_column(work, tree, constraints, pair, body, lever, sign):
     The rows are the rows of a pair of frames.
     """
     size = len(constraints.change)
+    axes = vec.get_columns(constraints.location, pair * LOCATION + AXES)
     w, v = joint_axis(work, tree, body)
     v = vec.plus(v, vec.cross(w, lever))
+    twist = vec.across(axes, w), vec.across(axes, v)
+    vec.put6(constraints.twist, 0, vec.times6(twist, sign))
     for row in range(len(constraints.error)):
         if constraints.pair[row] == pair:
-            axis, angular = _direction(constraints, row)
-            value = vec.dot(axis, v)
-            if angular:
-                value = vec.dot(axis, w)
+            value = load(constraints.twist, constraints.component[row])
             at = row * size + tree.coordinate[body]
-            vec.add(constraints.jacobian, at, value * sign)
+            vec.add(constraints.jacobian, at, value)
 
 
 def _put_base(constraints, pair, lever):
@@ -322,26 +323,49 @@ def write_jacobian(work, robot, constraints):
             _put_base(constraints, pair, second_lever)
 
 
+def _solve_inwards(work, tree, basis, rows):
+    """Replace the columns of J^T in `basis` by the columns of L^-T J^T.
+
+    The result is the result of `bodies.solve_inwards` for each column. Here all columns share each
+    entry of L, and the six entries of the base remain in registers until they are complete.
+    """
+    packed = tree.offsets.packed
+    size = len(tree.row)
+    for k in range(size - 1, 5, -1):
+        row = tree.row[k]
+        # The first six entries of each path belong to the base.
+        for t in range(6, tree.depth[k]):
+            entry, above = load(work, packed + row + t), tree.path[row + t]
+            for i in range(rows):
+                at = i * size
+                vec.add(basis, at + above, -entry * load(basis, at + k))
+    for i in range(rows):
+        at = i * size
+        base = vec.get6(basis, at)
+        for k in range(size - 1, 5, -1):
+            entries = vec.get6(work, packed + tree.row[k])
+            base = vec.minus6(base, vec.times6(entries, load(basis, at + k)))
+        vec.put6(basis, at, base)
+    for k in range(5, 0, -1):
+        for t in range(k):
+            entry = load(work, packed + tree.row[k] + t)
+            for i in range(rows):
+                at = i * size
+                vec.add(basis, at + t, -entry * load(basis, at + k))
+
+
 @called
 def factorise(work, tree, constraints):
     """Write Q and R for the present J; `bodies.factorise` must have factorised M."""
     basis, roots = constraints.basis, constraints.roots
     rows, size = len(constraints.error), len(tree.row)
-    packed, scaled = tree.offsets.packed, tree.offsets.scaled
     vec.copy(constraints.jacobian, 0, basis, 0, len(basis))
-    # D^(-1/2) L^-T J^T as in `bodies.solve_inwards`, for all columns of J^T at once: each entry of
-    # L is read only once.
-    for k in range(size - 1, -1, -1):
-        row = tree.row[k]
-        for t in range(tree.depth[k]):
-            entry, above = load(work, packed + row + t), tree.path[row + t]
-            for i in range(rows):
-                at = i * size
-                vec.add(basis, at + above, -entry * load(basis, at + k))
-        scale = root(load(work, scaled + row + tree.depth[k]))
+    _solve_inwards(work, tree, basis, rows)
+    for k in range(size):
+        scale = root(load(work, tree.offsets.scaled + tree.row[k] + tree.depth[k]))
         store(roots, k, scale)
-        for i in range(rows):
-            at = i * size + k
+        for row in range(rows):
+            at = row * size + k
             store(basis, at, load(basis, at) * scale)
     for row in range(rows):
         at = row * size
