@@ -88,7 +88,7 @@ def monodromy(F: Array) -> Array:
 def lifted(loop: PeriodicLoop) -> tuple[Array, Array, Array, Array]:
     """Return A, B, C and D of a system whose sample is a period of the loop.
 
-    Its signals are those of the N samples: the n channels of the first sample come first.
+    Its signals are the signals of all N samples: the n channels of the first sample come first.
     """
     count, size, channels = loop.G.shape
     rows = loop.H.shape[1]
