@@ -223,6 +223,7 @@ def test_verdicts_are_green_or_red(results, robot):
     )
 
 
+@pytest.mark.exhaustive
 def test_a_large_robot_has_small_cards():
     robot = random_tree(np.random.default_rng(1), 30)
     q, v = robot.neutral(), 0.1 * np.ones(robot.nv)

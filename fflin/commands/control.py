@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from argparse import Namespace
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
@@ -13,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import fflin
 from fflin.base.errors import DetectabilityError, FileError, InputError
 from fflin.base.names import chosen, input_keys
-from fflin.base.process import Progress
+from fflin.base.process import Progress, Status
 from fflin.base.tables import folded
 from fflin.commands import DONE, FELL_SHORT
 from fflin.commands.builders import (
@@ -161,7 +160,8 @@ def tune(arguments: Namespace) -> Report:
     example: fflin tune satellite.toml --law 'pd shared=true' --goal 'margin disk=0.75' -o law.npz
     """
     robot, plant, structure, goals, settings, allocated = tuning_of(arguments)
-    tuned = fflin.tune(plant, structure, goals, **settings)
+    with closing(Status()) as line:
+        tuned = fflin.tune(plant, structure, goals, **settings, progress=line.say)
     text = str(tuned)
     if allocated:
         text += f"\n\n{folded([_TORQUE_OF_OTHERS])}"
@@ -324,8 +324,7 @@ def simulate(arguments: Namespace) -> Report:
     if line:
         text += f"\n{folded([line])}"
     if detumbling_law(arguments) is not None and not motion.stopped:
-        record["detumbling_time"], line = _detumbling_of(motion)
-        text += f"\n{folded([line])}"
+        record["detumbling_time"] = fflin.detumbling_time(motion)
     if window is not None and not motion.stopped:
         pointing = motion.pointing(window, accuracy=arguments.accuracy)
         record["pointing"] = pointing
@@ -359,18 +358,6 @@ def _margins_line(margins: GainMargins | None) -> str:
         f"margins of the linear loop, all inputs at once: gain {low:.3g} to {high:.3g}, phase "
         f"{margins.phase:.3g} deg (disk margin {margins.disk:.3g})"
     )
-
-
-def _detumbling_of(motion: fflin.Motion) -> tuple[float, str]:
-    """Return the detumbling time [s] of a motion, and a line on it."""
-    orbit = motion.orbit
-    assert orbit is not None
-    time = fflin.detumbling_time(motion)
-    bound = f"{4.0 * orbit.mean_motion:.3g} rad/s, four times the orbital rate"
-    line = f"detumbled after {time:.5g} s"
-    if not math.isfinite(time):
-        return time, f"not detumbled: the mean rate over one orbit is not below {bound}"
-    return time, f"{line}: the mean rate over one orbit is below {bound}"
 
 
 def _window(arguments: Namespace) -> float | None:

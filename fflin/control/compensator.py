@@ -41,7 +41,7 @@ class Compensator(EstimatingDesign):
         sampled compensator, if limits change the command. Zero without integral action, estimated
         disturbances and delayed inputs.
     dt : float
-        Sampling time [s]; 0 for continuous time.
+        Sample time [s]; 0 for continuous time.
     state_names, input_names, output_names : tuple of str
         Signals of the compensator. The inputs of the compensator are the outputs of the model.
     robot, urdf_sha256 : str

@@ -58,12 +58,49 @@ def lags_of_robot(robot: Robot, state: StateMap, *, outputs: bool) -> Lags:
 
 def robot_lags(law: Policy | Gain, lin: LinearModel) -> Lags:
     """Return the lags of the robot of a model, of the outputs only if a law measures them."""
+    outputs = isinstance(law, Policy) and law.senses_outputs
+    return lags_of_its_robot(lin, outputs=outputs)
+
+
+def lags_of_its_robot(lin: LinearModel, *, outputs: bool) -> Lags:
+    """Return the lags of the robot of a model, see `lags_of_robot`; none if it has no robot."""
     robot = lin._robot
     if robot is None:
         return NO_LAGS
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
-    outputs = isinstance(law, Policy) and law.senses_outputs
     return lags_of_robot(robot, state, outputs=outputs)
+
+
+def lags_of_commands(
+    law: Policy | Gain, lin: LinearModel, robot: Robot
+) -> tuple[Lags, str]:
+    """Return the lags of a robot for the inputs of a model, and a sentence on neglected lags.
+
+    Other inputs of the robot may realise the inputs of the model, as in an `Allocation`. If all of
+    them have the same lag, the generalised force has this lag exactly. Different lags are
+    neglected.
+    """
+    outputs = isinstance(law, Policy) and law.senses_outputs
+    state = StateMap(robot, reference=lin.reference, frame=lin.frame)
+    lags = lags_of_robot(robot, state, outputs=outputs)
+    if Actuation(state).names == lin.input_names:
+        return lags, ""
+    times = lags_of(robot.named_inputs)
+    least, largest = min(times, default=0.0), max(times, default=0.0)
+    if largest - least > _ROUNDING * largest:
+        sentence = (
+            f"the inputs of '{robot.name}', which realise {listed(_groups(lin))}, have lags of "
+            f"{least:.3g} to {largest:.3g} s; the error budget neglects them, because they differ: "
+            f"give lin.with_lags({{'{_groups(lin)[0]}': {largest:.3g}}}) for the largest"
+        )
+        return lags._replace(inputs={}), sentence
+    late = dict.fromkeys(lin.input_names, largest) if largest else {}
+    return lags._replace(inputs=late), ""
+
+
+def _groups(lin: LinearModel) -> list[str]:
+    """Return the groups of the inputs of a model, such as "tau_b"."""
+    return list(dict.fromkeys(name.partition(".")[0] for name in lin.input_names))
 
 
 def designed_lags(law: Policy | Gain) -> Lags:

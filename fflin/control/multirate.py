@@ -1,4 +1,4 @@
-"""Kalman filters and compensators of outputs with their own sampling times and delays."""
+"""Kalman filters and compensators of outputs with their own sample times and delays."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ class MultirateEstimator(_Periodic):
     x0, u0, y0 : ndarray
         State, inputs and outputs at the operating point.
     dt : float
-        Sampling time of the model [s].
+        Sample time of the model [s].
     state_names, input_names, output_names : tuple of str
     robot, urdf_sha256 : str
         Name of the robot, and SHA-256 of its URDF.
@@ -176,11 +176,11 @@ class MultirateCompensator(_Periodic):
     E : ndarray (N, nz, nu)
         Gain of the anti-windup, as in `Compensator`.
     poles : ndarray of complex
-        Poles of the closed loop over one period: those of the gain and of the estimator.
+        Poles of the closed loop over one period: poles of the gain and of the estimator.
     y0, u0 : ndarray
         Outputs and inputs at the operating point.
     dt : float
-        Sampling time [s].
+        Sample time [s].
     state_names, input_names, output_names : tuple of str
         Signals of the compensator. The inputs of the compensator are the outputs of the model.
     robot, urdf_sha256 : str

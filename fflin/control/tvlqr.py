@@ -405,10 +405,12 @@ def tvlqr(
     The differential Riccati equation is :math:`-\dot P = A^T P + P A - P B R^{-1} B^T P + Q`, with
     :math:`P(T) = Q_f`. The Riccati equation is solved backwards from knot to knot, by maps
     :math:`P_0 = W + \Phi^T P_1 (I + G P_1)^{-1} \Phi` from the cost :math:`P_1` at a knot to the
-    cost :math:`P_0` at the previous knot. W and G are positive semidefinite. Each map is computed
-    from a short matrix exponential by doubling, so P stays positive semidefinite over any horizon.
-    The method has order four in general, and is exact if A and B are constant. Knots are added
-    until the estimated errors of the steps and of the interpolation of P are below 1e-7.
+    cost :math:`P_0` at the previous knot. Each map is computed from a short matrix exponential by
+    doubling. In short steps, W and G are positive semidefinite, and then P stays positive
+    semidefinite over any horizon. In long steps over which B or Q changes, they may be indefinite.
+    The code does not check this, but it adds knots until the estimated errors of the steps and of
+    the interpolation of P are below 1e-7. The method has order four in general, and is exact if A
+    and B are constant.
 
     With `sample`, the regulator is sampled: e is measured at the samples, and :math:`\delta u` is
     held between samples. The cost is still the integral over continuous time, evaluated by (10.1)

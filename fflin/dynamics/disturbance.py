@@ -26,6 +26,13 @@ from fflin.robot.inputs import BaseForce, BaseTorque
 from fflin.robot.joints import ROOT
 from fflin.robot.robot import Robot
 
+# Times in an orbit at which the wrench of flat plates is computed, and the largest harmonic of the
+# orbit in their periodic part. The coefficients decay with the square of the harmonic.
+_TIMES = 2048
+_HARMONICS = 128
+# Coefficients below this fraction of the largest one are rounding errors.
+_ROUNDING = 1e-12
+
 _ROWS = {BaseTorque.GROUP: PIN_ANGULAR, BaseForce.GROUP: PIN_LINEAR}
 
 # A constant is a wave of frequency 0 at this phase [rad], because sin(pi / 2) = 1.
@@ -186,6 +193,36 @@ class Plate:
         if self.plate.two_sided:
             return -cosine, -self.normal
         return 0.0, self.normal
+
+
+def plate_phasors(
+    robot: Robot, field: OrbitField | None, R: Array
+) -> dict[float, Values]:
+    """Return {rate [rad/s]: phasor (6,)} of force and torque of the flat plates, in base axes.
+
+    R (3, 3) is the constant attitude of the base in the world. `field` is the field of a circular
+    orbit, or None without an orbit. The wrench is the sum of the real parts of phasor times
+    exp(j rate t), up to the harmonic `_HARMONICS` of the orbit.
+    """
+    plates = [Plate(plate, field) for plate in plates_of(robot.disturbance)]
+    if not plates:
+        return {}
+    if field is None:
+        constant = sum((plate.wrench(0.0, R) for plate in plates), np.zeros(6))
+        return {0.0: constant + 0j}
+    rate = float(np.linalg.norm(field.rate))
+    times = np.arange(_TIMES) * (2.0 * math.pi / rate / _TIMES)
+    wrenches = np.zeros((_TIMES, 6))
+    for plate in plates:
+        wrenches += [plate.wrench(t, R) for t in times.tolist()]
+    coefficients = np.fft.rfft(wrenches, axis=0)[: _HARMONICS + 1] / _TIMES
+    coefficients[1:] *= 2.0
+    largest = np.abs(coefficients).max()
+    return {
+        harmonic * rate: phasor
+        for harmonic, phasor in enumerate(coefficients)
+        if np.abs(phasor).max() > _ROUNDING * largest
+    }
 
 
 def distortion(robot: Robot, field: OrbitField) -> Array | None:

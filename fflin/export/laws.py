@@ -98,7 +98,7 @@ class Law:
     operations: float
     cases: list[Case]
     period: int = 1  # number of samples after which the tables A, B and E repeat
-    # whether the rows of the tables for the samples repeat, instead of the last one being kept
+    # whether the tables for the samples repeat; if not, the last row stays in effect
     repeats: bool = False
     # data of a magnetic law
     magnetic: BDotForm | None = None
@@ -245,7 +245,7 @@ def _law_of_model(title: str, policy: Policy, dt: float, robot: Robot) -> Law | 
         return _state_law(title, policy, dt, form, robot)
     if isinstance(form, OutputForm) and form.loop.measures_state:
         return _memory_law(title, policy, form.terms(0.0), robot)
-    # The form also contains the sensors of the robot, which are no part of the code.
+    # The form also contains the sensors of the robot, which the code does not contain.
     if isinstance(policy, MultirateFeedback):
         terms = policy.terms()
     elif isinstance(policy, LinearLaw):
@@ -332,7 +332,7 @@ def _law_about_point(
 ) -> Law:
     """Return the law of a policy about the point of its model, with one gain for each grid point.
 
-    `terms` are those of a law with a memory.
+    `terms` are the terms of a law with a memory.
     """
     lin = policy.model
     assert lin is not None
@@ -602,7 +602,7 @@ def _magnetic_cases(form: BDotForm) -> Iterator[Case]:
 
 
 def _compensator_law(given: Compensator | MultirateCompensator, robot: Robot) -> Law:
-    """Convert a compensator, which contains no model; units are those of the robot's signals."""
+    """Convert a compensator, which contains no model; the robot's signals give the units."""
     none = np.zeros((len(given.u0), len(given.y0)))
     corrected = given.E.any()
     periodic = isinstance(given, MultirateCompensator)

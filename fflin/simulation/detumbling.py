@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-import math
-
-import numpy as np
-
 from fflin.base.errors import InputError
-from fflin.base.rotation import rotation_matrices
-from fflin.base.validation import Array, instance, positive
-from fflin.dynamics.coordinates import PIN_ANGULAR
-from fflin.dynamics.orbital import normal_of
+from fflin.base.validation import instance, positive
 from fflin.simulation.motion import Motion
+from fflin.simulation.rotation_rates import RotationRates
 
 
 def detumbling_time(motion: Motion, factor: float = 4.0) -> float:
@@ -54,22 +48,5 @@ def detumbling_time(motion: Motion, factor: float = 4.0) -> float:
             "the motion is not in orbit; simulate a robot with an orbit, such as "
             "CircularOrbit(500e3)"
         )
-    rates = np.linalg.norm(_inertial_rates(motion), axis=1)
-    # Integral of the rate from the start, and its mean over the period before each row.
-    steps = 0.5 * (rates[1:] + rates[:-1]) * np.diff(motion.t)
-    angle = np.append(0.0, np.cumsum(steps))
-    start = motion.t - orbit.period
-    means = (angle - np.interp(start, motion.t, angle)) / orbit.period
-    slow = (start >= 0.0) & (means < factor * orbit.mean_motion)
-    if not slow.any():
-        return math.inf
-    return float(motion.t[slow.argmax()])
-
-
-def _inertial_rates(motion: Motion) -> Array:
-    """Return the angular velocities (N, 3) relative to inertial space, in base axes."""
-    assert motion.orbit is not None
-    normal = normal_of(motion.frame)
-    R = rotation_matrices(motion.q[:, 3:7])
-    rates: Array = motion.v[:, PIN_ANGULAR] + motion.orbit.mean_motion * normal @ R
-    return rates
+    rates = RotationRates(motion.t, motion.q, motion.v, motion.frame, orbit)
+    return rates.slow_after(factor * orbit.mean_motion)

@@ -31,16 +31,22 @@ from fflin.base.validation import (
 from fflin.control.closed_loop import ClosedLoop
 from fflin.control.data_sheet import output_keys
 from fflin.control.gain import Gain
+from fflin.control.lags import (
+    designed_lags,
+    lags_of_commands,
+    lags_of_model,
+    model_of_loop,
+)
 from fflin.control.margins import delayed_model, laws_in_loop
 from fflin.control.optimal.periodic_loops import (
     monodromy,
     steady_covariances,
     steady_states,
 )
-from fflin.control.policy import Policy, System
+from fflin.control.policy import Policy, System, as_policy
 from fflin.control.sensor_errors import declared_errors
-from fflin.dynamics.coordinates import refuse_elliptic
-from fflin.dynamics.disturbance import phasors_of
+from fflin.dynamics.coordinates import PIN_ANGULAR, PIN_LINEAR, refuse_elliptic
+from fflin.dynamics.disturbance import phasors_of, plate_phasors
 from fflin.dynamics.state import StateMap
 from fflin.dynamics.state_rows import attitude_rotations
 from fflin.linear.model import LinearModel
@@ -75,6 +81,12 @@ _ZERO = 1e-12
 
 # Name of the part of the simulated errors that the other causes do not explain.
 _NOT_SUPERPOSED = "simulated minus superposed"
+
+# Forces on the base that flat plates exert.
+_WRENCH = (BaseTorque.GROUP, BaseForce.GROUP)
+
+# Names of the causes of flat plates.
+_PLATES = ("mean of flat plates", "periodic part of flat plates")
 
 # Fraction of a motion from which its errors are counted.
 _LATE = 0.5
@@ -284,9 +296,12 @@ def error_budget(
         Simulated motion whose attitude errors are compared with the budget.
     robot : Robot, optional
         Robot whose field `disturbance` contains further causes, at the attitude of `lin`, and whose
-        outputs may declare noise; the drift of their biases is left out. In orbit,
-        constants in inertial axes are sinusoids with the rate of the orbit. Flat plates are left
-        out, with an `FflinWarning`.
+        outputs may declare noise; the drift of their biases is left out. If `lin` has no lags, the
+        loop has the lags of this robot. The inputs that realise the commands of an `Allocation`
+        must have equal lags; different lags are neglected, with an `FflinWarning`. In orbit,
+        constants in inertial axes are sinusoids with the rate of the orbit. The drag and the solar
+        pressure on flat plates are those at the attitude of `lin`. In orbit, their periodic part
+        has up to 128 harmonics; its amplitude is that of a sinusoid with the same variance.
     limit_cycle : bool
         Whether the part of the errors of `motion` that the linear superposition does not explain is
         a further cause, "simulated minus superposed". The motion must contain the same causes. Its
@@ -318,7 +333,7 @@ def error_budget(
     >>> float(budget.total[2]) > 0.0, float(budget.deviation[2])
     (True, 0.0)
     """
-    lin, delay = delayed_model(policy, lin, delay)
+    lin, delay = delayed_model(policy, _with_lags_of(robot, policy, lin), delay)
     if sample is not None:
         sample = positive("sample", sample, "s")
     factor = positive("factor", factor)
@@ -330,8 +345,11 @@ def error_budget(
     ]
     phasors = _disturbances(robot, lin)
     forces += [name for name, _ in phasors]
+    plates = _plates(robot, lin)
+    forces += _WRENCH if plates else ()
     loop = DisturbedLoop(laws, lin, delay, sample, forces)
     acting = [loop.phasor(*key, value) for key, value in phasors.items()]
+    acting += loop.plates(plates)
     causes: list[Contribution] = []
     if noise is None:
         noise = _declared_noise(policy, lin, robot, loop.dt)
@@ -378,6 +396,23 @@ def error_budget(
         delay=loop.longest_delay,
         robot=lin.robot,
     )
+
+
+def _with_lags_of(
+    robot: Robot | None, policy: Policy | Gain, lin: LinearModel
+) -> LinearModel:
+    """Return the model with the lags of the given robot, if it has none itself."""
+    from fflin.robot.robot import Robot
+
+    instance("lin", lin, LinearModel, "a fflin.LinearModel")
+    if robot is None or lags_of_model(lin):
+        return lin
+    instance("robot", robot, Robot, "a Robot")
+    law = policy if isinstance(policy, Gain) else as_policy(policy)
+    lags, neglected = lags_of_commands(law, lin, robot)
+    if neglected and not designed_lags(law):
+        warnings.warn(neglected, FflinWarning, stacklevel=5)
+    return model_of_loop(lin, lags)
 
 
 def _given(name: str, mapping: object) -> Mapping[str, object]:
@@ -448,16 +483,8 @@ def _disturbances(
         return {}
     instance("robot", robot, Robot, "a Robot")
     refuse_elliptic(robot, "error budgets")
-    if plates_of(robot.disturbance):
-        warnings.warn(
-            f"'{robot.name}' has flat plates, whose drag and solar pressure the error budget does "
-            "not contain; give their largest torque as disturbance={'tau_b': ...}",
-            FflinWarning,
-            stacklevel=3,
-        )
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
-    root = robot.model.jointPlacements[ROOT].rotation
-    attitude = root @ rotation_matrix(lin.q[3:7])
+    attitude = _attitude(robot, lin)
     axes = {BaseTorque.GROUP: state.axes[0], BaseForce.GROUP: state.axes[1]}
     total: dict[tuple[str, float], Values] = {}
     for name, given_axes, given, rate in phasors_of(robot, state.field):
@@ -473,6 +500,34 @@ def _disturbances(
         key = BaseTorque.GROUP, rate
         total[key] = total.get(key, np.zeros(3, complex)) + value
     return total
+
+
+def _attitude(robot: Robot, lin: LinearModel) -> Array:
+    """Return the base axes (3, 3) at the operating point, in the axes of the world."""
+    root = robot.model.jointPlacements[ROOT].rotation
+    attitude: Array = root @ rotation_matrix(lin.q[3:7])
+    return attitude
+
+
+def _plates(robot: Robot | None, lin: LinearModel) -> dict[float, Values]:
+    """Return {rate [rad/s]: phasor (6,)} of torque and force on flat plates in the axes of `lin`.
+
+    The attitude of the plates is constant.
+    """
+    if robot is None or not plates_of(robot.disturbance):
+        return {}
+    state = StateMap(robot, reference=lin.reference, frame=lin.frame)
+    rotation = state.rotation(lin.q)
+    phasors: dict[float, Values] = {}
+    in_base = plate_phasors(robot, state.field, _attitude(robot, lin))
+    for rate, wrench in in_base.items():
+        torque, force = wrench[PIN_ANGULAR], wrench[PIN_LINEAR]
+        if state.axes[0]:
+            torque = rotation @ torque
+        if state.axes[1]:
+            force = rotation @ force
+        phasors[rate] = np.concatenate((torque, force))
+    return phasors
 
 
 def _residual_torques(
@@ -668,18 +723,47 @@ class DisturbedLoop(ClosedLoop):
         G = self._held(inputs.real, 0.0).real
         return Contribution(f"constant {key}", "constant", self._constants(G))
 
+    def plates(self, phasors: Mapping[float, Values]) -> list[Contribution]:
+        """Return the effects of flat plates: of their mean wrench and of its harmonics.
+
+        The phasors (6,) of torque and force belong to the rates [rad/s] of the harmonics.
+        """
+        at = [self._signals("force", key, self._forces) for key in _WRENCH]
+        wrench = self._force_inputs[:, np.ravel(at)]
+        causes = list[Contribution]()
+        powers = np.zeros(self.size)
+        for rate, phasor in phasors.items():
+            inputs = wrench @ phasor[:, None]
+            if rate:
+                powers = powers + self._powers(inputs, rate)
+                continue
+            G = self._held(inputs.real, 0.0).real
+            causes.append(Contribution(_PLATES[0], "constant", self._constants(G)))
+        if powers.any():
+            amplitudes = self._errors(np.sqrt(powers))
+            causes.append(Contribution(_PLATES[1], "periodic", amplitudes))
+        return causes
+
     def _sinusoid(self, key: str, inputs: Values, w: float) -> Contribution:
         """Return the effect of independent sinusoidal forces, whose amplitudes are columns."""
+        amplitudes = np.sqrt(self._powers(inputs, w))
+        hertz = w / (2.0 * math.pi)
+        cause = f"{key} at {hertz:.4g} Hz"
+        return Contribution(cause, "periodic", self._errors(amplitudes))
+
+    def _powers(self, inputs: Values, w: float) -> Array:
+        """Return the squared amplitudes of the states for sinusoids as in `_sinusoid`.
+
+        They are the mean over the period of the law.
+        """
         G = self._held(inputs, w)
         if self.dt:
             response = steady_states(self.F, G, w * self.dt)
         else:
             response = np.linalg.solve(1j * w * np.eye(self.size) - self.F, G)
         powers = np.sum(np.abs(response) ** 2, axis=2)
-        amplitudes = np.sqrt(powers.mean(axis=0))
-        hertz = w / (2.0 * math.pi)
-        cause = f"{key} at {hertz:.4g} Hz"
-        return Contribution(cause, "periodic", self._errors(amplitudes))
+        mean: Array = powers.mean(axis=0)
+        return mean
 
     def force_noise(self, key: str, size: float) -> Contribution:
         """Return the effect of white noise of forces."""

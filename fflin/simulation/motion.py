@@ -184,6 +184,8 @@ class Motion(StatesAndInputs, Design):
     _robot: Any = field(default=None, kw_only=True)
     # controller, and run of a campaign, as text; not saved
     _about: str = field(default="", kw_only=True)
+    # whether the controller only detumbles; not saved
+    _detumbling: bool = field(default=False, kw_only=True)
     # checksum of the nominal robot; not saved
     _nominal: str = field(default="", kw_only=True)
     wheels: tuple[str, ...] = field(default_factory=tuple)
@@ -447,7 +449,7 @@ class Motion(StatesAndInputs, Design):
     def to_pandas(self) -> DataFrame:
         """Return times, states and inputs as a pandas data frame, with the times as its index.
 
-        The columns are those of the .csv file that `save` writes.
+        The columns are the columns of the .csv file that `save` writes.
 
         Raises
         ------
@@ -626,9 +628,14 @@ def _longer(whole: Motion, motion: Motion, name: str) -> Motion:
     for key in (*rows, "energy", "momentum", "momentum_drift", "com_drift"):
         added = rows.get(key, getattr(motion, key))
         joined[key] = np.concatenate((getattr(whole, key), added))
+    about = whole._about
+    if motion._about and motion._about != about:
+        about = f"{about}, then {motion._about}".removeprefix(", then ")
     return replace(
         whole,
         **joined,
+        _about=about,
+        _detumbling=whole._detumbling and motion._detumbling,
         target=target,
         prediction=whole.prediction[:0],
         steered=tuple(x for x in whole.steered if x in motion.steered),

@@ -346,6 +346,7 @@ def test_off_rest_the_frozen_model_is_judged_and_said_so(robots):
     assert full.dimension == 12 + 2 * robot.n and full.stabilizable
 
 
+@pytest.mark.exhaustive
 def test_a_hundred_joints():
     rng = np.random.default_rng(5)
     robot = random_tree(rng, 100)

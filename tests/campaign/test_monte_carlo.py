@@ -638,6 +638,7 @@ def test_a_report_is_within_80_columns(campaign):
     assert first in ("r_b.x", "|r_b.x|")
 
 
+@pytest.mark.exhaustive
 def test_conditions(campaign):
     degrees = campaign.values("attitude")
     assert np.array_equal(campaign.met("attitude < 1 deg"), degrees < 1.0)

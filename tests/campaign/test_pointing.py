@@ -150,6 +150,7 @@ def test_a_stopped_lane_keeps_its_own_rows(satellite):
         assert np.array_equal(motion.t, expected.t)
 
 
+@pytest.mark.exhaustive
 def test_commands_report_pointing_errors(tmp_path, capsys):
     loop = ["planar_detumble", "--rpy", "0", "0", "10", "--duration", "30", "--dt"]
     loop += ["0.1", "--pointing", "5"]

@@ -121,6 +121,7 @@ WRITES = {
 
 
 @pytest.mark.parametrize("name", WRITES)
+@pytest.mark.exhaustive
 def test_a_command_replaces_only_files_of_the_same_kind(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     options, endings = WRITES[name]

@@ -311,6 +311,7 @@ def test_simulate_begins_and_weighs_as_the_file_says(sat):
     assert x["omega_b.z"] == 0.01 and x["qdot_m.joint_1"] == 0.2
 
 
+@pytest.mark.exhaustive
 def test_lqr_on_the_command_line_uses_the_weights_of_the_file(sat):
     def weights(*options):
         code, out, err = run("lqr", "sat.toml", *options, cwd=sat)

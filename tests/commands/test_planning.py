@@ -186,6 +186,7 @@ def test_predictive_control_keeps_the_limits(tmp_path):
     assert "--allocate" in refused(*command, *mpc, "--allocate")
 
 
+@pytest.mark.exhaustive
 def test_the_former_names_of_the_time_steps_still_work(tmp_path, capsys):
     def x(*words):
         assert (

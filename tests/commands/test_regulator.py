@@ -246,6 +246,7 @@ def test_gravity_beyond_the_limits_is_reported_and_not_refused(capsys):
     assert says(out, "tau_m.panel_left, tau_m.panel_right")
 
 
+@pytest.mark.exhaustive
 def test_a_simulation_reports_the_margins_of_its_loop(capsys):
     loop = ["planar_detumble", "--rpy", "0", "0", "10", "--duration", "5"]
     assert main(["simulate", *loop, "--json"]) == 0

@@ -65,6 +65,7 @@ def test_an_arm_with_slow_joints_comes_back_within_its_limits(tmp_path):
     )
 
 
+@pytest.mark.exhaustive
 def test_target_sampling_limits_and_delay(tmp_path):
     code, _, err = run(
         *("simulate", "ets_vii", "--target-joint", "joint_1=0.5", "--sample", 0.1),
@@ -353,6 +354,7 @@ def wheels_file(tmp_path, count=3):
 @pytest.mark.parametrize(
     "options", [(), *exhaustive((("--reduce",),), (("--sample", 0.2),))]
 )
+@pytest.mark.exhaustive
 def test_three_wheels_settle_the_attitude(tmp_path, options):
     code, _, err = run(
         *("simulate", "cubesat", "--inputs", wheels_file(tmp_path), "--rpy", 30, 0, 0),

@@ -177,6 +177,7 @@ def test_an_offset_may_be_more_than_half_a_turn(flown):
     )
 
 
+@pytest.mark.exhaustive
 def test_a_sampled_trajectory_of_a_mat_file_is_followed_past_its_end(flown):
     folder = flown[0]
     code, _, err = chain(

@@ -11,6 +11,7 @@ from fflin.dynamics.magnetic import MagneticField
 from fflin.dynamics.orbital import OrbitField
 from fflin.linear.linearization import Linearizer
 from fflin.robot.orbit import DIPOLES
+from fflin.simulation.rotation_rates import RotationRates
 from tests.support.marks import exhaustive
 from tests.support.robots import random_point
 
@@ -153,6 +154,20 @@ def test_a_cubesat_detumbles_within_a_few_orbits(cubesat):
     assert np.abs(motion.u).max() <= 0.2
     assert fflin.detumbling_time(motion) < 3.0 * ORBIT.period
     assert fflin.detumbling_time(motion, factor=0.5) == math.inf
+
+
+def test_a_satellite_at_rest_in_an_ellipse_rotates_with_the_frame():
+    """Its rate is that of the true anomaly, whose mean over a period is the mean motion."""
+    orbit = fflin.EllipticOrbit(perigee=500e3, eccentricity=0.2, anomaly=0.4)
+    t = np.linspace(0.0, orbit.period, 2001)
+    q = np.zeros((len(t), 7))
+    q[:, 6] = 1.0
+    motion = RotationRates(t, q, np.zeros((len(t), 6)), "lvlh", orbit)
+    rates = [orbit.at(time).rate for time in t.tolist()]
+    assert motion.rates == pytest.approx(rates, rel=1e-15)
+    assert motion.rates.max() > 1.4 * orbit.mean_motion
+    assert motion.means()[-1] == pytest.approx(orbit.mean_motion, rel=1e-12)
+    assert motion.slow_after(1.1 * orbit.mean_motion) == t[-1]
 
 
 @pytest.mark.compiled

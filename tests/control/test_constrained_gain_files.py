@@ -81,6 +81,7 @@ def test_a_gain_of_other_constraints_is_refused(other, tmp_path):
         model_of(gain, arms(other)[0], "the gain was made", lin.reference)
 
 
+@needs_compiler
 def test_c_code_of_a_saved_gain_flies_like_the_policy(tmp_path):
     robot, q = arms(GRIP)
     lin = fflin.linearize(robot, q).discretize(0.1)

@@ -38,6 +38,7 @@ def off(robot, motion):
 
 
 @pytest.mark.parametrize("angle", [0.4, *exhaustive(-2.0, 3.1)])
+@pytest.mark.exhaustive
 def test_the_least_effort_about_a_hinge_has_the_closed_form(door, angle):
     """Torque and force share the moment M about the hinge as (1, lever) M / (1 + lever^2). Held
     over N steps of h, M = 6 J angle (N - 1 - 2 k) / (h^2 N (N^2 - 1)) with J about the hinge."""

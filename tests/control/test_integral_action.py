@@ -407,6 +407,7 @@ def test_validity_flies_the_integrals_and_predicts_them(arm):
     assert 1.9 < power < 2.1
 
 
+@pytest.mark.exhaustive
 def test_uncertain_loops_contain_the_integrals(arm):
     robot, lin = arm
     gain = fflin.lqr(lin, integral_action=["q_b"])

@@ -86,6 +86,7 @@ def test_a_sampled_law_follows_its_recursion_with_the_applied_inputs(arm, kind, 
     assert (np.abs(commands) > high).any()
 
 
+@pytest.mark.exhaustive
 def test_the_state_of_a_continuous_law_is_integrated_with_the_anti_windup(arm):
     robot, lin = arm
     law = Integrating(lin, 0.0)
@@ -172,6 +173,7 @@ def allocated(dt, most=2e-2):
     return robot, fflin.Allocation(Integrating(lin, dt), design), lin
 
 
+@pytest.mark.exhaustive
 def test_an_allocation_corrects_its_law_by_the_force_that_is_achieved():
     robot, policy, lin = allocated(H)
     motion = flown(robot, policy, lin, every=5, duration=30.0)

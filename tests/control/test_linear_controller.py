@@ -144,6 +144,7 @@ def test_transfer_functions_are_realised():
         assert not result[:, [0, 1, 2, 4, 5]].any()
 
 
+@pytest.mark.exhaustive
 def test_a_gain_comes_back_as_the_state_feedback_it_was():
     robot = fflin.load("ets_vii")
     lin = fflin.linearize(robot, fflin.configuration(robot, {"joint_2": 0.4}))

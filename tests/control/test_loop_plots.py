@@ -84,6 +84,7 @@ def test_the_figure_shows_the_curves_and_the_margins(satellite, tmp_path):
     assert labels[0].startswith(f"tau_b.x: {margins.channels[0].phase:.0f} deg")
 
 
+@pytest.mark.exhaustive
 def test_output_feedback_unstable_loops_and_laws_without_a_model(satellite):
     lin, law = satellite
     sampled = lin.discretize(0.2)

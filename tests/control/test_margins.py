@@ -185,6 +185,7 @@ DISKS = {
 
 
 @pytest.mark.parametrize("case", DISKS)
+@pytest.mark.exhaustive
 def test_the_fixed_scaling_bears_full_perturbations_exactly_up_to_its_bound(case):
     lin = DISKS[case]()
     rng = np.random.default_rng(0)
@@ -267,6 +268,7 @@ def test_the_disk_margin_does_not_depend_on_the_units_of_the_inputs():
 
 @pytest.mark.parametrize("name", ["cubesat", "ets_vii", "planar_detumble"])
 @pytest.mark.parametrize("dt", [0.0, *exhaustive(0.01, 0.1, 1.0)])
+@pytest.mark.exhaustive
 def test_the_margin_that_the_weights_guarantee_is_a_lower_bound(name, dt):
     lin = fflin.linearize(fflin.load(name))
     model = lin.discretize(dt) if dt else lin

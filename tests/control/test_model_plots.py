@@ -58,6 +58,7 @@ def test_patterns_of_sampled_robots_can_be_read(name):
     ]
 
 
+@pytest.mark.exhaustive
 def test_patterns_of_none_can_be_read():
     empty = replace(
         fflin.linearize(fflin.load("cubesat")),

@@ -250,6 +250,7 @@ def test_an_output_that_the_inputs_act_on_exceeds_its_limit_by_its_value(service
     assert f"(worst: {name} by {excess:.2g} at 0.1 s)" in ahead.notes[0]
 
 
+@pytest.mark.exhaustive
 def test_slews_that_break_the_regulator_are_held(servicer):
     """The base turns hard while the joints are weak: under the regulator arm and panels swing
     beyond their travels, and it has not settled after a minute; the controller turns no harder than

@@ -50,6 +50,7 @@ def test_a_backward_sweep_over_many_periods_gives_the_same_solution(along, sched
     assert apart(P, schedule.P[0]) < 1e-10
 
 
+@pytest.mark.exhaustive
 def test_the_lifted_system_has_the_same_solution(along):
     h = along.period / 3
     schedule = fflin.tvlqr(along, Q, R, "periodic", sample=h)

@@ -202,6 +202,7 @@ def one_joint():
 
 
 @pytest.mark.parametrize(("knots", "spin"), [(11, 0.2), *exhaustive((6, 0.0))])
+@pytest.mark.exhaustive
 def test_speeds_keep_within_limits_between_knots(one_joint, knots, spin):
     """Linear torques bend the speeds between knots, beyond limits that the knots keep."""
     (robot, goal), limit = one_joint, SPEEDS["qdot_m"]
@@ -220,6 +221,7 @@ def test_speeds_keep_within_limits_between_knots(one_joint, knots, spin):
         assert largest >= (1.0 + 0.009 * float(result[1])) * limit
 
 
+@pytest.mark.exhaustive
 def test_a_violation_that_is_left_is_printed_as_it_was_computed(one_joint, monkeypatch):
     """Of a motion whose limits hold at knots alone: with a warning, unless that much is allowed."""
     robot, goal = one_joint
@@ -259,6 +261,7 @@ def test_limits_that_cannot_hold_between_knots_hold_at_knots(one_joint):
 
 
 @pytest.mark.parametrize("knots", [4, *exhaustive(5, 31)])
+@pytest.mark.exhaustive
 def test_few_knots_keep_limits_between_them(one_joint, knots):
     robot, goal = one_joint
     options = {"knots": knots, "hold": "linear", "limits": SPEEDS}
@@ -269,6 +272,7 @@ def test_few_knots_keep_limits_between_them(one_joint, knots):
 
 
 @pytest.mark.parametrize("duration", [5.0, *exhaustive(3.0)])
+@pytest.mark.exhaustive
 def test_an_infeasible_plan_gives_up_and_names_the_limit(
     one_joint, monkeypatch, duration
 ):
@@ -949,6 +953,7 @@ def free_floating():
     return robot, fflin.configuration(robot, {"joint_1": 0.3})
 
 
+@pytest.mark.exhaustive
 def test_progress_shows_iterations_cost_and_violation(cube, capsys):
     robot, _ = cube
     goal = turned(robot, 0.5)

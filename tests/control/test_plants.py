@@ -37,6 +37,7 @@ def test_a_feedback_of_the_nominal_robot_runs_on_another(nominal, dt):
     assert run.urdf_sha256 == other.urdf_sha256
 
 
+@pytest.mark.exhaustive
 def test_measured_feedback_runs_on_another_robot(nominal):
     robot, _ = nominal
     sampled = fflin.linearize(robot).discretize(0.1)

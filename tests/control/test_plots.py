@@ -112,6 +112,7 @@ def curves_of(axes, label):
 
 
 @pytest.mark.parametrize("scale", [1.0, 300.0])
+@pytest.mark.exhaustive
 def test_rays_of_damping_are_labelled_at_the_edge_of_the_axes(scale):
     figure = fflin.plot_poles([-1.0 + 2.0j, -1.0 - 2.0j, -3.0 * scale])
     assert_legible(figure)
@@ -181,6 +182,7 @@ def test_an_object_without_poles_gives_a_one_line_error():
         fflin.plot_poles(masked)
 
 
+@pytest.mark.exhaustive
 def test_figures_are_drawn_in_place_of_the_users_axes(tmp_path):
     pyplot = pytest.importorskip("matplotlib.pyplot")
     lin = fflin.linearize(fflin.load("planar_detumble"))

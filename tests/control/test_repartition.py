@@ -202,6 +202,7 @@ def moving(robot, motion, along, q, v):
     return error[[state.names.index(name) for name in along.state_names]]
 
 
+@pytest.mark.exhaustive
 def test_designs_without_support_name_the_times_of_the_changes(passing):
     _, _, along = passing
     with pytest.raises(fflin.InputError, match=r"Kalman filters.*change at t = "):

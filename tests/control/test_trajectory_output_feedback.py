@@ -136,6 +136,7 @@ def test_the_errors_of_the_estimate_are_as_large_as_the_filter_says():
     assert result.mean() == pytest.approx(runs * nx, rel=0.05)
 
 
+@pytest.mark.exhaustive
 def test_it_goes_on_at_rest_where_the_trajectory_ends(loop):
     robot, along, gains, seen = loop
     policy = fflin.TrajectoryOutputFeedback(along, gains, seen)

@@ -240,6 +240,7 @@ def test_the_speed_of_a_wheel_limits_the_loop(spin):
 @pytest.mark.parametrize(
     "axis", [ORTHOGONAL[0], *exhaustive(*((item,) for item in ORTHOGONAL[1:]))]
 )
+@pytest.mark.exhaustive
 def test_a_large_wheel_turns_against_the_rest_of_the_robot(axis):
     """Its speed per momentum is that of both, the carrier free: a fifth more than of it alone."""
     added = [ReactionWheel(item, inertia=3e-3, max_speed=0.05) for item in ORTHOGONAL]

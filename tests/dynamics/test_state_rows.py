@@ -165,6 +165,7 @@ def test_a_rotor_may_spin_fast_and_a_link_may_not():
     assert "diverged" in fflin.simulate(arm, v0=fast, duration=1.0, dt=0.01).stopped
 
 
+@pytest.mark.exhaustive
 def test_momentum_is_kept_far_away():
     # In orbit about the Earth's centre, where angular momentum about the origin has no digits.
     robot = fflin.load("servicer_7dof")

@@ -163,6 +163,7 @@ def test_samples_of_one_step_agree_with_pinocchio(robots, make):
         pytest.param(followed_outputs, SAMPLE, marks=pytest.mark.exhaustive),
     ],
 )
+@pytest.mark.exhaustive
 def test_a_trajectory_that_ends_before_the_run_agrees_with_pinocchio(robots, make, dt):
     robot, policy, options = make(plain(robots["ets_vii"]))
     both(planned(robot, policy, **options, dt=dt, duration=9.2))

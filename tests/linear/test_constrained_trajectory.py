@@ -69,6 +69,7 @@ def test_the_transition_matrix_is_the_derivative_of_the_motion(loop, column):
     np.testing.assert_allclose(Phi[:, column], difference, atol=2e-6 * size)
 
 
+@pytest.mark.exhaustive
 def test_the_knots_are_models_about_the_moving_reference(loop):
     robot, motion, along = loop
     knot = along[3]

@@ -118,6 +118,7 @@ def test_names_units_and_delays_of_the_added_states():
     assert late.A.shape == (19, 19) and late.C.shape == (12, 19)
 
 
+@pytest.mark.exhaustive
 def test_a_held_point_stays_a_fixed_point():
     """The commands on their way are u0 at the operating point."""
     robot = fflin.load("planar_detumble", gravity=(0.0, 0.0, -9.81))

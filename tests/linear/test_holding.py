@@ -58,6 +58,7 @@ def test_wheels_take_up_the_torque_of_the_gravity_gradient(massive, frame):
     assert np.abs(lin.f0[at]).max() < 1e-15
 
 
+@pytest.mark.exhaustive
 def test_wheels_gain_the_reported_momentum():
     """One orbit of the nonlinear loop; the momentum is measured in the flight."""
     robot, q = hub(wheels(*np.eye(3).tolist()))

@@ -184,6 +184,7 @@ def test_controllability_and_observability_over_a_period():
     assert fflin.observability(fflin.linearize_orbit(robot, steps=40)).dimension == 12
 
 
+@pytest.mark.exhaustive
 def test_a_file_keeps_the_period(held, tmp_path):
     held.save(tmp_path / "along.npz")
     back = fflin.LinearTrajectory.load(tmp_path / "along.npz", held.robot)

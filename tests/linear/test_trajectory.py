@@ -86,6 +86,7 @@ def test_the_simulated_loop_holds_the_point(loop, options, hold, largest):
         assert coarse / along.residual.max() == pytest.approx(4.0, abs=0.8)
 
 
+@pytest.mark.exhaustive
 def test_axes_of_inputs_match_the_frame():
     robot = fflin.load("ets_vii")
     reference = pin.SE3(pin.rpy.rpyToMatrix(0.4, -0.2, 0.9), np.array([1.0, 2.0, 3.0]))

@@ -1,5 +1,7 @@
 """Error budgets equal closed forms, brute-force recursions and simulated motions."""
 
+from dataclasses import replace
+
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -8,7 +10,7 @@ from scipy.stats import chi2
 
 import fflin
 from fflin.base.errors import InputError, UnknownNameError
-from fflin.dynamics.disturbance import BaseDisturbance, phasors_of
+from fflin.dynamics.disturbance import BaseDisturbance, phasors_of, plate_phasors
 from fflin.dynamics.orbital import OrbitField
 from fflin.dynamics.state_rows import attitude_rotations
 from tests.control.test_multirate import designed
@@ -399,19 +401,170 @@ def test_an_amplitude_may_be_a_vector_with_one_phase():
             fflin.error_budget(gain, lin, periodic={"tau_b": wrong})
 
 
-def test_a_budget_warns_of_plates_and_refuses_elliptic_orbits():
+def test_a_budget_refuses_elliptic_orbits():
     robot = fflin.load("cubesat", inputs=[fflin.BaseTorque()], orbit=600e3)
     model = fflin.linearize(robot).discretize(10.0)
     gain = fflin.lqr(model, {"q_b": 1.0, "omega_b": 1.0}, 1e6)
     law = fflin.StateFeedback(model, gain)
-    plate = {"area": 0.1, "normal": (1, 0, 0), "density": 1e-11}
-    lit = robot.replace(disturbance={"plate": [plate]})
-    causes = {"disturbance": {"tau_b.x": 1e-6}}
-    with pytest.warns(fflin.FflinWarning, match="flat plates"):
-        fflin.error_budget(law, model, robot=lit, **causes)
     elliptic = robot.replace(orbit=fflin.EllipticOrbit(perigee=500e3, apogee=900e3))
     with pytest.raises(fflin.InputError, match="error budgets do not support elliptic"):
-        fflin.error_budget(law, model, robot=elliptic, **causes)
+        fflin.error_budget(law, model, robot=elliptic, disturbance={"tau_b.x": 1e-6})
+
+
+MEAN, PERIODIC = "mean of flat plates", "periodic part of flat plates"
+
+# Mirror on the side of a satellite. Sunlight pushes it along its normal.
+MIRROR = {
+    "area": 0.05,
+    "normal": (1, 0, 0),
+    "position": (0.0, 0.3, -0.2),
+    "sun": (1, 0, 0),
+    "specular": 1.0,
+}
+
+
+@pytest.mark.parametrize("frame", ["hybrid", "world"])
+def test_the_mean_torque_of_plates_without_an_orbit_is_that_of_their_forces(frame):
+    """The force acts at the centre of pressure, whose lever starts at the centre of mass."""
+    robot = fflin.load("cubesat", inputs=[fflin.BaseTorque()])
+    q = fflin.configuration(robot, rpy=(0.0, 0.0, 40.0))
+    lin = fflin.linearize(robot, q, frame=frame, reference=pin.SE3.Identity())
+    gain = fflin.lqr(lin)
+    lit = robot.replace(disturbance={"plate": [MIRROR]})
+    budget = fflin.error_budget(gain, lin, robot=lit)
+    (part,) = budget.contributions
+    assert part.cause == MEAN and part.kind == "constant"
+    cosine = np.cos(np.radians(40.0))
+    force = np.array([-2.0 * 4.54e-6 * 0.05 * cosine**2, 0.0, 0.0])
+    centre = pin.centerOfMass(
+        robot.model, robot.create_data(), pin.neutral(robot.model)
+    )
+    torque = np.cross(np.array(MIRROR["position"]) - centre, force)
+    if frame == "world":
+        torque = pin.rpy.rpyToMatrix(0.0, 0.0, np.radians(40.0)) @ torque
+    expected = fflin.error_budget(gain, lin, disturbance={"tau_b": torque})
+    np.testing.assert_allclose(
+        part.size[:3], expected.constant[:3], rtol=1e-9, atol=1e-15
+    )
+
+
+@pytest.mark.parametrize("sample", [None, 1.0])
+def test_sunlight_on_one_face_in_orbit_has_the_moments_of_a_squared_half_wave(sample):
+    """The torque is that of max(cos, 0)^2, with the mean 1/4 and the variance 1/8."""
+    robot = fflin.load("cubesat", inputs=[fflin.BaseTorque()], orbit=600e3)
+    lit = robot.replace(disturbance={"plate": [MIRROR]})
+    lin = fflin.linearize(robot)
+    gain = fflin.lqr(lin, {"q_b": 1.0, "omega_b": 1.0}, 1e6)
+    budget = fflin.error_budget(gain, lin, robot=lit, sample=sample)
+    mean, periodic = budget.contributions
+    assert (mean.cause, periodic.cause) == (MEAN, PERIODIC)
+    # The loop is much faster than the orbit, so that the errors follow the torque.
+    assert mean.size[1:3] == pytest.approx(0.5 * periodic.size[1:3], rel=2e-3)
+    assert budget.deviation[1:3] == pytest.approx(
+        periodic.size[1:3] / np.sqrt(2.0), rel=1e-12
+    )
+    force = np.array([-0.25 * 2.0 * 4.54e-6 * 0.05, 0.0, 0.0])
+    centre = pin.centerOfMass(
+        robot.model, robot.create_data(), pin.neutral(robot.model)
+    )
+    torque = np.cross(np.array(MIRROR["position"]) - centre, force)
+    expected = fflin.error_budget(
+        gain, lin, disturbance={"tau_b": torque}, sample=sample
+    )
+    assert mean.size[1:3] == pytest.approx(expected.constant[1:3], rel=1e-3)
+
+
+def test_harmonics_of_plates_add_to_their_wrench():
+    plates = [
+        {**MIRROR, "sun": (1, 0.5, 0.3), "specular": 0.3, "diffuse": 0.2},
+        {"area": 0.1, "normal": (0.2, 1, 1), "density": 1e-11, "two_sided": True},
+    ]
+    robot = fflin.load("cubesat").replace(orbit=700e3, disturbance={"plate": plates})
+    field = OrbitField(robot, "lvlh")
+    on_base = BaseDisturbance(robot, field)
+    q = fflin.configuration(robot, rpy=(20.0, -10.0, 10.0))
+    R = pin.XYZQUATToSE3(q[:7]).rotation
+    phasors = plate_phasors(robot, field, R)
+    assert len(phasors) == 129
+    largest = np.abs(on_base.wrench(0.0, q)).max()
+    for t in (0.0, 1000.0, 4000.0):
+        terms = [(value * np.exp(1j * w * t)).real for w, value in phasors.items()]
+        # The rest beyond 128 harmonics is of the order 1 / 128^2.
+        error = np.abs(np.sum(terms, axis=0) - on_base.wrench(t, q)).max()
+        assert error < 1e-4 * largest
+
+
+@pytest.mark.exhaustive
+def test_the_errors_of_plates_are_those_of_a_simulated_orbit():
+    plates = [
+        {**MIRROR, "specular": 0.5, "diffuse": 0.2},
+        {"area": 0.1, "normal": (1, 0.2, 0), "density": 1e-12, "position": (0, 0, 0.1)},
+    ]
+    robot = fflin.load("cubesat", inputs=[fflin.BaseTorque()], orbit=600e3)
+    lit = robot.replace(disturbance={"plate": plates})
+    lin = fflin.linearize(robot)
+    period = 2.0 * np.pi / float(np.linalg.norm(OrbitField(robot, "lvlh").rate))
+    h = period / 1000
+    sampled = lin.discretize(h)
+    gain = fflin.lqr(sampled, {"q_b": 1.0, "omega_b": 1.0}, 1e6)
+    law = fflin.StateFeedback(sampled, gain)
+    motion = fflin.simulate(lit, law, duration=2.0 * period, dt=h)
+    budget = fflin.error_budget(law, sampled, robot=lit, motion=motion)
+    # The plates turn by the error, which changes their torque by a fraction of this angle.
+    np.testing.assert_allclose(
+        budget.constant[1:3], np.abs(budget.simulated_mean)[1:3], rtol=0.01
+    )
+    np.testing.assert_allclose(
+        budget.deviation[1:3], budget.simulated_deviation[1:3], rtol=0.01
+    )
+
+
+def wheels_with(lags):
+    """Return the wheels of a satellite with lags [s]."""
+    wheels = [
+        item
+        for item in fflin.load_inputs("cubesat")
+        if isinstance(item, fflin.ReactionWheel)
+    ]
+    return [replace(item, lag=lag) for item, lag in zip(wheels, lags, strict=True)]
+
+
+def test_equal_lags_of_allocated_inputs_lag_the_commanded_torque(satellite):
+    robot, lin, gain = satellite
+    lagging = robot.replace(inputs=wheels_with((0.8, 0.8, 0.8)))
+    law = fflin.Allocation(fflin.StateFeedback(lin, gain), robot)
+    d, f, T = 1e-6, 0.1, 0.8
+    w = 2.0 * np.pi * f
+    periodic = {"tau_b.y": (d, f)}
+    budget = fflin.error_budget(law, lin, periodic=periodic, robot=lagging)
+    a, b, L = double_integrator(lin, gain, "y")
+    # The torque lags by 1 / (1 + j w T).
+    late = 1.0 / (1.0 + 1j * w * T)
+    response = L / abs((a + 1j * b * w) * late - w**2)
+    amplitude = budget.error("attitude.y")["tau_b.y at 0.1 Hz"]
+    assert amplitude == pytest.approx(DEGREES * d * response, rel=1e-9)
+
+
+def test_different_lags_of_allocated_inputs_are_neglected_with_a_warning(satellite):
+    robot, lin, gain = satellite
+    lagging = robot.replace(inputs=wheels_with((0.1, 0.1, 0.2)))
+    law = fflin.Allocation(fflin.StateFeedback(lin, gain), robot)
+    causes = {"periodic": {"tau_b.y": (1e-6, 0.1)}}
+    with pytest.warns(fflin.FflinWarning, match="lags of 0.1 to 0.2 s") as record:
+        budget = fflin.error_budget(law, lin, robot=lagging, **causes)
+    assert record[0].filename == __file__
+    expected = fflin.error_budget(law, lin, **causes)
+    np.testing.assert_allclose(budget.total, expected.total, rtol=1e-12)
+
+
+def test_the_lags_of_the_given_robot_are_in_the_budget(satellite):
+    robot, lin, gain = satellite
+    lagging = robot.replace(inputs=[fflin.BaseTorque(lag=0.4)])
+    noise = {"q_b": 1e-5}
+    budget = fflin.error_budget(gain, lin, noise=noise, robot=lagging)
+    expected = fflin.error_budget(gain, lin.with_lags({"tau_b": 0.4}), noise=noise)
+    np.testing.assert_allclose(budget.total, expected.total, rtol=1e-12)
+    assert budget.total[0] > 1.01 * fflin.error_budget(gain, lin, noise=noise).total[0]
 
 
 class Recursion:

@@ -135,6 +135,7 @@ def test_a_wheel_that_other_inputs_drive_beyond_its_limit_is_in_the_headline(tor
         assert (exceeded in headline) == (torque > 0.0) == ("speed limit" in headline)
 
 
+@pytest.mark.exhaustive
 def test_the_attitude_is_lost_where_the_wheel_is_full():
     """A torque from outside of 0.1 N m fills 6 N m s in a minute; then the body turns."""
     robot = spinner()

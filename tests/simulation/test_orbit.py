@@ -85,6 +85,7 @@ def test_a_body_flies_as_clohessy_and_wiltshire_say():
 
 
 @pytest.mark.parametrize("degrees", [60.0, *exhaustive(20.0, 85.0)])
+@pytest.mark.exhaustive
 def test_pitch_swings_with_the_period_of_the_elliptic_integral(degrees):
     """theta'' = -(3 n^2 / 2) k sin 2 theta, k = (I_x - I_z)/I_y in lvlh: a pendulum of 2 theta."""
     roll, pitch, yaw = 5.0, 4.5, 2.0

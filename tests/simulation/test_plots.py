@@ -86,6 +86,7 @@ def shown_rows(x):
     return rows
 
 
+@pytest.mark.exhaustive
 def test_a_reference_is_drawn_in_a_pale_colour_below_the_motion(along):
     _, motion = along
     figure = motion.plot()
@@ -302,6 +303,7 @@ def test_limits_are_drawn_where_a_curve_comes_to_a_third_of_them(limited):
     assert [text.get_text() for text in named.get_texts()].count("limit") == 1
 
 
+@pytest.mark.exhaustive
 def test_a_motion_without_limits_has_no_lines_of_them(loop):
     _, _, motion = loop
     assert not motion.limit_names

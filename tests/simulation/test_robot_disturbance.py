@@ -124,6 +124,7 @@ def test_default_axes_are_those_of_the_default_frame_and_both_disturbances_add()
     assert motion.v == pytest.approx(expected.v, abs=1e-12)
 
 
+@pytest.mark.exhaustive
 def test_inertial_axes_rotate_in_the_orbital_frame():
     n = 0.5  # [rad/s]
     robot = BODY.replace(

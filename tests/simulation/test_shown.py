@@ -63,6 +63,7 @@ def test_groups_names_and_patterns_pick_panels_and_lines(motion):
     )
 
 
+@pytest.mark.exhaustive
 def test_states_alone_and_inputs_alone(motion):
     assert set(drawn(motion, "r_b")) == {"position r_b"}
     assert set(drawn(motion, ["tau_m"])) == {"joint torques"}

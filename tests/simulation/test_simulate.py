@@ -482,6 +482,7 @@ def test_policies_that_do_not_fit_are_refused():
         fflin.StateFeedback(moving, gain.K)
 
 
+@pytest.mark.exhaustive
 def test_a_wheel_may_turn_many_times_a_step():
     robot = fflin.load("cubesat", inputs=fflin.load_inputs("cubesat"))
     v0 = fflin.velocity(robot, {"wheel_x": 500.0, "omega_b.y": 0.01})

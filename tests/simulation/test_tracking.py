@@ -145,6 +145,7 @@ def test_thrusters_realise_the_base_commands_of_a_schedule():
     np.testing.assert_allclose(run.target, alone.target, atol=1e-14)
 
 
+@pytest.mark.exhaustive
 def test_limits_that_the_trajectory_itself_breaks_are_reported(case):
     robot, schedule, _ = case
     with pytest.warns(fflin.FflinWarning, match=r"0\.\d+ N"):
@@ -320,6 +321,7 @@ def test_inputs_that_jump_at_knots_are_followed_to_the_integrators_order(engine)
     assert errors[0] > 8.0 * errors[1]
 
 
+@pytest.mark.exhaustive
 def test_a_sample_of_inputs_that_change_has_their_mean(monkeypatch):
     robot = fflin.load("planar_detumble")
     traj = swung(robot, 2.0, size=0.5).trajectory()

@@ -353,6 +353,7 @@ def test_tied_parameters_have_one_delta():
     assert uncertain.at({"panel_left.stiffness": 5.0}).stiffness["panel_left"] == 5.0
 
 
+@pytest.mark.exhaustive
 def test_tied_parameters_share_a_value_between_ends_and_the_worst_names_it():
     robot = fflin.load("servicer_7dof", stiffness=PANELS)
     uncertain = fflin.uncertain(

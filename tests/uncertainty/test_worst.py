@@ -349,6 +349,7 @@ WHEELED = {
         pytest.param("position regulated", marks=pytest.mark.exhaustive),
     ],
 )
+@pytest.mark.exhaustive
 def test_stability_matches_the_regulated_states(layout):
     """Worst figures compared with loops of robots built again, over their regulated states."""
     robot = WHEELED[layout]()

@@ -53,6 +53,7 @@ def test_errors_along_a_trajectory_are_in_deg_and_mm(robots):
     assert f"joints {np.degrees(joints):.2g} deg" in text
 
 
+@pytest.mark.exhaustive
 def test_a_run_of_a_campaign_is_named(flown):
     robot, policy, _ = flown
     options = {"runs": 6, "seed": 3, "duration": 2.0, "dt": 0.005}
@@ -70,6 +71,61 @@ def test_a_run_of_a_campaign_is_named(flown):
     assert headline(campaign.replay(worst)).startswith(start)
     start = f"run {other} of 6, seed 3, state feedback"
     assert headline(campaign.replay(other)).startswith(start)
+
+
+def detumbling(law, duration, turns=0.0):
+    """A motion of a cubesat that rotates about its axis z by `turns` orbital rates."""
+    robot = fflin.load("cubesat_magnetic")
+    n = robot.orbit.mean_motion
+    v0 = fflin.velocity(robot, {"omega_b.z": turns * n})
+    motion = fflin.simulate(robot, law, v0=v0, duration=10.0, dt=1.0)
+    # The rates hardly change in 10 s, so later times give a slow motion that is known.
+    return replace(motion, t=motion.t * (duration * robot.orbit.period / 10.0))
+
+
+@pytest.mark.parametrize(
+    ("law", "name"),
+    [(fflin.BDot(1.0), "B-dot"), (fflin.RateDamping(1e-9), "rate damping")],
+)
+def test_the_heading_of_a_detumbling_law_is_about_the_rate(law, name):
+    n = fflin.load("cubesat_magnetic").orbit.mean_motion
+    # The frame rotates about an axis across the axis of rotation of the satellite.
+    for turns, ending in ((3.0, "detumbled after"), (5.0, "not detumbled")):
+        motion = detumbling(law, 1.5, turns)
+        controller, rate, end = headline(motion).split(", ")
+        assert controller == name
+        size = np.degrees(n * np.hypot(turns, 1.0))
+        assert (
+            rate
+            == f"rate {size:.3g} deg/s to {size:.2g} deg/s (mean of the last orbit)"
+        )
+        assert end.startswith(ending)
+        assert str(motion).startswith(ending)
+    short = detumbling(law, 0.5, 3.0)
+    assert headline(short).endswith(", shorter than one orbit")
+    assert str(short).startswith(
+        "not detumbled: the run is shorter than one orbit (5677 s)"
+    )
+    stopped = headline(replace(short, stopped="event"))
+    assert stopped == f"{name}, stopped: event"
+
+
+def test_the_heading_of_two_phases_names_both_laws_and_not_the_detumbling_time():
+    robot = fflin.load("cubesat_magnetic")
+    options = {"duration": 10.0, "dt": 1.0}
+    first = fflin.simulate(robot, fflin.BDot(1.0), **options)
+    start = {"q0": first.q[-1], "v0": first.v[-1]}
+    free = fflin.simulate(robot, **start, **options)
+    assert headline(first.then(free)) == "B-dot, then no control"
+    again = fflin.simulate(robot, fflin.BDot(1.0), **start, **options)
+    assert headline(first.then(again)).endswith(", shorter than one orbit")
+
+
+def test_a_target_does_not_change_the_verdict_of_a_detumbling_law():
+    motion = detumbling(fflin.BDot(1.0), 1.5, 3.0)
+    aimed = replace(motion, target=np.zeros(len(motion.state_names)))
+    assert headline(aimed) == headline(motion)
+    assert "settled" not in str(aimed).partition("\n\n")[0]
 
 
 @pytest.mark.filterwarnings("ignore::fflin.FflinWarning")

@@ -207,6 +207,7 @@ def test_modes_on_the_command_line(tmp_path, capsys, monkeypatch):
     assert main([*command, "--html", str(tmp_path / "m.txt")]) == 2
 
 
+@pytest.mark.exhaustive
 def test_every_bundled_robot_that_bends_can_be_shown(robots, tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

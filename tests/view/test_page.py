@@ -448,6 +448,7 @@ def test_the_files_are_small(name, limit, tmp_path):
     assert os.path.getsize(path) < limit
 
 
+@pytest.mark.exhaustive
 def test_the_floor_lies_below_all_of_the_motion_and_the_target(tmp_path):
     robot = fflin.load("ur5").replace(gravity=(0.0, 0.0, -9.81))
     start = fflin.configuration(
