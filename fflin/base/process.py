@@ -14,6 +14,7 @@ T = TypeVar("T")
 _PATIENCE = 1.0  # seconds before a bar is shown
 _WORTH = 10.0  # shortest work [s] for which an estimate is shown
 _INTERVAL = 0.1
+_BETWEEN_LINES = 20.0  # least time [s] between two lines without a terminal
 LONG_RUN = 20.0  # duration of a run [s] after which a faster engine is recommended
 
 
@@ -84,6 +85,29 @@ class Progress:
         """Remove the bar from the terminal."""
         if self._drawn:
             print("\r\x1b[2K", end="", file=sys.stderr, flush=True)
+
+
+class Status(Progress):
+    """Line of text about a long computation.
+
+    On a terminal, the line is updated. Without a terminal, the first text is printed at once, and
+    later ones at least 20 s apart.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._next_line = -math.inf
+
+    def say(self, text: str) -> None:
+        """Show a text on a terminal, or print it as a line if the last one is old enough."""
+        if self._shown:
+            super().say(text)
+            return
+        now = time.monotonic()
+        if now < self._next_line:
+            return
+        self._next_line = now + _BETWEEN_LINES
+        print(f"fflin: {text}", file=sys.stderr, flush=True)
 
 
 def import_path_without(*folders: str | os.PathLike[str]) -> list[str]:

@@ -231,7 +231,7 @@ class LinearLaw(Feedback):
 
     @property
     def sample_time(self) -> float:
-        """Sampling time [s]; 0 in continuous time."""
+        """Sample time [s]; 0 in continuous time."""
         return self.system.dt or 0.0
 
     def linear_law(self) -> System | None:
@@ -286,8 +286,8 @@ class LinearLaw(Feedback):
         keep their speeds. If the inputs are delayed, the robot waits at the start for the longest
         delay, so that each input of the trajectory acts at its time.
 
-        The matrices of the law remain those about its point. They fit a trajectory if its rates are
-        small compared with the bandwidth of the law, and if the joints stay near the point. For
+        The law keeps the matrices about its point. They fit a trajectory if the trajectory's rates
+        are small compared with the bandwidth of the law, and if the joints stay near the point. For
         other trajectories, use `tvlqr` and `tvkalman`.
 
         Parameters
@@ -517,7 +517,7 @@ def _require_designed_for(gain: Gain, lin: LinearModel) -> None:
     same = {
         "states": gain.model_states == lin.state_names,
         "inputs": gain.input_names == lin.input_names,
-        "sampling time": bool(np.isclose(gain.dt, lin.dt)),
+        "sample time": bool(np.isclose(gain.dt, lin.dt)),
         "delay": _is_same_delay(gain, lin),
         "frame": gain.frame == lin.frame,
         "point": len(gain.model_states) == len(lin.x0)
@@ -625,7 +625,7 @@ class Allocation(Policy):
 
     @property
     def sample_time(self) -> float:
-        """Sampling time [s] of the inner policy."""
+        """Sample time [s] of the inner policy."""
         return self.inner.sample_time
 
     @property
@@ -720,7 +720,7 @@ class Allocation(Policy):
 
 
 def translation_excess(design: Robot, robot: Robot) -> Vector:
-    """Return the part (6 + n,) of a translation's force that is no error of an `Allocation`.
+    """Return the part (6 + n,) of a translation's force that is not an error of an `Allocation`.
 
     It is zero if an input of the design pushes the robot, and for joints without a motor.
     """

@@ -95,7 +95,7 @@ class TrajectoryFeedback(Feedback):
 
     @property
     def sample_time(self) -> float:
-        """Sampling time [s] of the schedule; 0 if it is continuous."""
+        """Sample time [s] of the schedule; 0 if it is continuous."""
         return self.schedule.dt
 
     @property
@@ -361,16 +361,16 @@ class TrajectoryOutputFeedback(OutputSensing, TrajectoryFeedback):
     ----------
     trajectory : LinearTrajectory
     schedule : GainSchedule
-        Result of `tvlqr` with a sampling time.
+        Result of `tvlqr` with a sample time.
     filter : FilterSchedule
-        Result of `tvkalman` with the same sampling time.
+        Result of `tvkalman` with the same sample time.
     noise : callable, optional
         Function noise(t) that returns measurement noise (ny,), which is added to y.
 
     Raises
     ------
     InputError
-        If the gains and the filter have different sampling times or trajectories.
+        If the gains and the filter have different sample times or trajectories.
 
     Examples
     --------

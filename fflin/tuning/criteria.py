@@ -27,11 +27,14 @@ _PARTS, _REFINEMENTS = 8, 4
 # Poles whose values are above _NEAR of the largest are reported, at most _POLES.
 _POLES = 6
 
+# Rounding error of a number of samples.
+_ROUNDING = 1e-9
+
 # Least distance of a transformed pole from a pole of the transformation.
 _AT_ONCE = 1e-9
 
 # Number of instants of a step response.
-_STEPS = 500
+_STEPS = 2000
 
 
 @dataclass(frozen=True, eq=False)
@@ -269,7 +272,7 @@ def _gain_piece(
 
 
 def _continuous(loop: ClosedLoop) -> tuple[Values, Values]:
-    """Return the poles in the time of the model, and their derivatives by those of the plant."""
+    """Return the poles in the time of the model, and their derivatives by the plant's poles."""
     poles = loop.poles
     dt = loop.plant.dt
     if not dt:
@@ -297,7 +300,7 @@ def _decay(goal: Decay, loop: ClosedLoop) -> list[Piece]:
 
 
 def _damping(goal: Damping, loop: ClosedLoop) -> list[Piece]:
-    """Return the required damping ratio divided by those of the least damped poles."""
+    """Return the required damping ratio divided by the ratios of the least damped poles."""
     poles, rates = _continuous(loop)
     sizes = np.abs(poles)
     values = goal.ratio * sizes / np.maximum(-poles.real, 1e-300)
@@ -378,10 +381,32 @@ def _variances(ends: Ends, channel: Channel, loop: ClosedLoop) -> list[Piece]:
 
 
 def step_times(goal: Track, dt: float) -> tuple[Array, float]:
-    """Return the instants [s] of a step response, and their distance."""
-    step = dt or goal.examined / _STEPS
-    number = max(2, math.ceil(goal.examined / step))
-    return step * np.arange(number + 1), step
+    """Return the instants [s] of a step response, and their distance.
+
+    The trapezoidal rule makes a step at -h/2 of a step at 0. One of the instants of a continuous
+    plant is the settling time.
+    """
+    if dt:
+        number = max(2, math.ceil(goal.examined / dt - _ROUNDING))
+        return dt * np.arange(number + 1), dt
+    before = math.ceil(goal.settling / goal.examined * _STEPS)
+    step = goal.settling / (before + 0.5)
+    number = math.ceil(goal.examined / step)
+    return step * (np.arange(number) + 0.5), step
+
+
+def powers(matrix: Array, vector: Array, count: int) -> Array:
+    """Return the rows ``matrix^k vector`` (count, n) for k = 0, 1, ..., count - 1."""
+    rows = np.zeros((count, len(vector)))
+    rows[0] = vector
+    power = matrix.T
+    done = 1
+    while done < count:
+        more = min(done, count - done)
+        rows[done : done + more] = rows[:more] @ power
+        power = power @ power
+        done += more
+    return rows
 
 
 def _step_errors(goal: Track, channel: Channel, loop: ClosedLoop) -> list[Piece]:
@@ -400,8 +425,7 @@ def _step_errors(goal: Track, channel: Channel, loop: ClosedLoop) -> list[Piece]
     # The state xi of the loop has x_k = xi_(k+1) + xi_k for the input of sample k, here a step.
     drive = 0.5 * h * inverse @ B[:, 0]
     halves = np.zeros((len(times) + 1, n))
-    for k in range(len(times)):
-        halves[k + 1] = advance @ halves[k] + drive
+    halves[1:] = powers(advance, drive, len(times)).cumsum(axis=0)
     states = halves[1:] + halves[:-1]
     # The reference is the negative of the error of the sensor.
     errors = -(states @ C[0] + D[0, 0]) - 1.0
@@ -415,15 +439,12 @@ def _step_errors(goal: Track, channel: Channel, loop: ClosedLoop) -> list[Piece]
 
     def impulses(count: int) -> Array:
         """Return the responses (count, m) of the output to impulses of all gains."""
-        rows = np.zeros((count, len(loop.B2.T)))
         # Response of xi: x_k = xi_(k+1) + xi_k after one sample of input.
         column = 0.5 * h * (inverse.T @ C[0])
-        before = column
-        rows[0] = loop.B2.T @ column + D12
-        for k in range(1, count):
-            after = advance.T @ before
-            rows[k] = loop.B2.T @ (after + before)
-            before = after
+        columns = powers(advance.T, column, count)
+        columns[1:] += columns[:-1].copy()
+        rows: Array = columns @ loop.B2
+        rows[0] += D12
         return rows
 
     def piece(k: int) -> Piece:

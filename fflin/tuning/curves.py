@@ -18,6 +18,9 @@ from fflin.tuning.verification import step_errors
 # Frequencies of a curve, and how far it extends beyond the least and the largest pole.
 _POINTS, _BEYOND = 400, 10.0
 
+# Instants of the step response of a continuous loop.
+_INSTANTS = 1501
+
 # Largest ratio of the frequencies of a curve.
 _RANGE = 1e5
 
@@ -101,10 +104,13 @@ def _frequencies(loop: ClosedLoop, ends: Ends) -> Array:
 def _steps(goal: Track, item: GoalLoops) -> Curves:
     """Return the step responses of a goal with its template."""
     rows = []
-    times: Array = np.zeros(0)
+    times: Array = np.linspace(0.0, goal.examined, _INSTANTS)
     for loop, channel in item.loops:
         assert channel is not None
-        times, errors = step_errors(goal, loop.system(channel), loop.plant.dt)
-        rows.append(1.0 + errors)
+        dt = loop.plant.dt
+        instants, errors = step_errors(goal, loop.system(channel), dt)
+        if dt:
+            times = instants
+        rows.append(1.0 + np.interp(times, instants, errors))
     low, high = goal.bounds(times)
     return Curves(goal.label, times, np.array(rows), 1.0 + low, 1.0 + high, True)

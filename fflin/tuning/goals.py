@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 # Signals with sizes: names, or {name, group or pattern: size}.
 Sized: TypeAlias = "Names | Mapping[str, float]"
 
+# Relative rounding error of a time.
+_ROUNDING = 1e-9
+
 # Largest disk margin of a loop.
 _LARGEST_DISK = 2.0
 
@@ -392,7 +395,7 @@ class Track(Goal):
 
     def bounds(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the least and the largest error y - 1 of a unit step at times [s]."""
-        settled = times >= self.settling
+        settled = times >= self.settling * (1.0 - _ROUNDING)
         low = np.where(settled, -self.within, -math.inf)
         high = np.where(settled, min(self.within, self.overshoot), self.overshoot)
         return low, high

@@ -63,6 +63,9 @@ class Term(NamedTuple):
 # Function of a point that returns the pieces, or None if it is not defined there.
 Evaluate = Callable[[Array], "list[Term] | None"]
 
+# Function that is called in each step with its number and the largest value.
+OnStep = Callable[[int, float], None]
+
 
 @dataclass(frozen=True, eq=False)
 class Minimum:
@@ -126,8 +129,12 @@ def minimise(
     *,
     steps: int,
     is_done: Callable[[list[Term]], bool] | None = None,
+    on_step: OnStep | None = None,
 ) -> Minimum:
-    """Minimise the largest objective subject to constraints, from a point where all are defined."""
+    """Minimise the largest objective subject to constraints, from a point where all are defined.
+
+    `on_step` is called in each step with its number and the largest of all values.
+    """
     x: Array = np.clip(start, *bounds)
     terms = evaluate(x)
     assert terms is not None
@@ -140,6 +147,8 @@ def minimise(
         objective, constraint = levels(terms)
         history.append((objective, constraint))
         path.append(x)
+        if on_step is not None:
+            on_step(len(history), max(objective, constraint))
         if is_done is not None and is_done(terms):
             break
         if is_done is None and _stagnates(history):

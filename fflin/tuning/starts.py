@@ -9,7 +9,7 @@ import numpy as np
 
 from fflin.base.validation import Array
 from fflin.tuning.problem import Problem
-from fflin.tuning.search import Minimum, Term, minimise
+from fflin.tuning.search import Minimum, OnStep, Term, minimise
 
 # Largest number of steps of the search for a stable loop.
 _STABILISING = 150
@@ -29,30 +29,47 @@ def searched(
     starts: int,
     steps: int,
     seed: int,
-    done: Callable[[int], None] = lambda number: None,
+    say: Callable[[str], object] | None = None,
 ) -> tuple[Minimum | None, tuple[float, ...]]:
     """Search from several starts, and return the best result and the values of all.
 
     The first start of a law with states is the best law with one state less, so that a law of a
-    higher order is never worse. `done` is called with the number of starts that have ended.
+    higher order is never worse. `say` is called in each step with a text about the progress.
     """
     screening = min(steps, _SCREENING) if starts > 1 else steps
     best: Minimum | None = None
     values = []
-    for number, start in enumerate(_starts(problem, starts, steps, seed)):
+    for number, start in enumerate(_starts(problem, starts, steps, seed, say)):
         x = None if start is None else stabilised(problem, start)
+        on_step = step_texts(say, f"start {number + 1} of {starts}")
         value = math.inf
         if x is not None:
-            minimum = minimise(problem.evaluate, x, problem.bounds, steps=screening)
+            minimum = minimise(
+                problem.evaluate, x, problem.bounds, steps=screening, on_step=on_step
+            )
             value = math.exp(max(minimum.objective, minimum.violation))
             if best is None or _is_better(minimum, best):
                 best = minimum
         values.append(value)
-        done(number + 1)
     if best is not None and best.steps == _SCREENING and steps > _SCREENING:
-        more = minimise(problem.evaluate, best.x, problem.bounds, steps=steps)
+        on_step = step_texts(say, "best start")
+        more = minimise(
+            problem.evaluate, best.x, problem.bounds, steps=steps, on_step=on_step
+        )
         best = more.after(best)
     return best, tuple(values)
+
+
+def step_texts(say: Callable[[str], object] | None, search: str) -> OnStep | None:
+    """Return a function that says the step of a search and its largest value."""
+    if say is None:
+        return None
+
+    def on_step(number: int, level: float) -> None:
+        value = math.exp(min(level, 100.0))
+        say(f"{search}, step {number}: largest value {value:.4g}")
+
+    return on_step
 
 
 def stabilised(problem: Problem, x: Array) -> Array | None:
@@ -74,7 +91,11 @@ def stabilised(problem: Problem, x: Array) -> Array | None:
 
 
 def _starts(
-    problem: Problem, starts: int, steps: int, seed: int
+    problem: Problem,
+    starts: int,
+    steps: int,
+    seed: int,
+    say: Callable[[str], object] | None,
 ) -> Iterator[Array | None]:
     """Yield the starts of a search.
 
@@ -85,7 +106,7 @@ def _starts(
     for number in range(starts):
         rng = np.random.default_rng([seed, number])
         if number == 0:
-            first = _simpler(problem, starts, steps, seed)
+            first = _simpler(problem, starts, steps, seed, say)
             if first is None and has_gain:
                 first = _regulator(problem, None)
             yield problem.start() if first is None else first
@@ -95,14 +116,20 @@ def _starts(
             yield problem.start(rng)
 
 
-def _simpler(problem: Problem, starts: int, steps: int, seed: int) -> Array | None:
+def _simpler(
+    problem: Problem,
+    starts: int,
+    steps: int,
+    seed: int,
+    say: Callable[[str], object] | None,
+) -> Array | None:
     """Return the point of the best simpler law, or None."""
     simple = problem.simpler
     if simple is None:
         return None
     # The simplest law is searched from all starts, and each other law from the next simpler law.
     few = starts if simple.simpler is None else 1
-    best = searched(simple, few, min(steps, _SCREENING), seed)[0]
+    best = searched(simple, few, min(steps, _SCREENING), seed, say)[0]
     return None if best is None else problem.extended(simple, best.x)
 
 

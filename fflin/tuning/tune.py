@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,7 +26,7 @@ from fflin.tuning.points import Point, Points, points_of
 from fflin.tuning.problem import Case, Measure, Problem
 from fflin.tuning.robust import UncertainLoop
 from fflin.tuning.search import Minimum, Term, minimise
-from fflin.tuning.starts import searched, stabilised
+from fflin.tuning.starts import searched, stabilised, step_texts
 from fflin.tuning.structures import Structure, Structured
 from fflin.tuning.tuned import GoalValue, Tuned, is_active
 from fflin.tuning.verification import peak_above, second_value
@@ -61,6 +62,7 @@ def tune(
     starts: int = 3,
     steps: int = 300,
     seed: int = 0,
+    progress: Callable[[str], object] | None = None,
 ) -> Tuned:
     """Tune the parameters of a law of a given structure to goals.
 
@@ -96,6 +98,9 @@ def tune(
         Largest number of steps of each search.
     seed : int
         The same seed gives the same law, bit for bit.
+    progress : callable, optional
+        Function that is called with a text about the progress, often several times per second. By
+        default, a line on stderr shows the text if stderr is a terminal.
 
     Returns
     -------
@@ -140,13 +145,14 @@ def tune(
     starts = count("starts", starts, largest=1000)
     steps = count("steps", steps, largest=100_000)
     seed = whole("seed", seed, 0)
-    points = points_of(plant, dt, delay, seed, q)
-    task = _Task(structure, every, points)
-    bar = Progress()
-    problem, minimum, values = task.first(starts, steps, seed, bar)
-    problem, minimum = task.with_worst(problem, minimum, steps, bar)
-    bar.close()
-    return task.result(problem, minimum, values, time.process_time() - started)
+    with closing(Progress()) as line:
+        say = line.say if progress is None else progress
+        say("models of the plant")
+        points = points_of(plant, dt, delay, seed, q)
+        task = _Task(structure, every, points, say)
+        problem, minimum, values = task.first(starts, steps, seed)
+        problem, minimum = task.with_worst(problem, minimum, steps)
+        return task.result(problem, minimum, values, time.process_time() - started)
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,9 +169,14 @@ class _Task:
     """Search of a structure, goals and models."""
 
     def __init__(
-        self, structure: Structure, goals: Sequence[Goal], points: Points
+        self,
+        structure: Structure,
+        goals: Sequence[Goal],
+        points: Points,
+        say: Callable[[str], object],
     ) -> None:
         self.points = points
+        self.say = say
         lin = points.nominal
         self.lin = lin
         self.signals: Signals = signals_of(lin)
@@ -214,25 +225,22 @@ class _Task:
         return Problem(self.structured, self.measures, cases)
 
     def first(
-        self, starts: int, steps: int, seed: int, bar: Progress
+        self, starts: int, steps: int, seed: int
     ) -> tuple[Problem, Minimum, tuple[float, ...]]:
         """Search from several starts, and return the best result and the values of all."""
         problem = self.problem()
-        best, values = searched(
-            problem, starts, steps, seed, lambda done: bar(done, starts, "search")
-        )
+        best, values = searched(problem, starts, steps, seed, self.say)
         if best is None:
             raise InputError(self._why_unstable(problem))
         return problem, best, values
 
     def with_worst(
-        self, problem: Problem, minimum: Minimum, steps: int, bar: Progress
+        self, problem: Problem, minimum: Minimum, steps: int
     ) -> tuple[Problem, Minimum]:
         """Add the worst models until none is worse, and return the last problem and result."""
         candidates = self.points.candidates
         few = candidates[: self.points.corners + _FEW]
-        for number in range(_ROUNDS):
-            bar(number + 1, _ROUNDS, "worst models")
+        for _ in range(_ROUNDS):
             added, values = self._worse(problem, minimum.x, few)
             if not added:
                 added, values = self._worse(problem, minimum.x, candidates)
@@ -246,7 +254,10 @@ class _Task:
                     "no law of this structure was found that stabilises all models; give narrower "
                     "ranges, or another structure"
                 )
-            more = minimise(problem.evaluate, start, problem.bounds, steps=steps)
+            on_step = step_texts(self.say, f"search with {len(self.chosen)} models")
+            more = minimise(
+                problem.evaluate, start, problem.bounds, steps=steps, on_step=on_step
+            )
             minimum = more.after(minimum)
         return problem, minimum
 
@@ -263,7 +274,9 @@ class _Task:
             levels.append(_WORSE * max(value, limit))
         law = problem.law(x)
         missed: dict[int, tuple[float, Point]] = {}
-        for point in (*self.points.fixed, *self.points.candidates):
+        points = (*self.points.fixed, *self.points.candidates)
+        for number, point in enumerate(points, 1):
+            self.say(f"gains of model {number} of {len(points)} at all frequencies")
             case = self.case(point)
             for index, loop in enumerate(case.loops(law) or []):
                 measure, scaling = self.measures[index], problem.scaling(x, index)
@@ -313,7 +326,8 @@ class _Task:
     ) -> list[_Worst]:
         """Return the largest value of each goal over models."""
         results: list[_Worst | None] = [None] * len(self.measures)
-        for point in points:
+        for number, point in enumerate(points, 1):
+            self.say(f"goals of model {number} of {len(points)}")
             case = self.case(point)
             floors = [
                 0.0 if known is None else _REFINED * known.value for known in results
@@ -360,6 +374,7 @@ class _Task:
             active = is_active(found.value, hard, level)
             bound = math.nan
             if uncertain is not None:
+                self.say(f"bound over the whole ranges: {measure.goal.label}")
                 largest = max(found.value, 0.0 if math.isnan(check) else check)
                 bound = uncertain.bound(measure.goal, measure.ends, largest)
             goals.append(
@@ -419,6 +434,7 @@ class _Task:
 
     def _least(self, goal: Goal) -> float:
         """Return the norm of full order of a goal that `hinf` accepts, or NaN."""
+        self.say(f"least value of all controllers: {goal.label}")
         measured, commanded = self.structured.used
         outputs = [self.signals.outputs[index] for index in measured]
         inputs = [self.signals.inputs[index] for index in commanded]
@@ -440,7 +456,13 @@ class _Task:
                     return None
                 return [term._replace(is_constraint=False) for term in terms]
 
-            relaxed = minimise(evaluate, minimum.x, problem.bounds, steps=_RELAXING)
+            relaxed = minimise(
+                evaluate,
+                minimum.x,
+                problem.bounds,
+                steps=_RELAXING,
+                on_step=step_texts(self.say, "search for the least factor"),
+            )
         weights: dict[int, float] = {}
         for key, weight in (relaxed.weights or {}).items():
             index = key[1] if isinstance(key, tuple) else 0

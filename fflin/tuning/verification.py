@@ -13,7 +13,7 @@ from fflin.control.optimal.disk import Loop, largest_scaled_gain
 from fflin.control.optimal.largest_gain import gain_crossings
 from fflin.tuning.channels import Channel, Ends
 from fflin.tuning.closed_loop import ClosedLoop
-from fflin.tuning.criteria import scaled, weights_at
+from fflin.tuning.criteria import powers, scaled, weights_at
 from fflin.tuning.goals import Goal, Margin, MaxGain, RollOff, Track, Variance
 from fflin.tuning.weights import Weight
 
@@ -23,8 +23,9 @@ _ACCURACY, _LEVELS = 1e-8, 60
 # Frequencies of a sweep of a sampled loop with a weight that depends on frequency.
 _SWEEP = 4000
 
-# Instants of a step response in each instant of the search.
-_FINER, _STEPS = 4, 500
+# Least and largest number of instants of a step response, and the largest product of their distance
+# and a pole. Between two instants, the oscillation of this pole rises by at most 0.13 %.
+_STEPS, _TURN = (4000, 100_000), 0.1
 
 # Goals whose value is a largest gain over frequency.
 _GAINS = (MaxGain, RollOff, Margin)
@@ -38,7 +39,7 @@ def second_value(
     """Return the value of a goal by a second method; None for goals of poles.
 
     Gains follow from eigenvalues of Hamiltonian matrices, instead of a search over frequencies.
-    Margins are those of the best scaling at each frequency. Variances follow from the Gramian of
+    Margins use the best scaling at each frequency. Variances follow from the Gramian of
     observability, and step responses from matrix exponentials.
     """
     if ends is None or channel is None:
@@ -178,21 +179,25 @@ def step_errors(goal: Track, system: System, dt: float) -> tuple[Array, Array]:
     n = len(A)
     rows: Array = C
     through: Array = D
-    h = dt or goal.examined / (_STEPS * _FINER)
     if dt:
+        h = dt
         rate = 2.0 / dt
         inverse = np.linalg.inv(rate * np.eye(n) - A)
         factor = math.sqrt(2.0 * rate)
         advance, drive = (rate * np.eye(n) + A) @ inverse, factor * inverse @ B
         rows, through = factor * C @ inverse, D + C @ inverse @ B
     else:
+        fastest = np.abs(np.linalg.eigvals(A)).max(initial=0.0)
+        wanted = goal.examined * float(fastest) / _TURN
+        steps = min(max(wanted, _STEPS[0]), _STEPS[1])
+        # One of the instants is the settling time.
+        before = math.ceil(goal.settling / goal.examined * steps)
+        h = goal.settling / before
         step = expm(h * np.block([[A, B], [np.zeros((1, n + 1))]]))
         advance, drive = step[:n, :n], step[:n, n:]
     count = max(2, math.ceil(goal.examined / h - 1e-9))
     times = h * np.arange(count + 1)
-    state = np.zeros(n)
-    errors = np.zeros(count + 1)
-    for k in range(count + 1):
-        errors[k] = -float(rows[0] @ state + through[0, 0]) - 1.0
-        state[:] = advance @ state + drive[:, 0]
+    states = np.zeros((count + 1, n))
+    states[1:] = powers(advance, drive[:, 0], count).cumsum(axis=0)
+    errors: Array = -(states @ rows[0] + through[0, 0]) - 1.0
     return times, errors

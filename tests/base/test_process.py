@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 import fflin
-from fflin.base.process import Progress, import_path_without
+from fflin.base.process import Progress, Status, import_path_without
 from fflin.batch.run import OwnWorkers
 from tests.support.commands import run, run_in_process
 
@@ -104,3 +104,28 @@ def test_a_long_run_shows_its_hint(monkeypatch, capsys):
         "75 s left (faster: --engine compiled)"
     )
     assert len(late) <= 80
+
+
+def test_without_a_terminal_a_line_appears_at_once_and_now_and_then(
+    monkeypatch, capsys
+):
+    now = [0.0]
+    monkeypatch.setattr("fflin.base.process.time.monotonic", lambda: now[0])
+    line = Status()
+    for now[0] in (0.0, 1.0, 19.0, 21.0, 22.0):
+        line.say(f"at {now[0]:g} s")
+    line.close()
+    assert capsys.readouterr().err == "fflin: at 0 s\nfflin: at 21 s\n"
+
+
+def test_on_a_terminal_one_line_is_updated(monkeypatch, capsys):
+    now = [0.0]
+    monkeypatch.setattr("fflin.base.process.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("fflin.base.process.on_terminal", lambda: True)
+    line = Status()
+    for now[0] in (0.0, 1.1, 1.15, 2.0):
+        line.say(f"at {now[0]:g} s")
+    line.close()
+    assert capsys.readouterr().err == "".join(
+        f"\r\x1b[2K{text}" for text in ("at 1.1 s", "at 2 s", "")
+    )

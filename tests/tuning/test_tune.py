@@ -175,7 +175,8 @@ def test_a_step_response_follows_its_template(stiff):
         fflin.linearize(stiff), LAW, [goal, fflin.Margin(0.5)], starts=1, steps=30
     )
     assert policy.goals[0].met
-    assert policy.goals[0].value == pytest.approx(policy.goals[0].check, rel=2e-2)
+    # The trapezoidal rule of the search is exact to (w h)^2 / 12 for a pole at w, here 0.1 %.
+    assert policy.goals[0].value == pytest.approx(policy.goals[0].check, rel=2e-3)
 
 
 REFUSED = {
