@@ -125,7 +125,7 @@ def test_a_hard_step_that_limits_the_other_goals_holds_by_both_methods(seed):
 def contradicting(factor):
     """Goals that contradict each other, with limits that are larger by a factor."""
     return [
-        fflin.Margin(1.0 / factor, hard=True),
+        fflin.Margin(1.0 / factor),
         fflin.MaxGain({"tau_b": TORQUE}, {"q_b": 3e-5 * factor}),
         fflin.RollOff({"q_b": NOISE}, {"tau_b": 1.0}, above=8.0, below=0.03 * factor),
     ]
