@@ -88,7 +88,7 @@ class CampaignPointing(FrozenArrays, html.Reported):
         For each wheel with a limit, the largest speed or torque of each run (N,) as a fraction of
         the limit.
     thrusters : mapping
-        ``pulses``, ``impulse`` [N s] and ``propellant`` [kg] of each run (N,), as far as known.
+        ``pulses``, ``impulse`` [N s] and ``propellant`` [kg] of each run (N,), if known.
     confidence : float
         Confidence level of the intervals.
     robot : str

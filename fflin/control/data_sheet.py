@@ -104,7 +104,7 @@ def measurement_noise(lin: LinearModel, V: Noises | None) -> Weight:
     if V is None and missing:
         raise InputError(
             f"V is missing, and the outputs {listed(missing)} have no noise; give V, or noise= of "
-            "these outputs"
+            "these outputs (noise in their [[output]] of the robot file)"
         )
     return values
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -185,8 +185,10 @@ class MultirateCompensator(_Periodic):
         Signals of the compensator. The inputs of the compensator are the outputs of the model.
     robot, urdf_sha256 : str
         Name of the robot, and SHA-256 of its URDF.
-    pace : str
-        Note on the disk margin of the loop, as in `Compensator`.
+    delay : ndarray (nu,)
+        Delay of the inputs [s] in the model, as in `Compensator`.
+    slow_bias, pace : str
+        Notes on an estimated bias and on the disk margin of the loop, as in `Compensator`.
 
     Examples
     --------
@@ -205,6 +207,9 @@ class MultirateCompensator(_Periodic):
     E: Array
     y0: Vector
     u0: Vector
+    # Files of earlier versions contain no delay.
+    delay: Vector = field(default_factory=lambda: np.zeros(0))
+    slow_bias: str = ""
     pace: str = ""
 
     @property
@@ -222,6 +227,8 @@ class MultirateCompensator(_Periodic):
     def _notes(self) -> list[str]:
         """Return notes on estimated disturbances and biases, and on the pace of the loop."""
         notes = list(added_notes(self.state_names))
+        if self.slow_bias:
+            notes.append(self.slow_bias)
         if self.pace:
             notes.append(self.pace)
         return notes

@@ -93,6 +93,11 @@ class MultirateFeedback(OutputSensing, Feedback):
         return self.lin.dt
 
     @property
+    def notes(self) -> tuple[str, ...]:
+        """Note on an estimated bias that settles slowly."""
+        return (self.compensator.slow_bias,) if self.compensator.slow_bias else ()
+
+    @property
     def sensors(self) -> tuple[str, ...]:
         """Names of the outputs of the model."""
         return self.lin.output_names

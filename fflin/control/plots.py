@@ -100,7 +100,7 @@ def plot_matrices(
     path : str or Path, optional
         File to save to: .png, .pdf or .svg. See `plot_motion` for possible errors.
     axes : matplotlib.axes.Axes, optional
-        Axes of a grid, as of ``pyplot.subplots``, in whose place the figure is drawn.
+        Axes of a grid, such as from ``pyplot.subplots``; the figure is drawn in their place.
 
     Examples
     --------
@@ -164,7 +164,7 @@ def plot_modes(
     path : str or Path, optional
         File to save to: .png, .pdf or .svg. See `plot_motion` for possible errors.
     axes : matplotlib.axes.Axes, optional
-        Axes of a grid, as of ``pyplot.subplots``, in whose place the figure is drawn.
+        Axes of a grid, such as from ``pyplot.subplots``; the figure is drawn in their place.
 
     Examples
     --------
@@ -247,7 +247,7 @@ def plot_check(
     path : str or Path, optional
         File to save to: .png, .pdf or .svg. See `plot_motion` for possible errors.
     axes : matplotlib.axes.Axes, optional
-        Axes of a grid, as of ``pyplot.subplots``, in whose place the figure is drawn.
+        Axes of a grid, such as from ``pyplot.subplots``; the figure is drawn in their place.
 
     Examples
     --------
@@ -319,7 +319,7 @@ def plot_poles(
     title : str
         Title of the figure.
     axes : matplotlib.axes.Axes, optional
-        Axes of a grid, as of ``pyplot.subplots``, in whose place the figure is drawn.
+        Axes of a grid, such as from ``pyplot.subplots``; the figure is drawn in their place.
 
     Returns
     -------
@@ -377,7 +377,7 @@ def plot_loops(
     sample : float, optional
         Sample time [s] with which a continuous law is executed.
     axes : matplotlib.axes.Axes, optional
-        Axes of a grid, as of ``pyplot.subplots``, in whose place the figure is drawn.
+        Axes of a grid, such as from ``pyplot.subplots``; the figure is drawn in their place.
 
     Returns
     -------

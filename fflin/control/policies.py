@@ -15,6 +15,7 @@ from fflin.base.errors import InputError
 from fflin.base.validation import Array, Vector, frozen, instance, shaped
 from fflin.control.channel import Law
 from fflin.control.delayed import is_delayed, law_with_memory
+from fflin.control.dipole_error import note_on_dipole
 from fflin.control.following import Following
 from fflin.control.gain import Gain
 from fflin.control.loops import (
@@ -751,6 +752,7 @@ class AllocatedPolicy(BoundLaw):
             self.correct = self._correct
         self._data = robot.create_data()
         self._design_data = allocation.design.create_data()
+        self._law = allocation.inner
         self._limits = input_limits(robot, limits_of(robot))
         excess = translation_excess(allocation.design, robot)
         self._excess = excess[:, np.newaxis]
@@ -764,7 +766,11 @@ class AllocatedPolicy(BoundLaw):
         asked, given = (
             ", ".join(actuation.groups) for actuation in (self._design, self._robot)
         )
-        return (f"allocation: the commanded {asked} are realised by {given}", *notes)
+        notes = (f"allocation: the commanded {asked} are realised by {given}", *notes)
+        if isinstance(self._law, StateFeedback):
+            robot = self._robot.state.robot
+            notes += note_on_dipole(robot, self._law.lin, self._law.K)
+        return notes
 
     def __call__(self, t: float, q: Array, v: Array) -> Array:
         """Return the inputs (nu,) whose generalised force is nearest to the commanded force.

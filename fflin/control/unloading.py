@@ -201,7 +201,7 @@ def _models(
     model = continuous
     if lin.lag.any() or lin.output_lag.any():
         # The wheels and the external torque lag alike, so their lagging torques cancel each other.
-        # The law computes the lagging torques of its own commands alone.
+        # The law computes only the lagging torques of its own commands.
         model = continuous.with_lags(lag, lags_by_name(lin)[1])
     if not lin.dt:
         return model, continuous

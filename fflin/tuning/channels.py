@@ -117,7 +117,7 @@ def _sized(given: Sized) -> dict[str, float]:
 
 
 def _expanded(sizes: dict[str, float], signals: Signals) -> dict[str, float]:
-    """Replace groups of inputs such as wheel by the names of the inputs."""
+    """Replace groups of inputs, such as "wheel", by the names of the inputs."""
     members = {
         name: size for key, size in sizes.items() for name in signals.expanded(key)
     }
