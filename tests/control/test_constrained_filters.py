@@ -22,6 +22,7 @@ def resting():
     return robot, q, along
 
 
+@pytest.mark.exhaustive
 def test_the_covariance_is_the_exact_discrete_one(resting):
     """For constant A: the disturbance over a sample by Van Loan's matrix exponential."""
     robot, q, along = resting
