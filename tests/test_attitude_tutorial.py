@@ -11,7 +11,7 @@ import fflin
 
 PAGE = Path(__file__).parents[1] / "docs" / "tutorials" / "attitude_control.md"
 CELL = re.compile(r"```\{code-cell\}\n(?::[^\n]*\n)*(.*?)```", re.DOTALL)
-H = 0.25  # sampling time and delay [s]
+H = 0.25  # sample time and delay [s]
 LATE = 4  # commands on their way
 
 

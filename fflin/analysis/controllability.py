@@ -11,6 +11,7 @@ from fflin.analysis.hautus import split_by_poles, unobservable
 from fflin.analysis.lasting_modes import conclude, reached, root_of
 from fflin.analysis.mechanics import ConservedMomenta, combination
 from fflin.analysis.observability import lasting_motions, observability
+from fflin.analysis.output_hints import with_outputs
 from fflin.base.errors import (
     DetectabilityError,
     InputError,
@@ -571,7 +572,7 @@ def require_detectable(lin: LinearModel) -> None:
     lin = lin.undelayed
     missed = "the outputs do not observe {}, whose motion does not decay by itself; add outputs"
     if len(lin.A) < 2 * len(lin.M):
-        report = reached(
+        words, notes, margin = reached(
             lin.state_names,
             lin.dt,
             lin.A.T,
@@ -580,11 +581,12 @@ def require_detectable(lin: LinearModel) -> None:
             missed,
             unstable=True,
         )
-        return conclude(DetectabilityError, *report)
+        return conclude(DetectabilityError, with_outputs(words), notes, margin)
     analysis = observability(lin)
     words = ""
     if not analysis.detectable:
-        words = missed.format(listed(lasting_motions(lin, analysis)))
+        motions = lasting_motions(lin, analysis)
+        words = with_outputs(missed.format(listed(motions)), " ".join(motions))
     return conclude(DetectabilityError, words, analysis.notes, analysis.margin)
 
 

@@ -288,8 +288,8 @@ class Modes(html.Reported):
         }
         rows = [["rad/s", "clamped", "mode", "elastic energy"]]
         # Freeing the link raises the frequencies. A motion far below all clamped frequencies, such
-        # as an oscillation in orbit, is no mode of an appendage, although it strains the appendages
-        # a little.
+        # as an oscillation in orbit, is not a mode of an appendage, although it strains the
+        # appendages a little.
         least = 0.5 * min(clamped.values(), default=0.0)
         for mode in self.vibrations:
             name = next(iter(mode.strain), "")

@@ -358,7 +358,7 @@ def wheel_inputs(lin: LinearModel) -> tuple[str, ...]:
 def ignorable_wheels(lin: LinearModel) -> tuple[Indices, Indices]:
     """Return two index arrays of wheels whose angles do not affect the other states.
 
-    The first array contains all such wheels. The second array contains those of them whose speeds
+    The first array contains all such wheels. The second array contains the wheels whose speeds
     do not affect the other states either.
     """
     nv = len(lin.M)
@@ -527,11 +527,14 @@ def without(lin: LinearModel, removed: Indices) -> LinearModel:
 
     If the removed states do not affect the other states, the result is exact.
     """
-    kept = np.setdiff1d(np.arange(len(lin.M)), removed)
-    names = [lin.state_names[i] for i in (*kept, *(kept + len(lin.M)))]
+    nv = len(lin.M)
+    kept = np.setdiff1d(np.arange(nv), removed)
+    rates = nv + kept
+    names = [lin.state_names[i] for i in (*kept, *rates)]
     rest = mechanics.floating_inertia(lin.M, kept, removed)
     # Set stiffness and damping to zero if they are only rounding errors of a spin.
-    nv, A, system = len(lin.M), lin.A.copy(), mechanics.second_order(lin)
+    system = mechanics.second_order(lin)
+    A = lin.A.copy()
     if not lin.dt and not system.K.values.any():
         A[nv:, :nv] = 0.0
     if not lin.dt and not system.D.values.any():

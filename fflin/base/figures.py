@@ -150,7 +150,7 @@ def drawing(
 def _in_place_of(axes: object) -> Figure:
     """Return a subfigure in place of axes, which are removed.
 
-    Raise `InputError` if `axes` are not axes in a grid, such as those of ``pyplot.subplots``.
+    Raise `InputError` if `axes` are not axes in a grid, such as ``pyplot.subplots`` returns.
     """
     from matplotlib.axes import Axes as GivenAxes
 

@@ -221,7 +221,7 @@ class ScheduledFeedback(Feedback):
     gains : GainBatch
         Gains of the same robot, on a grid of its joint positions. If the robot has captured or
         released an object since the gains were designed, `line_up` matches the states and inputs of
-        `gains` with those of `lin`.
+        `gains` with the states and inputs of `lin`.
 
     Raises
     ------

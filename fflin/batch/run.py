@@ -154,7 +154,7 @@ def run_chunks(
 ) -> int:
     """Compute the missing chunks of a store, save the results, and return the number of kept rows.
 
-    Kept rows are those that the store contains from before this call.
+    Kept rows are rows that the store contained before this call.
 
     The store saves the rows and results for which it has arrays. If `upto` is given, only chunks
     that begin before row `upto` are computed.

@@ -26,9 +26,9 @@ if TYPE_CHECKING:
 class ToolBatch(Design):
     r"""Linear models ``dx/dt = f0 + A (x - x0) + B (u - u0)`` in another tool's coordinates.
 
-    The models are those of a `LinearBatch`. See `ToolModel` for the state x. ``tool_batch[i]`` is
-    the `ToolModel` of point i. The outputs are not converted, so it has none; for one model with
-    its outputs, convert ``batch[i].to(tool)`` of the `LinearBatch`.
+    The models are converted from a `LinearBatch`. See `ToolModel` for the state x.
+    ``tool_batch[i]`` is the `ToolModel` of point i. The outputs are not converted, so it has none;
+    for one model with its outputs, convert ``batch[i].to(tool)`` of the `LinearBatch`.
 
     Attributes
     ----------
@@ -40,7 +40,7 @@ class ToolBatch(Design):
     q, v : ndarray
         Configurations and velocities of the points in the tool's coordinates, one row each.
     T, T_left, T_u : ndarray (N, nx, 12 + 2n), (N, 12 + 2n, nx), (N, nu, nu)
-        Matrices from the deviations of a `LinearModel` to those of the tool, see `ToolModel`.
+        Matrices from the deviations of a `LinearModel` to the tool's deviations, see `ToolModel`.
     dt : float
         Time step [s]; 0 in continuous time.
     state_names, input_names, state_units, input_units : tuple of str
@@ -131,7 +131,7 @@ class _Change(NamedTuple):
 
     @property
     def T_u(self) -> Array:
-        """Matrix from input deviations of a model to those of the tool."""
+        """Matrix from input deviations of a model to the tool's input deviations."""
         return np.linalg.solve(self.to.V, self.own.V)
 
 
@@ -205,7 +205,7 @@ class _Points:
         self._nu = state.velocities(batch.v)
         nv = self._nu.shape[1]
         base = slice(nv, nv + 6)
-        # The rates of the base: those of a moving reference, or f0 in the axes of the frame.
+        # The rates of the base: the rates of a moving reference, or f0 in the axes of the frame.
         drift = batch.f0 if batch._drift is None else batch._drift
         self._placements = batch.placements
         moves_base = kind.actuation.fixed[:6].any(axis=0)

@@ -460,7 +460,7 @@ class Campaign(FrozenArrays):
         ------
         InputError
             If the run does not exist, or the campaign was loaded from a file and the robot or an
-            option is missing or is not that of the campaign.
+            option is missing or differs from the campaign.
 
         Warns
         -----
@@ -525,7 +525,7 @@ class Campaign(FrozenArrays):
     def to_pandas(self) -> DataFrame:
         """Return the table of figures as a pandas data frame, with the number of the run as index.
 
-        The columns are those of the .csv file that `save` writes.
+        The columns are the columns of the .csv file that `save` writes.
 
         Raises
         ------

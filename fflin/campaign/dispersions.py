@@ -621,7 +621,7 @@ class Dispersions:
 
     @property
     def _root_of_sample(self) -> float:
-        """Square root of the sampling time of the law [s^0.5]."""
+        """Square root of the sample time of the law [s^0.5]."""
         return math.sqrt(self._times.sample * self._times.dt)
 
     def one(self, drawn: Array) -> tuple[Plant, Policy | None, Array, Array]:

@@ -136,7 +136,7 @@ def monte_carlo(
           at each sample. If the spread is a number, it is the standard deviation of the noise in
           all runs. From any other spread, a standard deviation is drawn for each run.
           ``NAME.drift``: standard deviation of the random change of the sensor's bias within 1 s.
-          By default, noise and drift are those that the robot's outputs declare, see `Output`; the
+          By default, the robot's outputs declare noise and drift, see `Output`; the
           option ``noise=0`` leaves them out.
         - ``delay`` [s]: change of the argument `delay` of `simulate`. The total delay is rounded to
           whole steps; a negative total becomes 0.

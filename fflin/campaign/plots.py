@@ -58,7 +58,7 @@ def plot_campaign(
     worst : int
         Number of worst runs to draw, at most five.
     axes : matplotlib.axes.Axes, optional
-        Axes of a grid, as of ``pyplot.subplots``, in whose place the figure is drawn.
+        Axes of a grid, such as from ``pyplot.subplots``; the figure is drawn in their place.
 
     Returns
     -------
@@ -126,7 +126,7 @@ def plot_validity(
     path : str or Path, optional
         File to save to: .png, .pdf or .svg. See `plot_motion` for possible errors.
     axes : matplotlib.axes.Axes, optional
-        Axes of a grid, as of ``pyplot.subplots``, in whose place the figure is drawn.
+        Axes of a grid, such as from ``pyplot.subplots``; the figure is drawn in their place.
 
     Examples
     --------
@@ -193,7 +193,7 @@ def plot_funnel(
     path : str or Path, optional
         File to save to: .png, .pdf or .svg. See `plot_motion` for possible errors.
     axes : matplotlib.axes.Axes, optional
-        Axes of a grid, as of ``pyplot.subplots``, in whose place the figure is drawn.
+        Axes of a grid, such as from ``pyplot.subplots``; the figure is drawn in their place.
 
     Examples
     --------

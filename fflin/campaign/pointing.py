@@ -88,7 +88,7 @@ class CampaignPointing(FrozenArrays, html.Reported):
         For each wheel with a limit, the largest speed or torque of each run (N,) as a fraction of
         the limit.
     thrusters : mapping
-        ``pulses``, ``impulse`` [N s] and ``propellant`` [kg] of each run (N,), as far as known.
+        ``pulses``, ``impulse`` [N s] and ``propellant`` [kg] of each run (N,), if known.
     confidence : float
         Confidence level of the intervals.
     robot : str
@@ -411,7 +411,7 @@ def _motions(
 def _joined(
     campaign: Campaign, completed: Indices, figures: list[Pointing]
 ) -> CampaignPointing:
-    """Return the figures of all runs; those of stopped runs are infinite."""
+    """Return the figures of all runs; the figures of stopped runs are infinite."""
     count = len(campaign)
 
     def all_runs(values: Sequence[object]) -> Array:

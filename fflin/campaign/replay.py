@@ -112,7 +112,7 @@ def job_of(
         or job.plant.state.names != campaign.state_names
     ):
         raise InputError(
-            "the robot or policy is not that of the campaign, because the names of the drawn "
+            "the robot or policy differs from the campaign, because the names of the drawn "
             "values or of the states differ; give the arguments of the call of monte_carlo"
         )
     return job

@@ -241,21 +241,17 @@ class Loop:
         free = linearize(
             self.robot, lin.q, lin.v, lin.u0, frame=lin.frame, reference=lin.reference
         )
-        rates = [2.0 * free.A] if lin.dt else [free.A, self.rate]
-        fastest = max(
-            float(np.abs(np.linalg.eigvals(matrix)).max()) for matrix in rates
-        )
+        matrices = [free.A] if lin.dt else [free.A, self.rate]
+        poles = [np.linalg.eigvals(matrix) for matrix in matrices]
+        factor = 2.0 if lin.dt else 1.0
+        fastest = factor * max(float(np.abs(values).max()) for values in poles)
         time_constants = _CONSTANTS if predicts else PATIENCE * math.log(1.0 / SETTLED)
         horizon = time_constants / decay
         pace = max(fastest, 4.0 * decay) * min(max(joint, 1.0), _WIDEST)
         # The step must also be short enough for the damping of all modes.
-        matrices = [free.A] if lin.dt else [free.A, self.rate]
-        poles = [
-            Poles("robot and the loop", np.linalg.eigvals(matrix))
-            for matrix in matrices
-        ]
+        limits_of_step = [Poles("robot and the loop", values) for values in poles]
         step = _STEP_PREDICTED if predicts else _STEP
-        dt, _ = Pace(poles, DEFAULT_INTEGRATOR, horizon).step(step / pace)
+        dt, _ = Pace(limits_of_step, DEFAULT_INTEGRATOR, horizon).step(step / pace)
         every = 1
         if lin.dt:
             every = math.ceil(lin.dt / dt)

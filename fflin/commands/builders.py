@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial, reduce
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 import fflin
 from fflin.base.errors import InputError, UnknownNameError, listed, located
@@ -23,6 +23,11 @@ if TYPE_CHECKING:
     from fflin.dynamics.coordinates import Frame
 
 T = TypeVar("T")
+
+# Laws that commands save, except those of `fflin tune`.
+SavedLaw: TypeAlias = (
+    "fflin.Gain | fflin.GainSchedule | fflin.Compensator | fflin.MultirateCompensator"
+)
 
 _WEIGHTS = ("weights", "q", "r", "bryson", "sample", "integral")
 _POSE = ("target_rpy", "target_position")
@@ -109,10 +114,17 @@ def load_robot(arguments: Namespace) -> fflin.Robot:
     inputs = getattr(arguments, "inputs", None)
     if inputs == "joints" and not robot.n:
         raise InputError(f"--inputs joints: '{robot.name}' has no joints")
+    if inputs == "wheels" and not robot.wheels:
+        raise InputError(
+            f"--inputs wheels: '{robot.name}' has no reaction wheels among its inputs"
+        )
     if inputs is not None:
         bundled = {
             "joints": (fflin.JointTorque("*"),),
             "base": (fflin.BaseTorque(), fflin.BaseForce()),
+            "wheels": tuple(
+                item for item in robot.inputs if isinstance(item, fflin.ReactionWheel)
+            ),
         }
         new_inputs = bundled.get(inputs) or fflin.load_inputs(inputs)
         with located(inputs):  # errors about a name or an inertia show the file
@@ -452,7 +464,7 @@ def with_welds(robot: fflin.Robot, arguments: Namespace) -> fflin.Robot:
 def robot_of_design(
     robot: fflin.Robot,
     allocate: bool | None,
-    law: fflin.Gain | fflin.GainSchedule | fflin.Compensator | None = None,
+    law: SavedLaw | None = None,
 ) -> fflin.Robot:
     """Return the robot for a design; for allocation, base torque and force replace other inputs.
 
@@ -467,7 +479,7 @@ def robot_of_design(
             torquers_give_every_moment,
         )
 
-        of_wrench = law is None or "tau_b.x" in law.input_names
+        of_wrench = law is None or "tau_b.x" in commands_of(law)
         allocate = of_wrench and (
             thrusters_give_every_wrench(robot) or torquers_give_every_moment(robot)
         )
@@ -495,6 +507,22 @@ def robot_of_design(
 
         return design.replace(weights=magnetic_weights(robot))
     return design
+
+
+def commands_of(law: SavedLaw) -> tuple[str, ...]:
+    """Return the names of the inputs of the robot that a law commands."""
+    if isinstance(law, fflin.Compensator | fflin.MultirateCompensator):
+        return law.output_names
+    return law.input_names
+
+
+def robot_of_law(robot: fflin.Robot, law: SavedLaw) -> fflin.Robot:
+    """Return the robot without the inputs that a compensator does not command."""
+    if not isinstance(law, fflin.Compensator | fflin.MultirateCompensator):
+        return robot
+    from fflin.control.saved_compensators import robot_with_inputs
+
+    return robot_with_inputs(robot, law.output_names)
 
 
 def designed(
@@ -867,7 +895,9 @@ def start_of(
 def about_point(
     robot: fflin.Robot, arguments: Namespace
 ) -> tuple[
-    fflin.Policy, fflin.StateFeedback | fflin.LinearController, fflin.LinearModel | None
+    fflin.Policy,
+    fflin.StateFeedback | fflin.LinearController | fflin.MultirateFeedback,
+    fflin.LinearModel | None,
 ]:
     """Return the policy about a point, its linear feedback, and the model that predicts the motion.
 
@@ -878,7 +908,7 @@ def about_point(
     from fflin.control.gain import sampled_for
 
     gain: fflin.Gain | None = None
-    feedback: fflin.StateFeedback | fflin.LinearController
+    feedback: fflin.StateFeedback | fflin.LinearController | fflin.MultirateFeedback
     if arguments.mpc:
         names = ("allocate", "gain", "controller", "reduce", "integral")
         refuse(arguments, names, "--mpc replaces the regulator and its options")
@@ -891,7 +921,8 @@ def about_point(
         why = "the file of --gain already contains the weights and the operating point"
         refuse(arguments, (*_WEIGHTS, *_TARGETS), why)
         gain = fflin.Gain.load(arguments.gain)
-    design = robot_of_design(robot, arguments.allocate, gain)
+    compensator = _compensator_of(arguments)
+    design = robot_of_design(robot, arguments.allocate, gain or compensator)
     if gain:
         lin = _about_gain(design, gain, arguments)
     else:
@@ -913,8 +944,7 @@ def about_point(
         refuse(
             arguments, of_gain, "--controller replaces the regulator and its options"
         )
-        sign = -1.0 if arguments.negative_feedback else 1.0
-        feedback = fflin.LinearController(arguments.controller, lin, sign=sign)
+        feedback = _output_feedback(arguments, lin, compensator)
     else:
         gain = gain or gain_of(lin, arguments, robot, allocated=design is not robot)
         feedback = _state_feedback(sampled_for(gain, lin), gain)
@@ -923,6 +953,33 @@ def about_point(
     if arguments.reduce or arguments.controller:
         return feedback, feedback, None
     return feedback, feedback, lin
+
+
+def _compensator_of(
+    arguments: Namespace,
+) -> fflin.Compensator | fflin.MultirateCompensator | None:
+    """Return the sampled compensator in the file of --controller, or None."""
+    from fflin.control.saved_compensators import sampled_compensator
+
+    if not arguments.controller:
+        return None
+    return sampled_compensator(arguments.controller)
+
+
+def _output_feedback(
+    arguments: Namespace,
+    lin: fflin.LinearModel,
+    compensator: fflin.Compensator | fflin.MultirateCompensator | None,
+) -> fflin.LinearController | fflin.MultirateFeedback:
+    """Return the law in the file of --controller, which may be a compensator of `fflin lqg`."""
+    from fflin.control.saved_compensators import feedback_of
+
+    if compensator is None:
+        sign = -1.0 if arguments.negative_feedback else 1.0
+        return fflin.LinearController(arguments.controller, lin, sign=sign)
+    why = "the law of `fflin lqg` already has the sign of its feedback"
+    refuse(arguments, ("negative_feedback",), why)
+    return feedback_of(compensator, lin)
 
 
 def _state_feedback(model: fflin.LinearModel, gain: fflin.Gain) -> fflin.StateFeedback:

@@ -45,12 +45,20 @@ TASKS = {
         "validity",
         "funnel",
     ),
-    "design and simulate": ("lqr", "tvlqr", "tune", "plan", "simulate", "export"),
+    "design and simulate": (
+        "lqr",
+        "lqg",
+        "tvlqr",
+        "tune",
+        "plan",
+        "simulate",
+        "export",
+    ),
     "many models or simulations": ("sweep", "montecarlo"),
 }
 
 # Commands of the module `control`; the module `models` defines all other commands.
-_CONTROL = "lqr tvlqr tune plan simulate export montecarlo validity funnel sweep"
+_CONTROL = "lqr lqg tvlqr tune plan simulate export montecarlo validity funnel sweep"
 
 # For files with these endings, the report shows the file size.
 _PAGES = (".html", ".gif")

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import fflin
-from fflin.base.errors import FileError, InputError
+from fflin.base.errors import DetectabilityError, FileError, InputError
 from fflin.base.names import chosen, input_keys
 from fflin.base.process import Progress, Status
 from fflin.base.tables import folded
@@ -33,6 +33,7 @@ from fflin.commands.builders import (
     reference_of,
     refuse,
     robot_of_design,
+    robot_of_law,
     state_of,
     tuned_law,
     tuning_of,
@@ -44,6 +45,7 @@ from fflin.commands.builders import (
 if TYPE_CHECKING:
     from fflin.base.validation import Array
     from fflin.batch.configurations import Configurations
+    from fflin.control.gain import Margins as GainMargins
 
 _ROWS = 240  # number of instants per run at which --plot shows errors and inputs
 
@@ -95,6 +97,61 @@ def lqr(arguments: Namespace) -> Report:
         arguments.plot: lambda path: fflin.plot_loops(gain, path),
     }
     return Report(gain.robot, result, text, files)
+
+
+def lqg(arguments: Namespace) -> Report:
+    """Design a regulator with a Kalman filter of the outputs; show poles, errors and margins.
+
+    example: fflin lqg satellite.toml --sample 0.25 --delay 0.25 --inputs wheels -o law.npz
+    """
+    from fflin.base.record import record_of
+    from fflin.commands.filtering import deviations, deviations_table, filter_of
+    from fflin.control.margins import margins_at_once
+    from fflin.control.saved_compensators import policy_of
+
+    if arguments.sample is None and not arguments.delay:
+        raise InputError("a filter needs the sample time of the law; add --sample H")
+    arguments.reduce = False
+    robot, design, _, gain = designed(arguments)
+    model = gain._lin
+    assert model is not None  # since it was designed here
+    try:
+        estimator, note = filter_of(model, gain, arguments)
+    except DetectabilityError as error:
+        if robot.wheels and design is not robot:
+            hint = "; --inputs wheels designs a law of the wheels alone"
+            raise DetectabilityError(f"{error}{hint}") from None
+        raise
+    compensator = fflin.lqg(gain, estimator)
+    policy = policy_of(compensator, model)
+    margins = margins_at_once(policy, None, None)
+    errors = deviations(estimator, model)
+    notes = [f"weights: {gain.weights}", note]
+    # The report of the compensator already contains the note on a slow bias.
+    notes += [x for x in policy.notes if x != compensator.slow_bias]
+    if design is not robot:
+        notes.append(_TORQUE_OF_OTHERS)
+    text = "\n\n".join(
+        (
+            str(compensator),
+            folded([_margins_line(margins)]),
+            deviations_table(errors),
+            folded(notes),
+        )
+    )
+    result = {
+        **record_of(compensator),
+        "margins": margins,
+        "standard_deviations": {name: value for name, (value, _) in errors.items()},
+        "units": {name: unit for name, (_, unit) in errors.items()},
+        "notes": notes,
+        "allocated": design is not robot,
+    }
+    files: dict[Path | None, Callable[[Path], object]] = {
+        arguments.output_file: compensator.save,
+        arguments.plot: lambda path: fflin.plot_loops(policy, path),
+    }
+    return Report(robot.name, result, text, files)
 
 
 def tune(arguments: Namespace) -> Report:
@@ -151,7 +208,12 @@ def export(arguments: Namespace) -> Report:
 
     kinds = {
         kind.__name__: kind
-        for kind in (fflin.Gain, fflin.GainSchedule, fflin.Compensator)
+        for kind in (
+            fflin.Gain,
+            fflin.GainSchedule,
+            fflin.Compensator,
+            fflin.MultirateCompensator,
+        )
     }
     with reading(arguments.file, "Gain, GainSchedule, Compensator or tuned law"):
         kind_name = text(read_record(arguments.file)[0]["kind"])
@@ -165,7 +227,7 @@ def export(arguments: Namespace) -> Report:
         law = kinds[kind_name].load(arguments.file)
     if (arguments.robot or arguments.weld) and robot is None:
         loaded = with_welds(fflin.load(arguments.robot or law.robot), arguments)
-        robot = robot_of_design(loaded, None, law)
+        robot = robot_of_law(robot_of_design(loaded, None, law), law)
     limits = None if arguments.limits == "none" else arguments.limits
     name, real = arguments.name, arguments.real
     folder = fflin.write_c(
@@ -282,16 +344,20 @@ def _margins_of(policy: object, settings: Mapping[str, Any]) -> tuple[object, st
     if not isinstance(policy, Policy) or not policy.laws_of_period():
         return None, ""
     margins = margins_at_once(policy, settings.get("delay"), settings.get("sample"))
+    return margins, _margins_line(margins)
+
+
+def _margins_line(margins: GainMargins | None) -> str:
+    """Return a line on the margins of a loop for all inputs at once."""
     if margins is None:
-        return None, "margins of the linear loop: see fflin.margins(policy, lin)"
+        return "margins of the linear loop: see fflin.margins(policy, lin)"
     if not margins.disk:
-        return margins, "margins of the linear loop: none, because it is unstable"
+        return "margins of the linear loop: none, because it is unstable"
     low, high = margins.gain
-    line = (
+    return (
         f"margins of the linear loop, all inputs at once: gain {low:.3g} to {high:.3g}, phase "
         f"{margins.phase:.3g} deg (disk margin {margins.disk:.3g})"
     )
-    return margins, line
 
 
 def _window(arguments: Namespace) -> float | None:

@@ -126,6 +126,15 @@ def info(arguments: Namespace) -> Report:
         "input_lags": {
             names[0]: item.lag for item, names in robot.named_inputs if item.lag
         },
+        "thrusters": {
+            names[0]: {
+                "on_off": item.on_off,
+                "least_impulse": item.least_impulse,
+                "isp": item.isp,
+            }
+            for item, names in robot.named_inputs
+            if isinstance(item, fflin.Thruster)
+        },
         "outputs": [
             {"type": output.WORD, **asdict(output)} for output in robot.outputs
         ],

@@ -91,6 +91,12 @@ OPTIONS: dict[str, dict[str, str]] = {
         CONTROLLER: f"{_WEIGHTS} integral delay dt allocate",
         OUTPUT: "output-file plot",
     },
+    "lqg": {
+        **_AT_POINT,
+        CONTROLLER: "weights q r bryson sample delay wheel-speeds integral allocate",
+        "filter": "process-noise noise bias-noise disturbance disturbance-frequency",
+        OUTPUT: "output-file plot",
+    },
     "tvlqr": {
         **_ALONG,
         TRAJECTORY: f"frame {_PATH}",
@@ -165,6 +171,8 @@ COMMON = {
     "limit frame inputs output-file plot",
     "lqr": "joint velocity equilibrium inputs frame weights q r bryson sample reduce wheel-speeds "
     "output-file plot",
+    "lqg": "sample delay weights q r bryson integral process-noise noise bias-noise disturbance "
+    "inputs output output-file plot",
     "tvlqr": "trajectory periodic hold strict weights q r bryson sample qf inputs frame "
     "output-file",
     "tune": "law goal vary sample delay starts seed joint inputs output output-file plot",
@@ -239,8 +247,9 @@ ABOUT: dict[str, str] = {
     "gravity": "uniform gravity in world axes [m/s^2]; zero by default",
     "passive": "joint without a motor: the default inputs do not include a torque at this joint",
     "inputs": "inputs of the robot: a TOML file of inputs, a bundled name such as cubesat, "
-    "`joints` (joint torques only) or `base` (base torque and force only). The default is the "
-    "inputs in robot.toml or, if there are none, base torque, base force and all joint torques",
+    "`joints` (joint torques only), `base` (base torque and force only) or `wheels` (wheels "
+    "only). The default is the inputs in robot.toml or, if there are none, base torque, base "
+    "force and all joint torques",
     "output": "outputs of the model: state (default), base, star_tracker, joints, rates, "
     "joints:NAME, rates:NAME (a joint or a pattern), com, momentum, frame:NAME (pose and "
     "velocity), pose:NAME, velocity:NAME, gyroscope:NAME, accelerometer:NAME, relative:NAME:TO "
@@ -304,8 +313,9 @@ ABOUT: dict[str, str] = {
     "gain": "use the gain in FILE, which `fflin lqr` saved, and regulate to the operating point "
     "for which the gain was designed",
     "controller": "use a linear controller K with positive feedback, u - u0 = K (y - y0), about "
-    f"the target. FILE ({_SAVED}) contains the matrices A, B, C and D of the controller "
-    "and, if the controller is sampled, its sample time dt or Ts. --output defines y",
+    f"the target. FILE ({_SAVED}) contains the law of `fflin lqg` or `fflin tune`, or the matrices "
+    "A, B, C and D of the controller and, if the controller is sampled, its sample time dt or Ts. "
+    "--output defines y",
     "negative-feedback": "apply the controller of --controller with negative feedback, u - u0 = -K "
     "(y - y0)",
     "mpc": "use model predictive control (MPC) with the limits of the robot; MPC requires --sample",
@@ -438,6 +448,26 @@ ABOUT: dict[str, str] = {
     "--sample, the sample time is T",
     "lqr output-file": "save the gain to FILE",
     "lqr plot": "plot the poles, the loop gain of each input and the stability margins to FILE",
+    "process-noise": "intensity of the process noise on a state, as the covariance of a sample. "
+    "NAME is a state, a group or a pattern, such as omega_b. The default is noise at the inputs, "
+    "as small as a disk margin of 2/3 permits",
+    "bias-noise": "estimate the bias of an output, whose random walk has the intensity W. NAME is "
+    "as in --noise. The default is the bias of the [[output]] in robot.toml. A larger W makes the "
+    "estimate faster",
+    "disturbance": "estimate and reject a slowly varying disturbance. NAME is a generalised "
+    "force such as tau_b or an input, and W the intensity of its random walk. The default is "
+    "[disturbance] of robot.toml, whose random walk reaches its size within 100 s, unless "
+    "there is integral action. `none` estimates no disturbance",
+    "disturbance-frequency": "frequency [Hz] of a sinusoid that the disturbance NAME contains; the "
+    "default is the frequency in [disturbance] of robot.toml",
+    "lqg noise": "standard deviation of the noise in each sample of an output. NAME is an output, "
+    "a group or a quantity such as gyroscope. The default is the noise of the [[output]] in "
+    "robot.toml",
+    "lqg delay": "delay [s] between a sample and the application of its command. Without "
+    "--sample, the sample time is T",
+    "lqg output-file": "save the law, for --controller of `fflin simulate` and `montecarlo` and "
+    "for `fflin export`, to FILE",
+    "lqg plot": "plot the loops and their margins to FILE",
     "tvlqr dt": "former name of --sample",
     "tvlqr output-file": "save the gains to FILE",
     "tune goal": "requirement, such as 'margin disk=0.75 hard=true' or 'max_gain "

@@ -149,7 +149,7 @@ def _sampled(
 
 
 def force_names(lin: LinearModel) -> tuple[str, ...]:
-    """Return the names of the generalised forces, and of the inputs that are no such forces."""
+    """Return the names of the generalised forces, and of the other inputs."""
     velocities = lin.state_names[-len(lin.M) :]
     forces = []
     for name in velocities:

@@ -278,7 +278,8 @@ class ClosedLoop:
         poles = np.linalg.eigvals(F)
         if self.dt:
             return bool(np.abs(poles).max(initial=0.0) < 1.0 - _ROUNDING)
-        # The poles of the approximation of a short delay are fast, and are no scale for others.
+        # The poles of the approximation of a short delay are fast, so they set no scale for the
+        # others.
         largest = self.own_rates().max(initial=0.0)
         return bool(poles.real.max(initial=-np.inf) < -_ROUNDING * largest)
 
@@ -430,7 +431,7 @@ class ClosedLoop:
 
 
 def _sampling_time(law: System, lin: LinearModel, sample: float | None) -> float:
-    """Return the sampling time [s] of the loop; 0 in continuous time."""
+    """Return the sample time [s] of the loop; 0 in continuous time."""
     times = {time for time in (law.dt, lin.dt, sample or 0.0) if time}
     if not times:
         return 0.0
@@ -438,7 +439,7 @@ def _sampling_time(law: System, lin: LinearModel, sample: float | None) -> float
     if longest - least > 1e-9 * longest:
         shown = " and ".join(f"{time:g} s" for time in sorted(times))
         raise InputError(
-            f"the law, the model and sample have different sampling times, {shown}; give the "
+            f"the law, the model and sample have different sample times, {shown}; give the "
             "continuous model, and a sample time only for a continuous law"
         )
     return longest

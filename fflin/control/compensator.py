@@ -41,11 +41,13 @@ class Compensator(EstimatingDesign):
         sampled compensator, if limits change the command. Zero without integral action, estimated
         disturbances and delayed inputs.
     dt : float
-        Sampling time [s]; 0 for continuous time.
+        Sample time [s]; 0 for continuous time.
     state_names, input_names, output_names : tuple of str
         Signals of the compensator. The inputs of the compensator are the outputs of the model.
     robot, urdf_sha256 : str
         Name of the robot, and SHA-256 of its URDF.
+    delay : ndarray (nu,)
+        Delay of the inputs [s] in the model, see `LinearModel.discretize`; zero without a delay.
     slow_bias : str
         Note on an estimated bias that settles more than ten times slower than the loop, or empty.
     pace : str
@@ -68,6 +70,8 @@ class Compensator(EstimatingDesign):
     output_names: tuple[str, ...]
     # Files of earlier versions do not contain E.
     E: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    # Files of earlier versions contain no delay.
+    delay: Vector = field(default_factory=lambda: np.zeros(0))
     slow_bias: str = ""
     pace: str = ""
 

@@ -37,7 +37,7 @@ class Figure(NamedTuple):
         output with another unit cannot have this figure.
     sampled : bool
         Whether the figure is the standard deviation of a sample. If False, it is a density, whose
-        square is divided by the sampling time.
+        square is divided by the sample time.
     """
 
     unit: str
@@ -104,7 +104,7 @@ def measurement_noise(lin: LinearModel, V: Noises | None) -> Weight:
     if V is None and missing:
         raise InputError(
             f"V is missing, and the outputs {listed(missing)} have no noise; give V, or noise= of "
-            "these outputs"
+            "these outputs (noise in their [[output]] of the robot file)"
         )
     return values
 
@@ -171,7 +171,7 @@ def declared_deviations(
 ) -> Deviations:
     """Return the standard deviations that the fields `noise` and `bias` of outputs declare.
 
-    `sensors` is {name: output}, and dt [s] is the sampling time of the law. A density counts per
+    `sensors` is {name: output}, and dt [s] is the sample time of the law. A density counts per
     sample of its sensor.
     """
     noise, drift = np.zeros((2, len(names)))
@@ -189,7 +189,7 @@ def declared_deviations(
 
 
 def _of_sample(what: str, given: SensorError, unit: str, sample: float) -> float:
-    """Return the standard deviation of a measurement with a sampling time [s]."""
+    """Return the standard deviation of a measurement with a sample time [s]."""
     if not isinstance(given, Mapping):
         return quantity(what, given)
     figure, square = _squared(what, given, unit, _OF_NOISE)

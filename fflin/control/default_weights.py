@@ -224,7 +224,7 @@ def _of_inertia(
     sampling = Limit(math.inf, "")
     if pace.hold:
         fastest = float(modal.frequencies[-1])
-        sampling = Limit(pace.held / (pace.hold * fastest), "the sampling time")
+        sampling = Limit(pace.held / (pace.hold * fastest), "the sample time")
     sampling = min(sampling, Limit(pace.most, "the disk margin"))
     damped = bool((lin.M != M).any())
     # In A of a free mass at rest, only the rates of the coordinates depend on the velocities.
@@ -773,7 +773,7 @@ def _slowed(
     warn_beyond(lin.robot, where, units, required[None], -high, high)
     cause = f"{effort}, which {_NOT_ENOUGH}"
     if reason == least.what:
-        # An unstable mode or the sampling time determines the bandwidth, and not an effort.
+        # An unstable mode or the sample time determines the bandwidth, and not an effort.
         cause = f"{reason}; {effort} {_NOT_ENOUGH}"
     return Limit(w, cause), description
 

@@ -8,7 +8,7 @@ from fflin.control.policy import System, proportional
 
 
 def is_delayed(states: tuple[str, ...]) -> bool:
-    """Return whether states are those of a model with delayed inputs."""
+    """Return whether states belong to a model with delayed inputs."""
     return without_past(states) != states
 
 

@@ -72,7 +72,7 @@ class Estimator(EstimatingDesign):
     x0, u0, y0 : ndarray
         State, inputs and outputs at the operating point.
     dt : float
-        Sampling time [s]; 0 for continuous time.
+        Sample time [s]; 0 for continuous time.
     state_names, input_names, output_names : tuple of str
     robot, urdf_sha256 : str
         Name of the robot, and SHA-256 of its URDF.
@@ -188,7 +188,7 @@ def added_notes(names: Sequence[str]) -> list[str]:
 
 
 def time_of(dt: float) -> str:
-    """Return the words of a report for a sampling time [s]; 0 is continuous time."""
+    """Return the words of a report for a sample time [s]; 0 is continuous time."""
     if dt:
         return f"sampled at {dt:g} s"
     return "continuous"

@@ -102,7 +102,7 @@ class Following(Policy):
 
     @property
     def sample_time(self) -> float:
-        """Sampling time [s]."""
+        """Sample time [s]."""
         return self.law.sample_time
 
     @property
@@ -201,7 +201,7 @@ class Following(Policy):
         """Return the command (nu,) at the sample at time t [s] that causes the reference inputs.
 
         Each entry is the mean of the reference input while this command acts, that is, for one
-        sampling time after the delay of the input.
+        sample time after the delay of the input.
         """
         if not self.input_delays:
             return self._mean_inputs(t)
@@ -330,7 +330,7 @@ class ReferencePath:
         self._at_rest: Array = np.zeros(robot.nv)
         self._aba: Aba | None = None
         if law.senses_outputs and any(x.FEELS_ACCELERATION for x in robot.outputs):
-            # The reference accelerations are those of the robot of the trajectory.
+            # The reference accelerations belong to the robot of the trajectory.
             self._aba = Aba(StateMap(law.trajectory.robot, frame="local"))
         terms = law.terms
         if not law.senses_outputs:

@@ -100,7 +100,7 @@ class Gain(ModelDesign):
     u0 : ndarray (nu,)
         State and inputs at the operating point.
     dt : float
-        Sampling time [s]; 0 for continuous time.
+        Sample time [s]; 0 for continuous time.
     state_names, input_names, state_units, input_units : tuple of str
     frame, robot : str
         Frame of the model and name of the robot.
@@ -234,7 +234,7 @@ class Gain(ModelDesign):
         ]
 
     def _head(self) -> str:
-        """Return one line with the control law, its size, its frame and its sampling time."""
+        """Return one line with the control law, its size, its frame and its sample time."""
         nu, nx = self.K.shape
         time = f"sampled at {self.dt:g} s" if self.dt else "continuous"
         law = f"u = u0 - K (x - x0), {nx} states"
@@ -446,7 +446,7 @@ def static_loop(
 ) -> StaticLoop:
     """Return the static gain and the slowest time constant of a closed loop.
 
-    The loop is from its scaled inputs to H x. `loop` (nx, nx) is A - B K, for the sampling time dt
+    The loop is from its scaled inputs to H x. `loop` (nx, nx) is A - B K, for the sample time dt
     [s], or for continuous time if dt is 0. `factor` (nu, nu) is the lower Cholesky factor of a
     weight of the inputs. The inputs are scaled such that this weight is the identity.
     """
@@ -686,7 +686,7 @@ def _stopped_rotors(gain: Gain) -> list[str]:
 
 
 class HasPoles(Protocol):
-    """Design with poles: [1/s] in continuous time, z for a sampling time dt [s]."""
+    """Design with poles: [1/s] in continuous time, z for a sample time dt [s]."""
 
     @property
     def poles(self) -> Poles:
@@ -694,7 +694,7 @@ class HasPoles(Protocol):
 
     @property
     def dt(self) -> float:
-        """Sampling time [s]; 0 for continuous time."""
+        """Sample time [s]; 0 for continuous time."""
 
 
 def summary_of_poles(design: HasPoles) -> str:
@@ -731,7 +731,7 @@ def summary_of_poles(design: HasPoles) -> str:
 def neutral_poles(rates: Values, dt: float) -> Mask:
     """Return which poles (n,), given as rates [1/s], neither decay nor grow.
 
-    Rounding errors may cause the decay of these poles. `dt` is the sampling time [s], or 0.
+    Rounding errors may cause the decay of these poles. `dt` is the sample time [s], or 0.
     """
     neutral: Mask = np.abs(rates.real) <= _smallest_decay(rates, dt)
     return neutral
@@ -810,14 +810,16 @@ def _remembered_asymmetry(gain: Gain, S: Array, scale: Array) -> Loop:
     The law remembers its own commands, and not the changed inputs, which are on their way in the
     plant.
     """
-    A, B = S @ gain.A @ S.T, S @ gain.B
+    A = S @ gain.A @ S.T
+    B = S @ gain.B
     names = gain.regulated or gain.state_names
     law = law_with_memory(gain.K @ S.T, A, B, gain.dt, names, gain.input_names)
     measured = selection(law.inputs, names)
     D = law.D @ measured
     memory = law.B @ measured
     F = np.block([[A + B @ D, B @ law.C], [memory, law.A]])
-    G = np.vstack((B, np.zeros((len(law.A), len(B.T))))) / scale
+    unaffected = np.zeros((len(law.A), B.shape[1]))
+    G = np.vstack((B, unaffected)) / scale
     H = scale[:, None] * np.hstack((D, law.C))
     return as_continuous(F, G, H, 0.5 * np.eye(len(H)), gain.dt)
 

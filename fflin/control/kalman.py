@@ -78,7 +78,7 @@ def kalman(
               K_j = P_j C_j^T (C_j P_j C_j^T + V_j)^{-1},\\qquad P_{j+N} = P_j
 
     C_j contains the outputs that arrive at the sample j. Earlier values of a delayed output are
-    further states. The model must be sampled, and its sampling time must divide the sampling times
+    further states. The model must be sampled, and its sample time must divide the sample times
     and delays of all outputs.
 
     Parameters
@@ -140,8 +140,8 @@ def kalman(
     InputError
         If a size or value is wrong, or if no disturbance reaches a mode that does not decay by
         itself. Without a disturbance, the filter would in time stop correcting the estimate of this
-        mode. Also if the sampling times and delays of the outputs have no common grid with the
-        sampling time of the model; the message states the nearest times that have one.
+        mode. Also if the sample times and delays of the outputs have no common grid with the
+        sample time of the model; the message states the nearest times that have one.
     UnknownNameError
         If a name does not exist.
     ModelError

@@ -58,11 +58,16 @@ def lags_of_robot(robot: Robot, state: StateMap, *, outputs: bool) -> Lags:
 
 def robot_lags(law: Policy | Gain, lin: LinearModel) -> Lags:
     """Return the lags of the robot of a model, of the outputs only if a law measures them."""
+    outputs = isinstance(law, Policy) and law.senses_outputs
+    return lags_of_its_robot(lin, outputs=outputs)
+
+
+def lags_of_its_robot(lin: LinearModel, *, outputs: bool) -> Lags:
+    """Return the lags of the robot of a model, see `lags_of_robot`; none if it has no robot."""
     robot = lin._robot
     if robot is None:
         return NO_LAGS
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
-    outputs = isinstance(law, Policy) and law.senses_outputs
     return lags_of_robot(robot, state, outputs=outputs)
 
 

@@ -90,7 +90,7 @@ class LinearController(OutputSensing, LinearLaw):
     system : tuple of A, B, C, D, dt, inputs, outputs
         The controller from all outputs to all inputs of the model, with `sign` applied.
     dt : float
-        Sampling time [s]; 0 in continuous time.
+        Sample time [s]; 0 in continuous time.
     loop : ndarray (nx + nz, nx + nz)
         Closed-loop matrix of the model's state and z.
 
@@ -99,7 +99,7 @@ class LinearController(OutputSensing, LinearLaw):
     InputError
         If one of these conditions is true:
 
-        - a size, name or sampling time does not fit the model;
+        - a size, name or sample time does not fit the model;
         - an entry is not finite, or a transfer function is improper;
         - D acts on an output with direct feedthrough from the inputs (algebraic loop).
     FileError
@@ -196,7 +196,7 @@ class LinearController(OutputSensing, LinearLaw):
 
     @property
     def dt(self) -> float:
-        """Sampling time [s]; 0 in continuous time."""
+        """Sample time [s]; 0 in continuous time."""
         return self.sample_time
 
     @property

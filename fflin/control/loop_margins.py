@@ -89,7 +89,7 @@ class Margins(FrozenArrays, Reported):
         Whether the loop is stable without changes.
     robot : str
     dt : float
-        Sampling time [s]; 0 in continuous time.
+        Sample time [s]; 0 in continuous time.
     delay : float
         Largest delay of an input [s] with which the margins were computed.
     samples : int

@@ -118,7 +118,7 @@ class Loop(BoundLaw):
     The state z of the law advances at each sample, or at each stage of the integrator if dt is 0.
     `sizes` contains the lengths of z and of the measured values y. The function `windup` returns
     the anti-windup gain E at a time [s]; see `Sample`. If outputs of the robot have their own
-    sampling times or delays, the law receives the values `start` (ny,) before the first measurement
+    sample times or delays, the law receives the values `start` (ny,) before the first measurement
     arrives. If `has_sensors` is true, the states of the law contain these sensors.
     """
 
@@ -147,7 +147,7 @@ class Loop(BoundLaw):
         if any(output.FEELS_ACCELERATION for output in outputs):
             self._aba = Aba(state)
         self._time = 0.0
-        # Memory of sensors with their own sampling times or delays, or None.
+        # Memory of sensors with their own sample times or delays, or None.
         self.sensors: SensorMemory | None = None
         # Values of sensors with a lag, or None.
         self.lag: SensorLag | None = None
@@ -211,7 +211,7 @@ class Loop(BoundLaw):
     def observe(self, t: float, q: Array, v: Array, a: Array, weights: Array) -> None:
         """Advance the sensors with a lag by a stage of the integrator with the acceleration a.
 
-        `weights` are those of `SensorLag.advance`.
+        `weights` are the weights of `SensorLag.advance`.
         """
         assert self.lag is not None
         _, measure, near = self.at(t)
@@ -243,7 +243,7 @@ class Loop(BoundLaw):
 def _sensor_memory(
     state: StateMap, dt: float, start: Array | None
 ) -> SensorMemory | None:
-    """Return the memory of sensors with their own sampling times or delays, or None."""
+    """Return the memory of sensors with their own sample times or delays, or None."""
     timing = timing_of_robot(state, dt)
     if timing.is_plain:
         return None

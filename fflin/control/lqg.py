@@ -109,7 +109,7 @@ def lqg(
     instance("gain", gain, Gain, "a Gain, as fflin.lqr returns it")
     kinds = (Estimator, MultirateEstimator)
     instance("estimator", estimator, kinds, "an Estimator, as fflin.kalman returns it")
-    first = _compensator(gain, estimator, zero_error)
+    first = compensator_of(gain, estimator, zero_error)
     slower = gain._slower
     late = isinstance(estimator, MultirateEstimator) or is_late(gain)
     if slower is None or not late:
@@ -118,10 +118,10 @@ def lqg(
     assert lin is not None  # since the gain was designed for a model
 
     def redesign(factor: float) -> Compensator | MultirateCompensator:
-        return _compensator(slower(factor), estimator, zero_error)
+        return compensator_of(slower(factor), estimator, zero_error)
 
     def margin_of(compensator: Compensator | MultirateCompensator) -> float | None:
-        return _disk_margin(lin, compensator)
+        return disk_margin_with(lin, compensator)
 
     compensator, change = slowed(first, redesign, margin_of)
     if change is None:
@@ -133,7 +133,7 @@ def lqg(
     return replace(compensator, pace=pace)
 
 
-def _disk_margin(
+def disk_margin_with(
     lin: LinearModel, compensator: Compensator | MultirateCompensator
 ) -> float | None:
     """Return the disk margin at the inputs of a model with a compensator, or None."""
@@ -148,7 +148,7 @@ def _disk_margin(
     return disk_margin_of(policy, lin)
 
 
-def _compensator(
+def compensator_of(
     gain: Gain,
     estimator: Estimator | MultirateEstimator,
     zero_error: Sequence[str] | None,
@@ -184,6 +184,7 @@ def _compensator(
         state_names=(*names, *gain.integrals),
         input_names=e.output_names,
         output_names=e.input_names,
+        delay=gain.delay,
         slow_bias=_slow_bias(gain, e),
         verified=gain.verified and e.verified,
     )
@@ -226,23 +227,30 @@ def _multirate(
         state_names=names,
         input_names=e.output_names,
         output_names=e.input_names,
+        delay=gain.delay,
+        slow_bias=_slow_bias(gain, e),
         verified=gain.verified and e.verified,
     )
 
 
-def _slow_bias(gain: Gain, e: Estimator) -> str:
+def _slow_bias(gain: Gain, e: Estimator | MultirateEstimator) -> str:
     """Return a note on the estimated bias that settles slowest, or an empty text if it is fast."""
     if not e.biases:
         return ""
     names = e.estimated or e.state_names
     S = selection(names, e.state_names)
-    poles, modes = np.linalg.eig(S @ (e.A - e.L @ e.C) @ S.T)
+    # The error of a periodic filter is propagated over one period.
+    gains = e.L if isinstance(e, MultirateEstimator) else [e.L]
+    over_period = np.eye(len(e.A))
+    for L in gains:
+        over_period = (e.A - L @ e.C) @ over_period
+    poles, modes = np.linalg.eig(S @ over_period @ S.T)
     # Participation of each state in each mode: products of right and left eigenvectors.
     participation = np.abs(modes * np.linalg.pinv(modes).T)
     participation /= participation.sum(axis=0)
     biases = [names.index(name) for name in e.biases if name in names]
     of_bias = participation[biases].sum(axis=0) > _MOST
-    decays = -rates_of(poles, e.dt).real
+    decays = -rates_of(poles, len(gains) * e.dt).real
     loop_rates = rates_of(gain.poles, gain.dt)
     loop_decays = -loop_rates.real[~neutral_poles(loop_rates, gain.dt)]
     if not of_bias.any() or not loop_decays.size:

@@ -56,7 +56,7 @@ def margins(
     three channels. For more, the result also contains the smallest destabilising change that was
     found.
 
-    The loop of measured outputs contains their sampling times and delays. If the law is periodic,
+    The loop of measured outputs contains their sample times and delays. If the law is periodic,
     as `MultirateFeedback` is, an oscillation has N frequencies at once, where N is the number of
     samples of the period. Its disk margin allows independent factors at each of them, as unknown
     dynamics of the channels cause them. The factors of the gain margins are constant, and the delay
@@ -72,12 +72,12 @@ def margins(
         sampled law.
     delay : float, optional
         Delay [s] of all inputs. A delay of `lin`, see `LinearModel.discretize`, is added. By
-        default, the delay is that of `lin`. If `lin` has none, it is the delay of the policy's
+        default, the delay of `lin` is used. If `lin` has none, it is the delay of the policy's
         model, as in `simulate`. Likewise, if `lin` has no lags, the loop has the lags of its
         robot, and a warning states lags for which the law was not designed. If the robot has no
         lags either, the loop has the lags of the policy's model.
     sample : float, optional
-        Sampling time [s] with which a continuous law is executed.
+        Sample time [s] with which a continuous law is executed.
     at : {"inputs", "outputs"}, optional
         Whether the inputs or the measured outputs are changed.
 
@@ -88,7 +88,8 @@ def margins(
     Raises
     ------
     InputError
-        If the policy is not linear about a point, or its signals are not those of the model.
+        If the policy is not linear about a point, or its signals differ from the signals of the
+        model.
 
     References
     ----------
@@ -120,7 +121,7 @@ def closed_loop(
     sample: float | None,
     at: Place = "inputs",
 ) -> ClosedLoop:
-    """Return the loop of a linear policy and a model; the arguments are those of `margins`."""
+    """Return the loop of a linear policy and a model; see `margins` for the arguments."""
     lin, delay = delayed_model(policy, lin, delay)
     if sample is not None:
         sample = positive("sample", sample, "s")
@@ -256,7 +257,7 @@ def laws_in_loop(
         if missing:
             what = f"the law measures {missing[0]}, which the model does not contain"
         else:
-            what = "the inputs of the law are not those of the model"
+            what = "the law and the model have different inputs"
         raise InputError(
             f"{what}; give the model of the robot for which the law was designed, with the same "
             "inputs and outputs"
@@ -271,7 +272,7 @@ def with_sensors(laws: list[System], lin: LinearModel) -> list[System]:
     if lin._robot is None:
         if len(laws) > 1:
             raise InputError(
-                "the model has no robot, so the sampling times and delays of its outputs are "
+                "the model has no robot, so the sample times and delays of its outputs are "
                 "unknown; give the model of fflin.linearize(robot)"
             )
         return laws

@@ -118,7 +118,7 @@ def mpc(
     horizon : int
         Number N of samples in the horizon.
     sample : float
-        Sampling time h [s] of the controller; by default the sampling time of a sampled model.
+        Sample time h [s] of the controller; by default the sample time of a sampled model.
     dt : float
         Former name of `sample`.
     limits : "urdf", float, mapping or list of them, optional
@@ -190,7 +190,7 @@ def mpc(
         sample = dt
     if sample is None:
         if not lin.dt:
-            raise InputError("sample is missing; give the sampling time [s]")
+            raise InputError("sample is missing; give the sample time [s]")
         sample = lin.dt
     dt = number("sample", sample)
     # The design starts from the continuous model or trajectory. If lin is sampled, its sampling
@@ -327,7 +327,7 @@ class OutputMpc(OutputSensing, Mpc):
 
     @property
     def sample_time(self) -> float:
-        """Sampling time [s]."""
+        """Sample time [s]."""
         return self.lin.dt
 
     def bind(self, robot: Robot) -> Command:
@@ -375,14 +375,17 @@ class _Estimating(Loop):
 
     def _step(self, t: float, z: Array, measure: Measure) -> tuple[Array, Array]:
         """Return the command and the next estimate."""
-        policy, e = self.policy, self.policy.estimator
-        nx = len(policy.lin.A)
-        w = z[nx : nx + policy.Pi.shape[1]]
-        target = policy.target(policy.horizon.window(t), w)
-        du = target.u + self.receding.step(t, z[:nx] - target.x, target)
-        u = policy.lin.u0 + du
-        innovation = measure(u) - policy.lin.y0 - e.C @ z - e.D @ du
-        return u, e.A @ z + e.B @ du + e.L @ innovation
+        policy = self.policy
+        lin, estimator = policy.lin, policy.estimator
+        nx = len(lin.A)
+        x = z[:nx]
+        disturbance = z[nx : nx + policy.Pi.shape[1]]
+        target = policy.target(policy.horizon.window(t), disturbance)
+        du = target.u + self.receding.step(t, x - target.x, target)
+        u = lin.u0 + du
+        innovation = measure(u) - lin.y0 - estimator.C @ z - estimator.D @ du
+        following = estimator.A @ z + estimator.B @ du + estimator.L @ innovation
+        return u, following
 
 
 @dataclass(eq=False, repr=False)
@@ -405,32 +408,25 @@ def _stageless_horizon(
             "lin was loaded from a file, which contains no robot; linearise again"
         )
     inputs, states, outputs = model.input_names, model.state_names, model.output_names
-    beside = [name for name in outputs if name not in states]
+    further_outputs = [name for name in outputs if name not in states]
     known = (*state_keys(robot.joint_names), *input_keys(model))
     limit_of = dict[str, object]()
     parts = list(limits) if isinstance(limits, list | tuple) else [limits]
     for k, part in enumerate(parts):
-        if isinstance(part, Mapping) and beside:
-            output_keys = [
-                x
-                for x in part
-                if stands_for_any(x, beside) and not stands_for_any(x, known)
-            ]
-            ranges = by_name(
-                "output", {key: range_of(key, part[key]) for key in output_keys}, beside
-            )
-            limit_of |= {beside[i]: limit for i, limit in ranges.items()}
-            parts[k] = {
-                key: limit for key, limit in part.items() if key not in output_keys
-            }
+        if isinstance(part, Mapping) and further_outputs:
+            output_limits, parts[k] = _split_limits(part, further_outputs, known)
+            limit_of |= output_limits
     end = model.v[-1] if isinstance(model, LinearTrajectory) else model.v
     given = parts[0] if len(parts) == 1 else parts
     acting = chosen_limits(robot, given, robot.wheels_at(end))
     limit_of |= {name: acting[name] for name in states if name in acting}
-    of_inputs = np.array(input_limits(robot, acting))
-    names = (*inputs, *states, *(name if name in beside else "" for name in outputs))
-    others = [limit_of.get(name, (-np.inf, np.inf)) for name in names[len(inputs) :]]
-    low, high = np.hstack((of_inputs, np.array(others).T))
+    # an output that is also a state has its limit as a state
+    output_keys = [name if name in further_outputs else "" for name in outputs]
+    names = (*inputs, *states, *output_keys)
+    unlimited = (-np.inf, np.inf)
+    others = [limit_of.get(name, unlimited) for name in (*states, *output_keys)]
+    limits_of_inputs = np.array(input_limits(robot, acting))
+    low, high = np.hstack((limits_of_inputs, np.array(others).T))
     at = np.flatnonzero(np.isfinite((low, high)).any(axis=0))
     if samples**2 * (len(at) + len(states)) * len(inputs) > _MOST_ENTRIES:
         raise InputError(
@@ -439,6 +435,25 @@ def _stageless_horizon(
         )
     limited = tuple(names[i] for i in at)
     return Horizon((), samples, dt, inputs, robot.name, limited, at, low[at], high[at])
+
+
+def _split_limits(
+    limits: Mapping[str, object], outputs: list[str], known: tuple[str, ...]
+) -> tuple[dict[str, tuple[float, float]], dict[str, object]]:
+    """Return the limits {output: (least, largest)} of outputs, and all other entries of `limits`.
+
+    A key that also stands for a name in `known` is no output.
+    """
+    keys = [
+        key
+        for key in limits
+        if stands_for_any(key, outputs) and not stands_for_any(key, known)
+    ]
+    ranges = {key: range_of(key, limits[key]) for key in keys}
+    range_at = by_name("output", ranges, outputs)
+    output_limits = {outputs[index]: limit for index, limit in range_at.items()}
+    rest = {key: limit for key, limit in limits.items() if key not in keys}
+    return output_limits, rest
 
 
 def _about(lin: LinearModel, horizon: Horizon, cost: Cost) -> Mpc:

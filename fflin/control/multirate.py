@@ -1,8 +1,8 @@
-"""Kalman filters and compensators of outputs with their own sampling times and delays."""
+"""Kalman filters and compensators of outputs with their own sample times and delays."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -80,7 +80,7 @@ class MultirateEstimator(_Periodic):
     x0, u0, y0 : ndarray
         State, inputs and outputs at the operating point.
     dt : float
-        Sampling time of the model [s].
+        Sample time of the model [s].
     state_names, input_names, output_names : tuple of str
     robot, urdf_sha256 : str
         Name of the robot, and SHA-256 of its URDF.
@@ -176,17 +176,19 @@ class MultirateCompensator(_Periodic):
     E : ndarray (N, nz, nu)
         Gain of the anti-windup, as in `Compensator`.
     poles : ndarray of complex
-        Poles of the closed loop over one period: those of the gain and of the estimator.
+        Poles of the closed loop over one period: poles of the gain and of the estimator.
     y0, u0 : ndarray
         Outputs and inputs at the operating point.
     dt : float
-        Sampling time [s].
+        Sample time [s].
     state_names, input_names, output_names : tuple of str
         Signals of the compensator. The inputs of the compensator are the outputs of the model.
     robot, urdf_sha256 : str
         Name of the robot, and SHA-256 of its URDF.
-    pace : str
-        Note on the disk margin of the loop, as in `Compensator`.
+    delay : ndarray (nu,)
+        Delay of the inputs [s] in the model, as in `Compensator`.
+    slow_bias, pace : str
+        Notes on an estimated bias and on the disk margin of the loop, as in `Compensator`.
 
     Examples
     --------
@@ -205,6 +207,9 @@ class MultirateCompensator(_Periodic):
     E: Array
     y0: Vector
     u0: Vector
+    # Files of earlier versions contain no delay.
+    delay: Vector = field(default_factory=lambda: np.zeros(0))
+    slow_bias: str = ""
     pace: str = ""
 
     @property
@@ -222,6 +227,8 @@ class MultirateCompensator(_Periodic):
     def _notes(self) -> list[str]:
         """Return notes on estimated disturbances and biases, and on the pace of the loop."""
         notes = list(added_notes(self.state_names))
+        if self.slow_bias:
+            notes.append(self.slow_bias)
         if self.pace:
             notes.append(self.pace)
         return notes

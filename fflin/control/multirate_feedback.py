@@ -1,4 +1,4 @@
-"""Feedback of outputs with their own sampling times and delays."""
+"""Feedback of outputs with their own sample times and delays."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class MultirateFeedback(OutputSensing, Feedback):
     """Feedback of outputs that are measured at different rates, by the compensator of `lqg`.
 
     At each sample of the model, u - u0 = C z is applied, and the measurements that arrive correct
-    z. The sensors of the simulated robot have the sampling times and delays of its outputs.
+    z. The sensors of the simulated robot have the sample times and delays of its outputs.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ class MultirateFeedback(OutputSensing, Feedback):
     Raises
     ------
     InputError
-        If the compensator was designed for a model with other signals or another sampling time.
+        If the compensator was designed for a model with other signals or another sample time.
 
     Examples
     --------
@@ -78,7 +78,7 @@ class MultirateFeedback(OutputSensing, Feedback):
         same = {
             "outputs": compensator.input_names == lin.output_names,
             "inputs": compensator.output_names == lin.input_names,
-            "sampling time": abs(compensator.dt - lin.dt) <= 1e-9 * compensator.dt,
+            "sample time": abs(compensator.dt - lin.dt) <= 1e-9 * compensator.dt,
         }
         different = [name for name, agrees in same.items() if not agrees]
         if different:
@@ -89,8 +89,13 @@ class MultirateFeedback(OutputSensing, Feedback):
 
     @property
     def sample_time(self) -> float:
-        """Sampling time [s]."""
+        """Sample time [s]."""
         return self.lin.dt
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Note on an estimated bias that settles slowly."""
+        return (self.compensator.slow_bias,) if self.compensator.slow_bias else ()
 
     @property
     def sensors(self) -> tuple[str, ...]:
@@ -132,7 +137,7 @@ class MultirateFeedback(OutputSensing, Feedback):
         ------
         InputError
             If the robot has other states, inputs or measured outputs than the model, or its outputs
-            have other sampling times or delays.
+            have other sample times or delays.
         """
         lin = self.lin
         state = self.state_map(robot)
@@ -140,7 +145,7 @@ class MultirateFeedback(OutputSensing, Feedback):
         known = lin._robot is not None
         if known and timing_of_robot(state, lin.dt) != timing_of_model(lin):
             raise InputError(
-                f"the outputs of '{robot.name}' have other sampling times or delays than the "
+                f"the outputs of '{robot.name}' have other sample times or delays than the "
                 "outputs of the law's model; design the law for the sensors of this robot"
             )
         terms = self.terms()

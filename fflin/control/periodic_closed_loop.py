@@ -1,4 +1,4 @@
-"""Loops of a periodic law and a model, such as laws of sensors with different sampling times."""
+"""Loops of a periodic law and a model, such as laws of sensors with different sample times."""
 
 from __future__ import annotations
 

@@ -303,7 +303,7 @@ def _without_velocity(goal: object) -> bool:
 def _knot_weights(shooting: Shooting) -> Array:
     """Return the weight [s] of each knot in the integral of the effort over time.
 
-    If the inputs are held, the weights are the hold times, otherwise those of the trapezoidal rule.
+    If the inputs are held, the weights are the hold times, otherwise the trapezoidal weights.
     """
     h = shooting.h
     if shooting.held:

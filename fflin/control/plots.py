@@ -67,7 +67,7 @@ _LABEL_SIZE = (0.075, 0.055)
 
 _POINTS = 400
 
-# Discrete-time poles z below this magnitude are those of delays, and no rates.
+# Discrete-time poles z below this magnitude belong to delays, and have no rate.
 _DEADBEAT = 1e-6
 
 # Rates below this fraction of the largest frequency are rounding errors.
@@ -100,7 +100,7 @@ def plot_matrices(
     path : str or Path, optional
         File to save to: .png, .pdf or .svg. See `plot_motion` for possible errors.
     axes : matplotlib.axes.Axes, optional
-        Axes of a grid, as of ``pyplot.subplots``, in whose place the figure is drawn.
+        Axes of a grid, such as from ``pyplot.subplots``; the figure is drawn in their place.
 
     Examples
     --------
@@ -164,7 +164,7 @@ def plot_modes(
     path : str or Path, optional
         File to save to: .png, .pdf or .svg. See `plot_motion` for possible errors.
     axes : matplotlib.axes.Axes, optional
-        Axes of a grid, as of ``pyplot.subplots``, in whose place the figure is drawn.
+        Axes of a grid, such as from ``pyplot.subplots``; the figure is drawn in their place.
 
     Examples
     --------
@@ -247,7 +247,7 @@ def plot_check(
     path : str or Path, optional
         File to save to: .png, .pdf or .svg. See `plot_motion` for possible errors.
     axes : matplotlib.axes.Axes, optional
-        Axes of a grid, as of ``pyplot.subplots``, in whose place the figure is drawn.
+        Axes of a grid, such as from ``pyplot.subplots``; the figure is drawn in their place.
 
     Examples
     --------
@@ -314,12 +314,12 @@ def plot_poles(
     path : str or Path, optional
         File to write, .png, .pdf or .svg. See `plot_motion` for possible errors.
     dt : float
-        Sampling time [s], if the poles are given as numbers. If it is not 0, the unit circle is
+        Sample time [s], if the poles are given as numbers. If it is not 0, the unit circle is
         drawn.
     title : str
         Title of the figure.
     axes : matplotlib.axes.Axes, optional
-        Axes of a grid, as of ``pyplot.subplots``, in whose place the figure is drawn.
+        Axes of a grid, such as from ``pyplot.subplots``; the figure is drawn in their place.
 
     Returns
     -------
@@ -375,9 +375,9 @@ def plot_loops(
     delay : float, optional
         Delay [s] of all inputs, as in `margins`.
     sample : float, optional
-        Sampling time [s] with which a continuous law is executed.
+        Sample time [s] with which a continuous law is executed.
     axes : matplotlib.axes.Axes, optional
-        Axes of a grid, as of ``pyplot.subplots``, in whose place the figure is drawn.
+        Axes of a grid, such as from ``pyplot.subplots``; the figure is drawn in their place.
 
     Returns
     -------

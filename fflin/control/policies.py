@@ -15,6 +15,7 @@ from fflin.base.errors import InputError
 from fflin.base.validation import Array, Vector, frozen, instance, shaped
 from fflin.control.channel import Law
 from fflin.control.delayed import is_delayed, law_with_memory
+from fflin.control.dipole_error import note_on_dipole
 from fflin.control.following import Following
 from fflin.control.gain import Gain
 from fflin.control.loops import (
@@ -230,7 +231,7 @@ class LinearLaw(Feedback):
 
     @property
     def sample_time(self) -> float:
-        """Sampling time [s]; 0 in continuous time."""
+        """Sample time [s]; 0 in continuous time."""
         return self.system.dt or 0.0
 
     def linear_law(self) -> System | None:
@@ -285,8 +286,8 @@ class LinearLaw(Feedback):
         keep their speeds. If the inputs are delayed, the robot waits at the start for the longest
         delay, so that each input of the trajectory acts at its time.
 
-        The matrices of the law remain those about its point. They fit a trajectory if its rates are
-        small compared with the bandwidth of the law, and if the joints stay near the point. For
+        The law keeps the matrices about its point. They fit a trajectory if the trajectory's rates
+        are small compared with the bandwidth of the law, and if the joints stay near the point. For
         other trajectories, use `tvlqr` and `tvkalman`.
 
         Parameters
@@ -516,7 +517,7 @@ def _require_designed_for(gain: Gain, lin: LinearModel) -> None:
     same = {
         "states": gain.model_states == lin.state_names,
         "inputs": gain.input_names == lin.input_names,
-        "sampling time": bool(np.isclose(gain.dt, lin.dt)),
+        "sample time": bool(np.isclose(gain.dt, lin.dt)),
         "delay": _is_same_delay(gain, lin),
         "frame": gain.frame == lin.frame,
         "point": len(gain.model_states) == len(lin.x0)
@@ -624,7 +625,7 @@ class Allocation(Policy):
 
     @property
     def sample_time(self) -> float:
-        """Sampling time [s] of the inner policy."""
+        """Sample time [s] of the inner policy."""
         return self.inner.sample_time
 
     @property
@@ -719,7 +720,7 @@ class Allocation(Policy):
 
 
 def translation_excess(design: Robot, robot: Robot) -> Vector:
-    """Return the part (6 + n,) of a translation's force that is no error of an `Allocation`.
+    """Return the part (6 + n,) of a translation's force that is not an error of an `Allocation`.
 
     It is zero if an input of the design pushes the robot, and for joints without a motor.
     """
@@ -751,6 +752,7 @@ class AllocatedPolicy(BoundLaw):
             self.correct = self._correct
         self._data = robot.create_data()
         self._design_data = allocation.design.create_data()
+        self._law = allocation.inner
         self._limits = input_limits(robot, limits_of(robot))
         excess = translation_excess(allocation.design, robot)
         self._excess = excess[:, np.newaxis]
@@ -764,7 +766,11 @@ class AllocatedPolicy(BoundLaw):
         asked, given = (
             ", ".join(actuation.groups) for actuation in (self._design, self._robot)
         )
-        return (f"allocation: the commanded {asked} are realised by {given}", *notes)
+        notes = (f"allocation: the commanded {asked} are realised by {given}", *notes)
+        if isinstance(self._law, StateFeedback):
+            robot = self._robot.state.robot
+            notes += note_on_dipole(robot, self._law.lin, self._law.K)
+        return notes
 
     def __call__(self, t: float, q: Array, v: Array) -> Array:
         """Return the inputs (nu,) whose generalised force is nearest to the commanded force.

@@ -223,7 +223,7 @@ class Policy(ABC):
         """Return policy(t, q, v) -> u for a robot; each call returns one with its own memory."""
 
     def _repr_html_(self) -> str:
-        """Return a card with the sampling time, the sensors and the notes of the law."""
+        """Return a card with the sample time, the sensors and the notes of the law."""
         time = "commands in continuous time"
         if self.sample_time:
             time = f"commands every {self.sample_time:g} s"
@@ -258,7 +258,7 @@ class Policy(ABC):
 
     @property
     def sample_time(self) -> float:
-        """Sampling time [s]; 0 for continuous commands."""
+        """Sample time [s]; 0 for continuous commands."""
         if self.model is None:
             return 0.0
         return self.model.dt
@@ -361,7 +361,7 @@ class Policy(ABC):
     def loop_around(self, sample: float) -> Callable[[LinearModel], Array] | None:
         """Return a function from a sampled model to the matrix of its closed loop, or None.
 
-        `sample` is the sampling time [s].
+        `sample` is the sample time [s].
         """
         K = self.feedback_gain
         if K is None:
@@ -552,7 +552,7 @@ def _check_closed_loop(label: str, closed: object) -> None:
     if not isinstance(closed, tuple) or len(closed) != 2:
         raise InputError(
             f"{label} returned an object of type {type(closed).__name__}, expected a matrix (n, n) "
-            "and its sampling time dt [s], or None"
+            "and its sample time dt [s], or None"
         )
     matrix, dt = closed
     shape = as_double(label, matrix).shape

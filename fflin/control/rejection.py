@@ -58,7 +58,7 @@ def rejection(
     cost : tuple of ndarray (nx, nx), (nu, nu)
         Weights Q and R.
     dt : float
-        Sampling time [s]; 0 for continuous time.
+        Sample time [s]; 0 for continuous time.
     """
     acting, A_w = disturbance
     nx, nw = acting.shape

@@ -1,4 +1,4 @@
-"""Sampled laws in series with sensors that have their own sampling times and delays."""
+"""Sampled laws in series with sensors that have their own sample times and delays."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def sensed(terms: Sequence[Sample], timing: SensorTiming) -> list[Sample]:
     """Return laws that include the sensors, for each sample of a common period.
 
     `terms` contains the law at each sample of its own period. In the result, y is what the sensors
-    see, and the states of the sensors follow those of the law.
+    see, and the states of the sensors follow the states of the law.
     """
     if timing.is_plain:
         return list(terms)

@@ -73,7 +73,7 @@ def declared_errors(
 ) -> Deviations | None:
     """Return the errors that the outputs of a robot declare for the sensors of a law.
 
-    `sample` [s] is the sampling time of the law. The result is None if the law is continuous, does
+    `sample` [s] is the sample time of the law. The result is None if the law is continuous, does
     not measure outputs, has its own noise, or its outputs declare no errors.
     """
     lin = policy.model

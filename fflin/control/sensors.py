@@ -1,4 +1,4 @@
-"""Sensors with their own sampling times and delays, in a loop with the sampling time of the law."""
+"""Sensors with their own sample times and delays, in a loop with the sample time of the law."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from fflin.dynamics.state import StateMap
 from fflin.linear.model import LinearModel
 from fflin.robot.outputs import FullState, Output
 
-# A time that differs from a multiple of the sampling time by less than this fraction of it counts
+# A time that differs from a multiple of the sample time by less than this fraction of it counts
 # as the multiple.
 _ROUNDING = 1e-6
 
@@ -26,12 +26,12 @@ _LONGEST = 1000
 _MOST_DELAYED = 500
 
 
-# A sensor without its own sampling time, delay, noise and bias.
+# A sensor without its own sample time, delay, noise and bias.
 _PLAIN: Output = FullState()
 
 
 class SensorTiming(NamedTuple):
-    """Sampling times and delays of outputs y (ny,), in samples of a law.
+    """Sample times and delays of outputs y (ny,), in samples of a law.
 
     An output with the period p and the delay d is measured at the samples 0, p, 2 p, ..., and
     arrives d samples later. Between two arrivals, a law receives the latest value.
@@ -60,9 +60,9 @@ class SensorTiming(NamedTuple):
 def timing_of(
     sensors: Sequence[Output], names: Sequence[str], dt: float
 ) -> SensorTiming:
-    """Return the timing of outputs with the given names, for a law with the sampling time dt [s].
+    """Return the timing of outputs with the given names, for a law with the sample time dt [s].
 
-    `sensors` (ny,) contains the output of each name. Raise `InputError` if a sampling time or a
+    `sensors` (ny,) contains the output of each name. Raise `InputError` if a sample time or a
     delay is not a multiple of dt, or if the law is continuous.
     """
     periods, delays = [], []
@@ -102,7 +102,7 @@ def sensors_of_model(lin: LinearModel) -> dict[str, Output]:
 
 
 def timing_of_robot(state: StateMap, dt: float) -> SensorTiming:
-    """Return the timing of the outputs of a robot for a law with the sampling time dt [s]."""
+    """Return the timing of the outputs of a robot for a law with the sample time dt [s]."""
     sensors = sensors_by_signal(state)
     return timing_of(list(sensors.values()), list(sensors), dt)
 
@@ -115,14 +115,14 @@ def _samples(what: str, time: float, dt: float, *, least: int) -> int:
         if count > _MOST_DELAYED and not least:
             raise InputError(
                 f"{what} is {time:g} s, more than {_MOST_DELAYED} samples of {dt:g} s; give a "
-                "model with a longer sampling time"
+                "model with a longer sample time"
             )
         return count
     below = max(math.floor(ratio), least)
     nearest = " and ".join(f"{k * dt:g}" for k in dict.fromkeys((below, below + 1)))
     raise InputError(
-        f"{what} is {time:g} s, which has no common grid with the sampling time {dt:g} s; the "
-        f"nearest times with a common grid are {nearest} s, or give a model with a sampling time "
+        f"{what} is {time:g} s, which has no common grid with the sample time {dt:g} s; the "
+        f"nearest times with a common grid are {nearest} s, or give a model with a sample time "
         "that divides it"
     )
 
@@ -146,7 +146,7 @@ def _require_common(timing: SensorTiming, names: Sequence[str], dt: float) -> No
 
 
 class SensorMemory:
-    """Values that a law receives from sensors with their own sampling times and delays.
+    """Values that a law receives from sensors with their own sample times and delays.
 
     Before the first measurement arrives, the law receives the values `start` (ny,).
     """
@@ -252,7 +252,7 @@ def _lines(timing: SensorTiming) -> tuple[list[_Line], int]:
 def sensor_systems(timing: SensorTiming) -> Iterator[tuple[Array, Array, Array, Array]]:
     """Yield the matrices of the sensors at each sample: states s' = A s + B y, received C s + D y.
 
-    All values are deviations from those before the first measurement arrives.
+    All values are deviations from the values before the first measurement arrives.
     """
     lines, size = _lines(timing)
     ny = len(lines)

@@ -31,7 +31,7 @@ from fflin.control.policy import (
 )
 from fflin.control.trajectory_end import SteadyEnd, resting_end, steady_regulator
 from fflin.control.tvlqr import FilterSchedule, GainSchedule
-from fflin.dynamics.coordinates import Frame, refuse_constraints
+from fflin.dynamics.coordinates import Frame
 from fflin.dynamics.outputs import Measuring
 from fflin.dynamics.state import StateMap
 from fflin.dynamics.state_rows import moved_by, moving_error
@@ -95,7 +95,7 @@ class TrajectoryFeedback(Feedback):
 
     @property
     def sample_time(self) -> float:
-        """Sampling time [s] of the schedule; 0 if it is continuous."""
+        """Sample time [s] of the schedule; 0 if it is continuous."""
         return self.schedule.dt
 
     @property
@@ -361,16 +361,16 @@ class TrajectoryOutputFeedback(OutputSensing, TrajectoryFeedback):
     ----------
     trajectory : LinearTrajectory
     schedule : GainSchedule
-        Result of `tvlqr` with a sampling time.
+        Result of `tvlqr` with a sample time.
     filter : FilterSchedule
-        Result of `tvkalman` with the same sampling time.
+        Result of `tvkalman` with the same sample time.
     noise : callable, optional
         Function noise(t) that returns measurement noise (ny,), which is added to y.
 
     Raises
     ------
     InputError
-        If the gains and the filter have different sampling times or trajectories.
+        If the gains and the filter have different sample times or trajectories.
 
     Examples
     --------
@@ -389,7 +389,6 @@ class TrajectoryOutputFeedback(OutputSensing, TrajectoryFeedback):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        refuse_constraints(self.trajectory.robot, "filters along trajectories")
         expected = "a FilterSchedule, as fflin.tvkalman returns it"
         seen = instance("filter", self.filter, FilterSchedule, expected)
         gains = self.schedule
@@ -464,7 +463,8 @@ class TrajectoryOutputFeedback(OutputSensing, TrajectoryFeedback):
                 # At this sample, the reference changes from the trajectory to the robot at rest, so
                 # the velocity error jumps.
                 stop = self.reference(self.duration)[1] - lin.v
-                jump[len(jump) // 2 :] = StateMap(self.trajectory.robot).velocities(
-                    stop
-                )
+                state = StateMap(self.trajectory.robot)
+                half = len(jump) // 2
+                picked = [state.names.index(name) for name in seen.state_names[:half]]
+                jump[half:] = state.velocities(stop)[picked]
         return Sample(A - B @ K - L @ (C - D @ K), L, -K, 0.0 * D.T, u, y, jump)

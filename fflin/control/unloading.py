@@ -136,15 +136,15 @@ def _multirate(
     feedback: Array,
     speeds: list[str],
 ) -> MultirateFeedback:
-    """Return a law of sensors with their own sampling times that also unloads the wheels.
+    """Return a law of sensors with their own sample times that also unloads the wheels.
 
     `lin` and `continuous` are the models of the design, and `feedback` (nu, number of wheels) is
     the gain of the wheel speeds.
     """
     if timing_of_model(lin) != timing_of_model(law.lin):
         raise InputError(
-            f"the sensors of '{lin.robot}' have other sampling times or delays than those of the "
-            "law; give the robot of the law with an additional external torque"
+            f"the sensors of '{lin.robot}' have other sample times or delays than the sensors of "
+            "the law; give the robot of the law with an additional external torque"
         )
     rows = selection(law.lin.input_names, lin.input_names)
     given = law.compensator
@@ -201,7 +201,7 @@ def _models(
     model = continuous
     if lin.lag.any() or lin.output_lag.any():
         # The wheels and the external torque lag alike, so their lagging torques cancel each other.
-        # The law computes the lagging torques of its own commands alone.
+        # The law computes only the lagging torques of its own commands.
         model = continuous.with_lags(lag, lags_by_name(lin)[1])
     if not lin.dt:
         return model, continuous

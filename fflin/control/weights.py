@@ -308,7 +308,7 @@ def sampled_cost(
     lin : LinearModel
         Continuous model.
     dt : float
-        Sampling time h [s].
+        Sample time h [s].
     Q, R : see `lqr`
         Weights of the integral.
     N : array_like (nx, nu), optional

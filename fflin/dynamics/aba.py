@@ -5,7 +5,7 @@ import pinocchio as pin
 
 from fflin.base.rotation import skew
 from fflin.base.validation import Array
-from fflin.dynamics.classical import ClassicalConstraints
+from fflin.dynamics.classical import ClassicalConstraints, Conditioning
 from fflin.dynamics.coordinates import PIN_ANGULAR
 from fflin.dynamics.state import Actuation, StateMap
 
@@ -124,6 +124,11 @@ class Aba:
         )
         total: Array = np.abs(np.linalg.inv(M)) @ forces
         return total
+
+    def conditioning(self, q: Array, v: Array) -> Conditioning:
+        """Return the condition of the constraints at a point, see `Conditioning`."""
+        assert self._constraints is not None
+        return self._constraints.conditioning(q, v)
 
     def slopes(self, q: Array, v: Array, u: Array) -> tuple[Array, Array, Array]:
         """Return the derivatives of dnu/dt with respect to the tangent of q, to nu and to u.

@@ -24,17 +24,51 @@ _WORLD = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
 # Relative singular values of the scaled rows below this are rounding errors.
 _ZERO = 1e-9
 
-# Regularisation of Pinocchio's proximal solver, relative to the smallest inertia that a constraint
-# force accelerates, and number of its iterations. Each iteration divides the error by the former.
-_MU, _ITERATIONS = 1e-3, 10
+# Number of iterations of Pinocchio's proximal solver.
+_ITERATIONS = 10
 
 # The solver does not iterate if the first solution is exact, such as at rest. Then its derivatives
 # have an error that is a power series in the regularisation. The sum of the derivatives with these
 # {factor of the regularisation: weight} has only an error of fourth order.
 _EXTRAPOLATION = {1.0: -1 / 21, 0.5: 2 / 3, 0.25: -8 / 3, 0.125: 64 / 21}
+# Coefficient of the error: the product of the factors.
+_FOURTH = 1 / 64
+
+# Assumed rounding error [ulp] of the solver, relative to the condition of J M^-1 J^T.
+_ULPS = 8.0
 
 # Distance [m] between the two points that represent a hinge in Pinocchio.
 _HINGE = 0.5
+
+
+class Conditioning(NamedTuple):
+    """Condition of the constraints, and accuracy of Pinocchio's solver.
+
+    The solver inverts J M^-1 J^T + mu E. In the directions of redundant rows, its rounding errors
+    grow by the largest eigenvalue divided by mu. In the direction of the smallest eigenvalue that
+    is not zero, the extrapolated error is the fourth power of the ratio of mu to this eigenvalue.
+    """
+
+    least: float  # smallest eigenvalue of J M^-1 J^T that is not zero
+    condition: (
+        float  # ratio of the largest to the smallest singular value of J M^(-1/2)
+    )
+
+    @property
+    def regularisation(self) -> float:
+        """Ratio of mu to the smallest eigenvalue at which both errors are equal."""
+        ratio: float = (self._rounding / _FOURTH) ** 0.2
+        return ratio
+
+    @property
+    def error(self) -> float:
+        """Relative error of the derivatives, the sum of both."""
+        return 2.0 * self._rounding / self.regularisation
+
+    @property
+    def _rounding(self) -> float:
+        """Rounding error of the solver for mu equal to the smallest eigenvalue."""
+        return _ULPS * float(np.finfo(float).eps) * self.condition**2
 
 
 class _Body(NamedTuple):
@@ -61,11 +95,7 @@ class ClassicalConstraints:
         """Return the constrained dv/dt (nv,) from the free dv/dt at q and v."""
         state = self.state
         rows, bias = self.rows(q, v)
-        M = state.project(pin.crba(self._model, self._data, q).T)
-        scale = 1.0 / np.sqrt(M.diagonal())
-        # In scaled coordinates, M is W, and the acceleration changes by W^-1 J^T lam.
-        factor = np.linalg.cholesky(scale[:, None] * M * scale)
-        scaled = np.linalg.solve(factor, (rows * scale).T).T
+        scaled, scale, factor = self._scaled(q, rows)
         free = state.velocities(rate)
         missing = -(rows @ free + bias)
         change = np.linalg.lstsq(scaled, missing, rcond=_ZERO)[0]
@@ -147,16 +177,39 @@ class ClassicalConstraints:
 
         Pinocchio computes them, with a hinge as two points on its axis.
         """
-        rows, _ = self.rows(q, v)
-        M = self.state.project(pin.crba(model, self._data, q).T)
-        delassus = np.linalg.eigvalsh(rows @ np.linalg.solve(M, rows.T))
-        least = float(delassus[delassus > _ZERO * delassus[-1]][0])
+        at = self.conditioning(q, v)
+        mu = at.regularisation * at.least
         total = np.zeros((3, model.nv, model.nv))
         for factor, weight in _EXTRAPOLATION.items():
-            settings = pin.ProximalSettings(0.0, factor * _MU * least, _ITERATIONS)
+            settings = pin.ProximalSettings(0.0, factor * mu, _ITERATIONS)
             total += weight * self._regularised(model, q, v, tau, settings)
         by_q, by_v, by_tau = total
         return by_q, by_v, by_tau
+
+    def conditioning(self, q: Array, v: Array) -> Conditioning:
+        """Return the condition of the constraints at a point.
+
+        The smallest eigenvalue of J M^-1 J^T is the square of a singular value. Near a singular
+        posture, rounding errors of the largest eigenvalue would hide it.
+        """
+        rows, _ = self.rows(q, v)
+        scaled, _, _ = self._scaled(q, rows)
+        sizes = np.linalg.svd(scaled, compute_uv=False)
+        least = float(sizes[sizes > _ZERO * sizes[0]][-1])
+        return Conditioning(least**2, float(sizes[0]) / least)
+
+    def _scaled(self, q: Array, rows: Array) -> tuple[Array, Array, Array]:
+        """Return the rows in coordinates of unit inertia, the scale of these, and a factor of M.
+
+        In the scaled coordinates, the inertia is W W^T with the Cholesky factor W. The rows are
+        W^-1 times the scaled rows, transposed.
+        """
+        state = self.state
+        M = state.project(pin.crba(self._model, self._data, q).T)
+        scale = 1.0 / np.sqrt(M.diagonal())
+        factor = np.linalg.cholesky(scale[:, None] * M * scale)
+        scaled = np.linalg.solve(factor, (rows * scale).T).T
+        return scaled, scale, factor
 
     def _regularised(
         self,

@@ -80,7 +80,8 @@ def refuse_constraints(robot: Robot, what: str) -> None:
         names = listed(item.title for item in robot.constraints)
         raise InputError(
             f"{what} do not support constraints, but '{robot.name}' has the constraints {names}; "
-            "remove them with robot.replace(constraints=[])"
+            "remove them with robot.replace(constraints=[]), or on the command line without --weld "
+            "and [[constraint]]"
         )
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from fflin.base.validation import Array
 from fflin.dynamics.integrators import held_exponential
 
-# A delay that differs from a multiple of the sampling time by less than this fraction of it counts
+# A delay that differs from a multiple of the sample time by less than this fraction of it counts
 # as the multiple.
 _ROUNDING = 1e-9
 
@@ -18,7 +18,7 @@ Hold: TypeAlias = Callable[[Array, Array, float], tuple[Array, Array]]
 
 
 class Delay(NamedTuple):
-    """Delay ``(samples - 1) h + rest`` [s] with the sampling time h and ``0 < rest <= h``.
+    """Delay ``(samples - 1) h + rest`` [s] with the sample time h and ``0 < rest <= h``.
 
     A delay of zero has no samples.
     """
@@ -54,7 +54,7 @@ class HeldSystem:
     A : ndarray (nx, nx)
     B : ndarray (nx, nu)
     h : float
-        Sampling time [s].
+        Sample time [s].
     delays : ndarray (nu,)
         Delays [s], at least 0.
     hold : callable, optional
@@ -122,7 +122,7 @@ class HeldSystem:
     def applied(self, s: float) -> tuple[Array, Array]:
         """Return the maps of the states (nu, size) and of the commands (nu, nu) to the inputs.
 
-        The inputs are those that act at the time s [s] after a sample, 0 <= s < h.
+        The inputs act at the time s [s] after a sample, 0 <= s < h.
         """
         nu = self.B.shape[1]
         of_states = np.zeros((nu, self.size))

@@ -163,10 +163,7 @@ def jam(
             f"'{mode}' is a mode of a flexible appendage or of slosh, which cannot jam; name "
             "joints or wheels"
         )
-    q = robot.neutral() if q is None else robot.checked_configuration(q)
-    v = np.zeros(robot.nv) if v is None else robot.checked_velocity(v)
-    if robot.constraints:
-        q, v = on_constraints(robot, q, v)
+    q, v = state_before(robot, q, v)
     at = {name: robot.joint(name).value(q) for name in named}
     looping = _without_rigid_loops(robot, at) if robot.constraints else robot
     left = welded(looping, at)
@@ -179,7 +176,19 @@ def jam(
     return replace(hit, impulse=state.forces(change)[stopped], _units=units)
 
 
-def on_constraints(robot: Robot, q: Array, v: Array) -> tuple[Array, Array]:
+def state_before(robot: Robot, q: Array | None, v: Array | None) -> tuple[Array, Array]:
+    """Return q (nq,) and v (nv,) before an impact: neutral and zero by default.
+
+    Raise `ConstraintError` if a robot with constraints cannot reach them.
+    """
+    q = robot.neutral() if q is None else robot.checked_configuration(q)
+    v = np.zeros(robot.nv) if v is None else robot.checked_velocity(v)
+    if robot.constraints:
+        return _on_constraints(robot, q, v)
+    return q, v
+
+
+def _on_constraints(robot: Robot, q: Array, v: Array) -> tuple[Array, Array]:
     """Return q (nq,) and v (nv,) on the constraints of a robot, or raise `ConstraintError`."""
     closure = Closure(StateMap(robot))
     q = closure.configuration(q)
@@ -466,17 +475,14 @@ def capture(
         if placement is None
         else checked_placement("placement", placement)
     )
-    q = robot.neutral() if q is None else robot.checked_configuration(q)
-    v = np.zeros(robot.nv) if v is None else robot.checked_velocity(v)
+    q, v = state_before(robot, q, v)
     holding = checked_constraints(hold)
-    if robot.constraints:
-        q, v = on_constraints(robot, q, v)
     joint, on = find_frame(robot.model, frame)
     data = robot.create_data()
     pin.forwardKinematics(robot.model, data, q)
     other_q, other_v = _beside(other, data.oMi[joint] * on * at, payload_q, payload_v)
     if other.constraints:
-        other_q, other_v = on_constraints(other, other_q, other_v)
+        other_q, other_v = _on_constraints(other, other_q, other_v)
     whole = _held(joined(robot, frame, other, at, prefix), other, prefix, holding)
     parts = [(robot, q, v), (other, other_q, other_v)]
     hit, forces = struck(

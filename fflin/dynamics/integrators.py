@@ -230,11 +230,15 @@ def held_exponential(A: Array, driven: Array, h: float | Array) -> tuple[Array, 
     h = np.asarray(h)[..., None, None]
     with np.errstate(over="ignore", invalid="ignore"):
         if not (A @ A).any():
-            return np.eye(n) + A * h, driven * h + A @ driven * (h * h / 2.0)
+            # the exponential series ends after its linear term
+            transition = np.eye(n) + A * h
+            held = driven * h + A @ driven * (h * h / 2.0)
+            return transition, held
         from scipy.linalg import expm
 
         block = np.zeros((*A.shape[:-2], n + k, n + k))
-        block[..., :n, :n], block[..., :n, n:] = A, driven
+        block[..., :n, :n] = A
+        block[..., :n, n:] = driven
         exponential = expm(block * h)
         return exponential[..., :n, :n], exponential[..., :n, n:]
 
@@ -251,7 +255,9 @@ def held_derivatives(
     # state (dx, x).
     n = len(A)
     both = np.zeros((*dA.shape[:-2], 2 * n, 2 * n))
-    both[..., :n, :n], both[..., :n, n:], both[..., n:, n:] = A, dA, A
+    both[..., :n, :n] = A
+    both[..., :n, n:] = dA
+    both[..., n:, n:] = A
     forced = np.concatenate(
         (d_driven, np.broadcast_to(driven, d_driven.shape)), axis=-2
     )

@@ -12,7 +12,7 @@ from fflin.dynamics.impact import (
     impulses_of,
     inertia_at,
     momentum_of,
-    on_constraints,
+    state_before,
 )
 from fflin.dynamics.state import StateMap
 from fflin.robot.constraints import Constraint, checked_constraints
@@ -83,10 +83,7 @@ def latch(
         raise InputError(
             "no constraint is given, expected Weld, Hinge or Spherical objects that close"
         )
-    q = robot.neutral() if q is None else robot.checked_configuration(q)
-    v = np.zeros(robot.nv) if v is None else robot.checked_velocity(v)
-    if robot.constraints:
-        q, v = on_constraints(robot, q, v)
+    q, v = state_before(robot, q, v)
     before = (robot, q, v)
     whole = robot.replace(constraints=[*robot.constraints, *closing], independent=[])
     closure = Closure(StateMap(whole))

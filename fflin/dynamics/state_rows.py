@@ -133,7 +133,7 @@ def attitude_errors(x: Array, target: Array) -> Array:
 
 
 def attitude_rotations(x: Array, target: Array) -> Array:
-    """Return the rotation vectors (N, 3) [rad] from the attitudes of targets to those of states.
+    """Return the rotation vectors (N, 3) [rad] from attitudes of targets to attitudes of states.
 
     The vectors are in target axes. `target` is one state (nx,), or one for each row of x (N, nx).
     """
@@ -169,7 +169,9 @@ def moving_errors(frame: str, x: Array, target: Array) -> Array:
     errors are in target axes. The error of a base velocity is the velocity of the state in the base
     axes of this state, minus the velocity of the target in target axes.
     """
-    e, (_, R), (_, R_target) = x - target, _turned(x), _turned(target)
+    _, R = _turned(x)
+    _, R_target = _turned(target)
+    e = x - target
     turned, scalar = _apart(x, target)
     e[:, :3] = turned * np.where(scalar < 0.0, -1.0, 1.0)
     e[:, 3:6] = (e[:, None, 3:6] @ R_target)[:, 0]
@@ -184,16 +186,21 @@ def moved_by(frame: str, target: Array, e: Array) -> Array:
     This function is the inverse of `moving_errors`. If an error has |q_b| > 1, the returned state
     has the attitude NaN, and its base velocities in reference axes are NaN too.
     """
-    x, (turn_target, R_target), (turn, R) = target + e, _turned(target), _turned(e)
+    scalar_target, R_target = _turned(target)
+    scalar_e, R_e = _turned(e)
     q_e, q_target = e[:, :3], target[:, :3]
-    x[:, :3] = turn_target * q_e + turn * q_target + np.cross(q_target, q_e)
-    scalar = turn * turn_target - (q_e * q_target).sum(axis=1, keepdims=True)
-    x[:, :3] *= np.where(scalar < 0.0, -1.0, 1.0)
-    x[:, 3:6] = target[:, 3:6] + (R_target @ e[:, 3:6, None])[..., 0]
-    R = R_target @ R
+    # product of the quaternions of target and error, with a scalar that is not negative
+    vector = scalar_target * q_e + scalar_e * q_target + np.cross(q_target, q_e)
+    scalar = scalar_e * scalar_target - (q_e * q_target).sum(axis=1, keepdims=True)
+    x = target + e
+    x[:, :3] = vector * np.where(scalar < 0.0, -1.0, 1.0)
+    offset = R_target @ e[:, 3:6, None]
+    x[:, 3:6] = target[:, 3:6] + offset[..., 0]
+    R = R_target @ R_e
     for rows in _in_reference(frame, x.shape[1]):
-        in_base_axes = (target[:, None, rows] @ R_target)[:, 0] + e[:, rows]
-        x[:, rows] = (R @ in_base_axes[..., None])[..., 0]
+        target_velocity = (target[:, None, rows] @ R_target)[:, 0]
+        velocity = target_velocity + e[:, rows]
+        x[:, rows] = (R @ velocity[..., None])[..., 0]
     return x
 
 

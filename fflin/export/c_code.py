@@ -50,7 +50,7 @@ _FLOAT = {
 _INVALID = 2  # status of a call, as in templates/header.h
 _LARGEST = 2**26  # [bytes] largest size of each file of a law
 
-# Valid names, without those of headers that the code or the C library includes.
+# Valid names, without the names of headers that the code or the C library includes.
 _NAME = r"(?!(features|float|math|std\w*)$)[A-Za-z][A-Za-z0-9_]{0,40}"
 
 
@@ -217,7 +217,7 @@ class CLaw(Policy):
     name : str
         The `name` given to `write_c`, with which all names in the C code begin.
     dt : float
-        Sampling time [s] of the control law; 0 in continuous time.
+        Sample time [s] of the control law; 0 in continuous time.
     frame : str
         Axes of the inputs on the base, as in `LinearModel`.
     origin : pin.SE3 or None
@@ -286,7 +286,7 @@ class CLaw(Policy):
 
     @property
     def sample_time(self) -> float:
-        """Sampling time [s]; 0 in continuous time."""
+        """Sample time [s]; 0 in continuous time."""
         return self.dt
 
     @property

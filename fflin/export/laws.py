@@ -17,6 +17,7 @@ from fflin.control.compensator import Compensator
 from fflin.control.following import Following, ReferencePath
 from fflin.control.gain import Gain, model_of, sampled_for
 from fflin.control.loops import NOT_CORRECTED, Sample
+from fflin.control.multirate import MultirateCompensator
 from fflin.control.multirate_feedback import MultirateFeedback
 from fflin.control.policies import LinearLaw, StateFeedback
 from fflin.control.policy import (
@@ -41,7 +42,7 @@ from fflin.robot.robot import Robot
 
 CASES = 200
 
-Design: TypeAlias = Gain | GainSchedule | Compensator | Policy
+Design: TypeAlias = Gain | GainSchedule | Compensator | MultirateCompensator | Policy
 
 
 class Case(NamedTuple):
@@ -97,7 +98,7 @@ class Law:
     operations: float
     cases: list[Case]
     period: int = 1  # number of samples after which the tables A, B and E repeat
-    # whether the rows of the tables for the samples repeat, instead of the last one being kept
+    # whether the tables for the samples repeat; if not, the last row stays in effect
     repeats: bool = False
     # data of a magnetic law
     magnetic: BDotForm | None = None
@@ -133,7 +134,7 @@ def measured(world: StateMap, q: Array, v: Array) -> Array:
 
 def law_of(given: object, robot: object, limits: object) -> Law:
     """Convert a policy or a controller design to a `Law`, with `limits` as in `simulate`."""
-    if not isinstance(given, Gain | GainSchedule | Compensator | Policy):
+    if not isinstance(given, Design):
         raise _not_written(given)
     lin = None
     trajectory = None
@@ -191,7 +192,7 @@ def _robot_error(given: object, problem: str) -> InputError:
 def _law_of(given: Design, robot: Robot) -> Law:
     """Convert a policy or a controller design for a robot."""
     title = type(given).__name__
-    if isinstance(given, Compensator):
+    if isinstance(given, Compensator | MultirateCompensator):
         return _compensator_law(given, robot)
     policy = _policy_of(given, robot)
     form = policy.form(robot)
@@ -244,7 +245,7 @@ def _law_of_model(title: str, policy: Policy, dt: float, robot: Robot) -> Law | 
         return _state_law(title, policy, dt, form, robot)
     if isinstance(form, OutputForm) and form.loop.measures_state:
         return _memory_law(title, policy, form.terms(0.0), robot)
-    # The form also contains the sensors of the robot, which are no part of the code.
+    # The form also contains the sensors of the robot, which the code does not contain.
     if isinstance(policy, MultirateFeedback):
         terms = policy.terms()
     elif isinstance(policy, LinearLaw):
@@ -331,7 +332,7 @@ def _law_about_point(
 ) -> Law:
     """Return the law of a policy about the point of its model, with one gain for each grid point.
 
-    `terms` are those of a law with a memory.
+    `terms` are the terms of a law with a memory.
     """
     lin = policy.model
     assert lin is not None
@@ -600,16 +601,24 @@ def _magnetic_cases(form: BDotForm) -> Iterator[Case]:
         yield Case(0, y, form.gain @ vector, gains @ size)
 
 
-def _compensator_law(given: Compensator, robot: Robot) -> Law:
-    """Convert a compensator, which contains no model; units are those of the robot's signals."""
+def _compensator_law(given: Compensator | MultirateCompensator, robot: Robot) -> Law:
+    """Convert a compensator, which contains no model; the robot's signals give the units."""
     none = np.zeros((len(given.u0), len(given.y0)))
-    E = given.E if given.E.any() else NOT_CORRECTED
+    corrected = given.E.any()
+    periodic = isinstance(given, MultirateCompensator)
+    matrices = (given.A, given.B, given.E)
+    terms = [
+        Sample(
+            A, B, given.C, none, given.u0, given.y0, E=E if corrected else NOT_CORRECTED
+        )
+        for A, B, E in (zip(*matrices, strict=True) if periodic else [matrices])
+    ]
     state = StateMap(robot)
     sensed, asked = (signals_of(state, kind) for kind in ("output", "input"))
     known = dict(zip(sensed[0] + asked[0], sensed[1] + asked[1], strict=True))
     return _output_law(
         type(given).__name__,
-        [Sample(given.A, given.B, given.C, none, given.u0, given.y0, E=E)],
+        terms,
         inputs=(
             given.output_names,
             tuple(known.get(x, "unknown") for x in given.output_names),

@@ -52,7 +52,7 @@ class Constraints(
     namedtuple(
         "Constraints",
         "first second first_pose second_pose pair component location jacobian basis triangle "
-        "error roots change multipliers forces squares least at packed",
+        "error roots change multipliers forces squares least at packed twist",
     )
 ):
     """Constraints between k pairs of frames, with r independent rows, and their work space.
@@ -78,6 +78,7 @@ class Constraints(
       it, squared, or the smallest of its squared length at the start. If it is zero, the rows are
       not independent.
     - `at` (nq,): a displaced configuration. `packed`: a copy of the packed M.
+    - `twist` (6,): the relative twist of a pair of frames, in axes of the first frame.
     """
 
 
@@ -124,19 +125,23 @@ def orthonormalise(basis: Array, triangle: Array, least: Array, rows: int) -> No
     size = len(basis) // rows
     for i in range(rows):
         at = i * size
-        before = _product(basis, at, basis, at, size)
-        for j in range(i):
-            part = _product(basis, j * size, basis, at, size)
-            store(triangle, j * rows + i, part)
-            _add(basis, at, -part, basis, j * size, size)
+        # The squared length remains on the diagonal of R until column i is orthonormal.
+        store(triangle, i * rows + i, _product(basis, at, basis, at, size))
+    for i in range(rows):
+        at = i * size
         square = _product(basis, at, basis, at, size)
-        fraction = square / before
+        fraction = square / load(triangle, i * rows + i)
         store(least, 0, chosen(fraction, load(least, 0), fraction, load(least, 0)))
         length = root(square)
         store(triangle, i * rows + i, length)
         inverse = 1.0 / length
         for index in range(size):
             store(basis, at + index, load(basis, at + index) * inverse)
+        # The processor computes the parts of all later columns at the same time.
+        for j in range(i + 1, rows):
+            part = _product(basis, at, basis, j * size, size)
+            store(triangle, i * rows + j, part)
+            _add(basis, j * size, -part, basis, at, size)
 
 
 def respond(
@@ -262,16 +267,16 @@ def _add_column(work, tree, constraints, pair, body, lever, sign):
     The rows are the rows of a pair of frames.
     """
     size = len(constraints.change)
+    axes = vec.get_columns(constraints.location, pair * LOCATION + AXES)
     w, v = joint_axis(work, tree, body)
     v = vec.plus(v, vec.cross(w, lever))
+    twist = vec.across(axes, w), vec.across(axes, v)
+    vec.put6(constraints.twist, 0, vec.times6(twist, sign))
     for row in range(len(constraints.error)):
         if constraints.pair[row] == pair:
-            axis, angular = _direction(constraints, row)
-            value = vec.dot(axis, v)
-            if angular:
-                value = vec.dot(axis, w)
+            value = load(constraints.twist, constraints.component[row])
             at = row * size + tree.coordinate[body]
-            vec.add(constraints.jacobian, at, value * sign)
+            vec.add(constraints.jacobian, at, value)
 
 
 def _put_base(constraints, pair, lever):
@@ -318,20 +323,52 @@ def write_jacobian(work, robot, constraints):
             _put_base(constraints, pair, second_lever)
 
 
+def _solve_inwards(work, tree, basis, rows):
+    """Replace the columns of J^T in `basis` by the columns of L^-T J^T.
+
+    The result is the result of `bodies.solve_inwards` for each column. Here all columns share each
+    entry of L, and the six entries of the base remain in registers until they are complete.
+    """
+    packed = tree.offsets.packed
+    size = len(tree.row)
+    for k in range(size - 1, 5, -1):
+        row = tree.row[k]
+        # The first six entries of each path belong to the base.
+        for t in range(6, tree.depth[k]):
+            entry, above = load(work, packed + row + t), tree.path[row + t]
+            for i in range(rows):
+                at = i * size
+                vec.add(basis, at + above, -entry * load(basis, at + k))
+    for i in range(rows):
+        at = i * size
+        base = vec.get6(basis, at)
+        for k in range(size - 1, 5, -1):
+            entries = vec.get6(work, packed + tree.row[k])
+            base = vec.minus6(base, vec.times6(entries, load(basis, at + k)))
+        vec.put6(basis, at, base)
+    for k in range(5, 0, -1):
+        for t in range(k):
+            entry = load(work, packed + tree.row[k] + t)
+            for i in range(rows):
+                at = i * size
+                vec.add(basis, at + t, -entry * load(basis, at + k))
+
+
 @called
 def factorise(work, tree, constraints):
     """Write Q and R for the present J; `bodies.factorise` must have factorised M."""
     basis, roots = constraints.basis, constraints.roots
-    size = len(tree.row)
-    for k in range(size):
-        at = tree.offsets.scaled + tree.row[k] + tree.depth[k]
-        store(roots, k, root(load(work, at)))
+    rows, size = len(constraints.error), len(tree.row)
     vec.copy(constraints.jacobian, 0, basis, 0, len(basis))
-    for row in range(len(constraints.error)):
+    _solve_inwards(work, tree, basis, rows)
+    for k in range(size):
+        scale = root(load(work, tree.offsets.scaled + tree.row[k] + tree.depth[k]))
+        store(roots, k, scale)
+        for row in range(rows):
+            at = row * size + k
+            store(basis, at, load(basis, at) * scale)
+    for row in range(rows):
         at = row * size
-        bodies.solve_inwards(work, tree, basis, at)
-        for k in range(size):
-            store(basis, at + k, load(basis, at + k) * load(roots, k))
         # A row that vanishes as a whole has only rounding errors, which can seem independent.
         square = _product(basis, at, basis, at, size)
         start = load(constraints.squares, row)
@@ -339,9 +376,7 @@ def factorise(work, tree, constraints):
         store(constraints.squares, row, start)
         fraction, least = square / start, load(constraints.least, 0)
         store(constraints.least, 0, chosen(fraction, least, fraction, least))
-    orthonormalise(
-        basis, constraints.triangle, constraints.least, len(constraints.error)
-    )
+    orthonormalise(basis, constraints.triangle, constraints.least, rows)
 
 
 @called

@@ -202,17 +202,23 @@ class Route:
 
     def _nudged(self, rng: np.random.Generator) -> tuple[Array, Array, Array]:
         """Return q, v and the inputs in base axes, changed by _NUDGE."""
-        state, (stiffness, _, rest) = self.state, self.state.robot.springs
-        per_unit = np.array([1.0 / joint.scale for joint in state.robot.joints])
+        state = self.state
+        stiffness, _, rest = state.robot.springs
+        unit = np.array([1.0 / joint.scale for joint in state.robot.joints])
         # The rounding error of a spring's force is relative to the deflection of the spring.
         deflection = np.abs(state.joint_positions(self.q) - rest)
-        per_unit = np.where(stiffness > 0.0, np.minimum(per_unit, deflection), per_unit)
-        size = np.concatenate((np.ones(6), per_unit))
-        step = state.spread(_NUDGE * rng.choice((-1.0, 1.0), len(size)) * size)
-        faster = 1.0 + _NUDGE * rng.choice((-1.0, 1.0), len(size))
-        stronger = 1.0 + _NUDGE * rng.choice((-1.0, 1.0), len(self._u))
-        q = pin.integrate(state.robot.model, self.q, step)
-        return q, state.spread(self.nu * faster), self._u * stronger
+        unit = np.where(stiffness > 0.0, np.minimum(unit, deflection), unit)
+        size = np.concatenate((np.ones(6), unit))
+
+        def nudges(count: int) -> Array:
+            signs: Array = rng.choice((-1.0, 1.0), count)
+            return _NUDGE * signs
+
+        displacement = state.spread(nudges(len(size)) * size)
+        nu = self.nu * (1.0 + nudges(len(size)))
+        u = self._u * (1.0 + nudges(len(self._u)))
+        q = pin.integrate(state.robot.model, self.q, displacement)
+        return q, state.spread(nu), u
 
     def _sums(self, dynamics: Dynamics) -> tuple[Array, Array]:
         """Sum the magnitudes of the terms of A and B when they are transformed to the frame."""

@@ -62,6 +62,8 @@ class Check(html.Reported):
         Description of the checked model.
     robot : str
         Name of the robot.
+    remarks : tuple of str
+        Limits of the comparisons, such as rounding errors near a singular posture of constraints.
 
     Examples
     --------
@@ -74,6 +76,7 @@ class Check(html.Reported):
     rows: tuple[Row, ...]
     title: str
     robot: str
+    remarks: tuple[str, ...] = ()
 
     @property
     def ok(self) -> bool:
@@ -105,7 +108,8 @@ class Check(html.Reported):
 
     def __str__(self) -> str:
         """Show whether the model is verified, and the largest error of each kind of comparison."""
-        lines = folded([self._verdict()]), folded([self._counted_title()])
+        texts = self._verdict(), self._counted_title(), *self.remarks
+        lines = [folded([text]) for text in texts]
         return "\n\n".join((*lines, grid(self._table(), "lrrlr")))
 
     def _html_parts(self) -> list[str]:
@@ -116,6 +120,7 @@ class Check(html.Reported):
         return [
             html.verdict(self._verdict(), self.ok),
             html.paragraph(self._counted_title(), "note"),
+            *(html.paragraph(remark, "note") for remark in self.remarks),
             html.table(self._table(), "lrrlr"),
             html.folded("all comparisons", html.table(every, "ll")),
         ]
@@ -213,8 +218,9 @@ def check_all(
     if tolerance is not None:
         tolerance = share("tolerance", tolerance)
     largest: dict[tuple[str, str], Row] = {}
+    remarks: list[str] = []
     for lin in models:
-        for comparison in _comparisons(robot, lin):
+        for comparison in _comparisons(robot, lin, remarks):
             row = comparison
             if tolerance is not None:
                 row = comparison._replace(tolerance=tolerance)
@@ -226,17 +232,23 @@ def check_all(
             title = f"{robot.name}, frame {lin.frame}, scaled cond(M) {condition:.1e}"
     if tolerance is not None:
         title += f", each error at most {tolerance:.1e}"
-    return Check(tuple(largest.values()), title, robot.name)
+    # Of models along a motion, the first one with a remark counts.
+    return Check(tuple(largest.values()), title, robot.name, tuple(remarks[:1]))
 
 
-def _comparisons(robot: Robot, lin: LinearModel) -> Iterator[Row]:
-    """Yield the row of each comparison of a model with independent computations."""
+def _comparisons(robot: Robot, lin: LinearModel, remarks: list[str]) -> Iterator[Row]:
+    """Yield the row of each comparison of a model with independent computations.
+
+    Append what the comparisons cannot detect to `remarks`.
+    """
     state = StateMap(robot, reference=lin.reference, frame=lin.frame, t=lin.time)
     if robot.constraints:
         require_fit(lin, robot, state, sensed=True)
         Constraints(robot).settle(lin.q)
         _require_independent(robot, lin)
-        yield from ConstrainedReferences(robot, lin).rows(lin)
+        references = ConstrainedReferences(robot, lin)
+        yield from references.rows(lin)
+        remarks += references.remarks(lin)
         return
     require_fit(lin, robot, state, whole=True, sensed=True)
     yield from References(robot, lin).rows(lin)

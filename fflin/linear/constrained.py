@@ -314,7 +314,7 @@ def independent_states(
 def reduced_fields(
     reduction: Reduction, arrays: dict[str, Array], C: Array | None
 ) -> dict[str, Any]:
-    """Return the arrays of a model in the independent states from those in all states.
+    """Return the arrays of a model in the independent states from the arrays in all states.
 
     C is None if the outputs are all states.
     """

@@ -45,9 +45,11 @@ _STEPS, _ARRIVED = 12, 1e-13
 # Step of the differences from which the steps of the other differences follow.
 _ROUGH = 1e-6
 
-# Rounding errors of the two computations, relative to the largest entry of a row. Pinocchio's
-# proximal solver has an error of this size if rows are redundant.
-_ROUNDING, _PROXIMAL = 1e-13, 1e-11
+# Rounding error of the differences, relative to the largest entry of a row.
+_ROUNDING = 1e-13
+
+# Largest rounding error, relative to the largest entry of a row, that needs no remark.
+_HIDDEN = 1e-2
 
 # Largest residual [m, rad] of a closed operating point.
 _CLOSED = 1e-9
@@ -137,6 +139,7 @@ class ConstrainedReferences:
         inputs = self.route.aba.actuation.groups
         self._inputs = {key: np.array(x, dtype=np.intp) for key, x in inputs.items()}
         self._differentiated = False
+        self._conditioning = self.route.aba.conditioning(lin.q, lin.v)
         self._nonlinear = Nonlinear(self.route.aba, replace(lin, x0=self._manifold.x0))
         self._measuring = Measuring(state, lin.q)
         self._units = self.route.units[self._kept]
@@ -228,6 +231,20 @@ class ConstrainedReferences:
         terms: Array = self.route.rate_terms(np.zeros(len(self.route.M)))[self._kept]
         return terms
 
+    def _point_rates(self) -> Reference:
+        """Return dz/dt at the operating point.
+
+        The constraints correct the accelerations by J^+ (J a + gamma). If J has a large condition,
+        the correction multiplies rounding errors of all accelerations by it.
+        """
+        size = np.maximum(np.abs(self.f0), self._terms()) + self._units
+        route = self.route
+        terms = route.rate_terms(np.zeros(len(route.M))) / route.units
+        largest = float(terms[len(route.M) :].max())
+        error = ULPS * EPS * self._conditioning.condition * largest * self._units
+        error[: len(self._kept) // 2] = 0.0
+        return Reference(self.f0, size, error)
+
     def _chosen_steps(self, T: Array) -> Array:
         """Return the steps (2 d,) of the independent states."""
         state = self.route.state
@@ -265,11 +282,38 @@ class ConstrainedReferences:
         A, B = route.A, route.B
         rounding = A.rounding[kept] @ size + np.abs(A.value[kept]) @ self._T_error
         value = A.value[kept] @ T
-        whole = np.hstack((value, B.value[kept]))
-        noise = _noise(whole, self._all_units, _PROXIMAL)
+        # The error of Pinocchio's solver is relative to the terms of the accelerations.
+        scale = A.scale[kept] @ size
+        terms = np.hstack((scale, B.scale[kept]))
+        noise = _noise(terms, self._all_units, self._conditioning.error)
         of_A, of_B = np.split(noise, [len(kept)], axis=1)
-        self.A = Reference(value, A.scale[kept] @ size, rounding + of_A)
+        self.A = Reference(value, scale, rounding + of_A)
         self.B = Reference(B.value[kept], B.scale[kept], B.rounding[kept] + of_B)
+
+    def remarks(self, lin: LinearModel) -> Iterator[str]:
+        """State which errors of A the comparisons cannot detect, if these are not small."""
+        hidden = self._undetected(lin)
+        if hidden > _HIDDEN:
+            yield (
+                f"near a singular posture (condition of the constraints "
+                f"{self._conditioning.condition:.1e}), errors of A below {hidden:.1g} times the "
+                "largest entry of their row are not detected, because the comparisons have "
+                "rounding errors of this size"
+            )
+
+    def _undetected(self, lin: LinearModel) -> float:
+        """Return the largest rounding error of A, relative to the largest entry of the row.
+
+        Each entry counts with the more accurate of the comparisons.
+        """
+        references = [self._differences[0]]
+        if self._has_pinocchio:
+            references.append(self.A)
+        rounding = np.min([x.rounding for x in references], axis=0) * self._units
+        largest = np.abs(lin.A * self._units).max(axis=1, initial=0.0)
+        moved = largest > 0.0
+        ratios = rounding[moved] / largest[moved, None]
+        return float(ratios.max(initial=0.0))
 
     @property
     def _has_pinocchio(self) -> bool:
@@ -311,8 +355,8 @@ class ConstrainedReferences:
         z0 = self._manifold.z0
         apart = np.abs(lin.x0 - z0) / np.maximum(1.0, np.abs(z0))
         yield worst("point", "x0", apart, ROUTE_TOLERANCE)
-        size = np.maximum(np.abs(self.f0), self._terms()) + self._units
-        yield worst("point", "f0", np.abs(lin.f0 - self.f0) / size, ROUTE_TOLERANCE)
+        f0 = self._point_rates().errors(lin.f0, ROUTE_TOLERANCE)
+        yield worst("point", "f0", f0, ROUTE_TOLERANCE)
         residual, rate = self._manifold.residuals()
         yield Row("point", "constraints", residual, _CLOSED)
         speed = 1.0 + float(np.abs(lin.v).max())

@@ -182,7 +182,7 @@ def equilibrium(
         Whether the inputs also balance the constant part of `Robot.disturbance`, and the forces of
         its flat plates at t = 0. Such inputs show what the actuators must hold. By default, the
         inputs are the inputs of a control law, which does not know the disturbance; a linear model
-        does not contain it either. Inertial axes are those at t = 0.
+        does not contain it either. Inertial axes are the axes at t = 0.
     forces : mapping, optional
         Forces [N] and torques [N m] that constraints must exert, such as
         ``{"grasp.force.x": 5.0}``, with the names and axes of `ConstraintForce`. The other

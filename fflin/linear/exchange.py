@@ -122,7 +122,7 @@ def transform(
 
         - the model and the robot have different states or inputs;
         - a discrete-time model was read from a file;
-        - the robot has constraints, and `dt` is given or the point is no equilibrium at rest;
+        - the robot has constraints, and `dt` is given or the point is not an equilibrium at rest;
         - `dt` is out of range or not allowed for this tool.
     UnknownNameError
         If the tool is unknown.

@@ -181,7 +181,7 @@ def outputs(
     ----------
     robot : Robot
         Robot with the same states, inputs and outputs as the model. Its masses may differ from
-        those with which the model was computed.
+        the masses with which the model was computed.
     lin : LinearModel
         Model that defines the reference and the operating point.
     q, v : array_like (nq,), (nv,)
@@ -246,7 +246,7 @@ def line_up(gain: Gain | GainBatch, lin: LinearModel) -> Array:
     Raises
     ------
     InputError
-        If gain and model have different frames or sampling times, or if each of them has states or
+        If gain and model have different frames or sample times, or if each of them has states or
         inputs that the other lacks, because they then belong to different robots.
 
     Examples

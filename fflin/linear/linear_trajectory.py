@@ -54,7 +54,7 @@ class LinearTrajectory(Trajectory):
     state_names, input_names, output_names : tuple of str
         Names of dx, du and dy.
     dt : float
-        Sampling time [s], during which du is constant; 0 in continuous time.
+        Sample time [s], during which du is constant; 0 in continuous time.
     period : float
         Time [s] after which the motion and the models repeat; 0 if they do not repeat.
     multipliers : ndarray (nx,)
@@ -304,7 +304,7 @@ class LinearTrajectory(Trajectory):
         Parameters
         ----------
         dt : float
-            Sampling time [s]. The duration must be a multiple of dt.
+            Sample time [s]. The duration must be a multiple of dt.
 
         Raises
         ------
@@ -424,7 +424,7 @@ def linearize_trajectory(
 def along(motion: Trajectory, partition: Partition | None = None) -> LinearTrajectory:
     """Return the error dynamics of a trajectory, linearised about all knots.
 
-    The coordinates of a robot with constraints are those of the partition, or are chosen.
+    If the robot has constraints, `partition` gives the coordinates. By default, they are chosen.
     """
     robot = motion.robot
     if partition is None:
@@ -561,23 +561,27 @@ def _through(
     `parts`. Each part has two steps, one for each exponential in (10.3).
     """
     fraction = np.arange(parts) / parts
-    start = [(t[:-1, None] + np.diff(t)[:, None] * fraction).ravel() for t in cuts]
-    h = np.concatenate([np.repeat(np.diff(t) / parts, parts) for t in cuts])
-    nodes = np.concatenate(start)[:, None] + np.array(GAUSS) * h[:, None]
+    starts = list[Array]()
+    lengths = list[Array]()
+    for times in cuts:
+        interval = np.diff(times)
+        starts.append((times[:-1, None] + interval[:, None] * fraction).ravel())
+        lengths.append(np.repeat(interval / parts, parts))
+    length = np.concatenate(lengths)
+    nodes = np.concatenate(starts)[:, None] + np.array(GAUSS) * length[:, None]
     A, B = traj.matrices_at(nodes.ravel())
     nx, nu = B.shape[1:]
-    F = np.zeros((len(h), 2, nx + nu, nx + nu))
-    F[..., :nx, :nx], F[..., :nx, nx:] = (
-        x.reshape(len(h), 2, *x.shape[1:]) for x in (A, B)
-    )
+    F = np.zeros((len(length), 2, nx + nu, nx + nu))
+    F[..., :nx, :nx] = A.reshape(len(length), 2, nx, nx)
+    F[..., :nx, nx:] = B.reshape(len(length), 2, nx, nu)
     mixed = (HEAVY * F + LIGHT * F[:, ::-1]).reshape(-1, nx + nu, nx + nu)
-    h = np.repeat(0.5 * h, 2)
+    h = np.repeat(0.5 * length, 2)
     heavy_light = np.stack((nodes, nodes[:, ::-1]), axis=2).reshape(-1, 2)
-    maps = np.concatenate(
-        held_exponential(mixed[:, :nx, :nx], mixed[:, :nx, nx:], h), axis=-1
-    )
-    ends = np.cumsum([2 * len(times) for times in start])[:-1]
-    _change_coordinates(traj, np.concatenate([t[1:] for t in cuts]), maps, 2 * parts)
+    transition, held = held_exponential(mixed[:, :nx, :nx], mixed[:, :nx, nx:], h)
+    maps = np.concatenate((transition, held), axis=-1)
+    interval_ends = np.concatenate([times[1:] for times in cuts])
+    _change_coordinates(traj, interval_ends, maps, 2 * parts)
+    ends = np.cumsum([2 * len(start) for start in starts])[:-1]
     columns = [np.split(array, ends) for array in (mixed, h, maps, heavy_light)]
     samples = list[tuple[Steps, Array]]()
     for row in zip(*columns, strict=True):

@@ -215,7 +215,7 @@ class LinearModel(ModelHeader, StateSpace):
     x0, u0, y0 : ndarray (nx,), (nu,), (ny,)
         State, input and output at the operating point.
     dt : float
-        Sampling time [s]; 0 for continuous time.
+        Sample time [s]; 0 for continuous time.
     state_names, input_names, output_names : tuple of str
         Names of states, inputs and outputs.
     state_units, input_units, output_units : tuple of str
@@ -640,7 +640,7 @@ class LinearModel(ModelHeader, StateSpace):
         :math:`A_d = E + A h` and :math:`B_d = B h + A B h^2/2`, with the identity E; see (2.2) of
         docs/derivation.md.
 
-        A and B are those at the operating point over the whole sample. If this point moves, as a
+        A and B of the operating point are used over the whole sample. If this point moves, as a
         joint that turns, they change meanwhile, so the result has an error that grows with the
         square of `dt` (1 % of A at 20 ms and 2 rad/s). For a motion, use
         `LinearTrajectory.discretize`.
@@ -656,7 +656,7 @@ class LinearModel(ModelHeader, StateSpace):
         Parameters
         ----------
         dt : float
-            Sampling time h [s], positive.
+            Sample time h [s], positive.
         delay : float or mapping, optional
             Delay [s] from a sample to the time from which its command acts: one for all inputs, or
             {name, group or pattern: delay} with names of inputs. The delay may be any fraction or
@@ -665,7 +665,7 @@ class LinearModel(ModelHeader, StateSpace):
         Returns
         -------
         LinearModel
-            Discrete-time model with sampling time ``dt``. Its `certificate` is the certificate of
+            Discrete-time model with sample time ``dt``. Its `certificate` is the certificate of
             the continuous-time model. Its `added` states are the commands on their way.
 
         Raises
@@ -753,7 +753,7 @@ class LinearModel(ModelHeader, StateSpace):
     def save(self, path: str | Path) -> None:
         """Write the model and its certificate to a file, atomically.
 
-        The file does not contain the sampling times and delays of outputs. If an output has them,
+        The file does not contain the sample times and delays of outputs. If an output has them,
         an `FflinWarning` is given, because `kalman` then designs for other sensors.
 
         Parameters
@@ -775,7 +775,7 @@ class LinearModel(ModelHeader, StateSpace):
         outputs = () if self._robot is None else self._robot.outputs
         if any(item.sample is not None or item.delay for item in outputs):
             warnings.warn(
-                "the file does not contain the sampling times and delays of the outputs, so kalman "
+                "the file does not contain the sample times and delays of the outputs, so kalman "
                 "of the loaded model assumes that each sample measures all outputs at once",
                 FflinWarning,
                 stacklevel=2,

@@ -96,26 +96,35 @@ class Nonlinear:
         near = Nonlinear(self._aba, lin, state)
         # The first row is the operating point. In each other row, one component of the base
         # velocity is increased by 1.
-        x = np.tile(lin.x0, (7, 1))
+        count = 7
+        x = np.tile(lin.x0, (count, 1))
         x[:, state.groups.r_b] = 0.0
         x[1:, 6 + robot.n : 12 + robot.n] += np.eye(6)
-        point = np.hstack((x, np.tile(lin.u0, (7, 1))))
-        (chart, q, v, a), expected = near.accelerations(point), near.rates(point)
+        point = np.hstack((x, np.tile(lin.u0, (count, 1))))
+        chart, q, v, a = near.accelerations(point)
+        expected = near.rates(point)
         # Evaluate each motion at the times t = +-h, +-2 h and +-3 h.
-        h = float(1e-2 * np.min(chart.q0) / (1.0 + np.abs(v[:, 3:]).max()))
-        t = h * np.repeat((1.0, 2.0, 3.0, -1.0, -2.0, -3.0), 7)[:, None]
-        speeds = np.tile(v, (6, 1))
-        moved = integrate_rows(robot.model, np.tile(q, (6, 1)), t * speeds)
-        after = state_history(state, moved, speeds + t * np.tile(a, (6, 1)), x[0])
+        fastest = np.abs(v[:, 3:]).max()
+        h = float(1e-2 * np.min(chart.q0) / (1.0 + fastest))
+        times = (1.0, 2.0, 3.0, -1.0, -2.0, -3.0)
+        t = h * np.repeat(times, count)[:, None]
+        copies = (len(times), 1)
+        speeds = np.tile(v, copies)
+        moved_q = integrate_rows(robot.model, np.tile(q, copies), t * speeds)
+        moved_v = speeds + t * np.tile(a, copies)
+        after = state_history(state, moved_q, moved_v, x[0])
         # The rates of a moving reference cancel in the errors, but not their rounding errors.
-        rounding = ULPS * EPS * np.abs(after).reshape(6, *x.shape).max(axis=0) / h
+        largest = np.abs(after).reshape(len(times), *x.shape).max(axis=0)
+        rounding = ULPS * EPS * largest / h
         if lin.moving:  # the first row is also the motion of the reference
-            after = moving_errors("local", after, np.repeat(after[::7], 7, axis=0))
+            reference_motion = np.repeat(after[::count], count, axis=0)
+            after = moving_errors("local", after, reference_motion)
         ahead, behind = after.reshape(2, 3, *x.shape)
         rates = np.tensordot(_WEIGHTS, ahead - behind, axes=1) / h
         size = np.maximum(1.0 + np.abs(v).max(axis=1), np.abs(expected).max(axis=1))
         scale = np.maximum(size[:, None], rounding / DIFFERENCE_TOLERANCE)
-        return float((np.abs(expected - rates) / scale).max())
+        errors = np.abs(expected - rates) / scale
+        return float(errors.max())
 
 
 # (ratio, sign) of each repetition of the differences of `jacobians`: the steps are divided by the
@@ -135,10 +144,9 @@ def jacobians(
 ) -> tuple[Array, list[Array]]:
     """Return the Jacobian of f at a point by central differences, and repetitions of it.
 
-    The repetitions have smaller steps than the given ones. Their curved variables, if there are
-    any, differ by a negligible fraction of the steps, so that their rounding errors are
-    independent. The differences between the Jacobians show the truncation error and the rounding
-    error of the first one.
+    The repetitions have smaller steps than `steps`. They displace the curved variables by a
+    negligible fraction of the steps, so that their rounding errors are independent. The differences
+    between the Jacobians show the truncation error and the rounding error of the first one.
     """
     again = []
     for ratio, sign in _REPETITIONS:
@@ -155,11 +163,16 @@ def jacobian(
     f maps rows of points to rows of values. The mask `is_curved` selects the variables for which
     sixth-order differences are used. For all other variables, second-order differences are used.
     """
-    curved, straight = np.diag(steps)[is_curved], np.diag(steps)[~is_curved]
+    offset_rows = np.diag(steps)
+    curved = offset_rows[is_curved]
+    straight = offset_rows[~is_curved]
     offsets = np.concatenate((curved, 2.0 * curved, 3.0 * curved, straight))
-    first, last = np.split(f(np.concatenate((point + offsets, point - offsets))), 2)
-    *near, rest = np.split(first - last, len(curved) * np.arange(1, 4))
-    derivatives: Array = np.empty((rest.shape[1], len(point)))
-    derivatives[:, is_curved] = np.tensordot(_WEIGHTS, near, axes=1).T
-    derivatives[:, ~is_curved] = 0.5 * rest.T
-    return derivatives / steps
+    values = f(np.concatenate((point + offsets, point - offsets)))
+    ahead, behind = np.split(values, 2)
+    *near_to_far, rest = np.split(ahead - behind, len(curved) * np.arange(1, 4))
+    sixth_order = np.tensordot(_WEIGHTS, near_to_far, axes=1)
+    second_order = 0.5 * rest
+    differences: Array = np.empty((values.shape[1], len(point)))
+    differences[:, is_curved] = sixth_order.T
+    differences[:, ~is_curved] = second_order.T
+    return differences / steps

@@ -100,7 +100,8 @@ def _valid(before: Motions, at: Motions, picked: Indices) -> bool:
     """Return whether coordinates determine the motion at two neighbouring knots and between."""
     if min(before.least(picked), at.least(picked)) < _WEAK:
         return False
-    # Where the coordinates stop, their basis becomes infinite and changes its orientation.
+    # At a point where the coordinates become dependent, their basis becomes infinite, and behind
+    # the point it has the opposite orientation.
     bases = [x.rates @ np.linalg.inv(x.rates[picked]) for x in (before, at)]
     return bool(np.linalg.slogdet(bases[0].T @ bases[1])[0] > 0.0)
 

@@ -75,7 +75,7 @@ TOOLS = {
 }
 
 
-# Tools whose matrices can be those of one time step of the semi-implicit Euler method (15.6).
+# Tools whose matrices can describe one time step of the semi-implicit Euler method (15.6).
 STEPPING = ("mujoco", "crocoddyl")
 
 

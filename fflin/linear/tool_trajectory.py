@@ -47,7 +47,7 @@ class ToolTrajectory(Design):
     T_u : ndarray (nu, nu)
         Matrix from the inputs of the `LinearTrajectory` to the inputs of the tool.
     dt : float
-        Sampling time or time step [s]; 0 in continuous time.
+        Sample time or time step [s]; 0 in continuous time.
     state_names, input_names : tuple of str
 
     Examples
@@ -92,7 +92,7 @@ class ToolSchedule(Design):
     q, v, u : ndarray (M, nq), (M, nv), (M, nu)
         The trajectory at these times, in the tool's coordinates.
     dt : float
-        Sampling time [s]; 0 in continuous time.
+        Sample time [s]; 0 in continuous time.
     state_names, input_names : tuple of str
 
     Examples

@@ -393,7 +393,7 @@ class Trajectory(Design):
         return u + fraction * (self.u[k + 1] - u)
 
     def _smooth_input(self, k: int | Indices, fraction: float | Array) -> Array:
-        """Return the inputs by periodic cubic splines; the arguments are those of `_input`."""
+        """Return the inputs by periodic cubic splines; see `_input` for the arguments."""
         start = self.t[k]
         times = start + np.reshape(fraction, np.shape(start)) * (self.t[k + 1] - start)
         u: Array = self._splines(times)
@@ -514,7 +514,7 @@ class Trajectory(Design):
     def to_pandas(self) -> DataFrame:
         """Return t, q, v and u as a pandas data frame, with the times as its index.
 
-        The columns are those of the .csv file that `save` writes.
+        The columns are the columns of the .csv file that `save` writes.
 
         Raises
         ------

@@ -97,7 +97,7 @@ def _checked(
         if check is not None:
             checked[name] = check(value, robot)
     # A given table replaces the old table. If `merged` is true, the old entries of all joints
-    # that the new table does not name stay. Otherwise, only those of modes stay.
+    # that the new table does not name stay. Otherwise, only the entries of modes stay.
     modes = {joint.name for joint in robot.modes}
     for name in _MERGED_TABLES if merged else _TABLES_OF_JOINTS:
         if name not in checked:
@@ -199,7 +199,7 @@ def equipped(
     tables = {}
     if gone:
         kept = [f"{group}.{name}" for group in _GROUPS for name in names]
-        # A wheel that is no joint any more is still an input, with its limits.
+        # A wheel that is no longer a joint is still an input, with its limits.
         kept += [
             f"{x.GROUP}.{name}"
             for x, entries in named_inputs(checked)

@@ -81,6 +81,11 @@ class Input:
         """Names of the model's frames on which this input is mounted."""
         return ()
 
+    @property
+    def actuator(self) -> str:
+        """Properties of the actuator that are given, such as "on-off, lag 0.05 s"."""
+        return f"lag {self.lag:g} s" if self.lag else ""
+
 
 class BaseTorque(Input):
     """Torque tau_b (3,) [N m] on the base, in the axes that `frame` of `linearize` selects.
@@ -221,6 +226,18 @@ class Thruster(Input):
     def frames(self) -> tuple[str, ...]:
         """Name of the frame on which the thruster is mounted."""
         return (self.frame,)
+
+    @property
+    def actuator(self) -> str:
+        """Pulses, specific impulse and lag of the thruster, if they are given."""
+        parts = ["on-off"] if self.on_off else []
+        if self.least_impulse is not None:
+            parts.append(f"least impulse {self.least_impulse:g} N s")
+        if self.isp is not None:
+            parts.append(f"isp {self.isp:g} s")
+        if self.lag:
+            parts.append(f"lag {self.lag:g} s")
+        return ", ".join(parts)
 
     @property
     def wrench(self) -> Array:

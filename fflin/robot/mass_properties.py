@@ -159,20 +159,22 @@ def _stretched(
     """
     # Some files contain physically impossible bodies, which have a negative second moment. Scale
     # such a body equally along all axes, so that the signs of its principal moments do not change.
-    least = np.linalg.eigvalsh(0.5 * np.trace(body.inertia) * np.eye(3) - body.inertia)[
-        0
-    ]
-    if least < -_NO_MOMENT * 0.5 * np.trace(body.inertia):
+    half_trace = 0.5 * np.trace(body.inertia)
+    second_moments = half_trace * np.eye(3) - body.inertia
+    least = np.linalg.eigvalsh(second_moments)[0]
+    if least < -_NO_MOMENT * half_trace:
         inertia = inertia[:, :1] * np.ones(3)
     # If the affine map T is applied to the mass distribution, P becomes T P T^T. This matrix is
     # positive semidefinite if P is. Here, T stretches the body about its centre of mass, and then
     # shifts it.
     T = np.zeros((len(com), 4, 4))
-    T[:, :3, :3] = (axes * np.sqrt(1.0 + inertia)[:, None]) @ axes.T
-    T[:, :3, 3] = body.lever + row_products(com, axes.T) - T[:, :3, :3] @ body.lever
+    stretch = (axes * np.sqrt(1.0 + inertia)[:, None]) @ axes.T
+    T[:, :3, :3] = stretch
+    T[:, :3, 3] = body.lever + row_products(com, axes.T) - stretch @ body.lever
     T[:, 3, 3] = 1.0
     P: Array = body.toPseudoInertia().toMatrix()
-    return (1.0 + density)[:, None, None] * (T @ P @ T.swapaxes(1, 2))
+    factor = (1.0 + density)[:, None, None]
+    return factor * (T @ P @ T.swapaxes(1, 2))
 
 
 def properties(P: Array) -> tuple[Array, Array, Array]:

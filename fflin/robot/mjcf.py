@@ -151,7 +151,7 @@ def _with_includes(document: bytes, path: Path) -> bytes:
 
 
 def _built(document: bytes, root: Element, path: Path, *, read: bool) -> pin.Model:
-    """Return Pinocchio's model of the document, which is the content of the file if `read`.
+    """Return Pinocchio's model of the document, which is the content of the file if `read` is true.
 
     Pinocchio reads only the first body of <worldbody>. Several bodies are put into one body.
     """

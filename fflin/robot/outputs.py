@@ -408,8 +408,8 @@ FORCES = {
 class ConstraintForce(Output):
     """Output of the force and torque that a constraint exerts on its `frame`, at its origin.
 
-    The opposite wrench acts on the frame `to`. The axes are fixed to `to`, and are those of `frame`
-    at its `placement`.
+    The opposite wrench acts on the frame `to`. The axes are fixed to `to`, and are parallel to
+    the axes of `frame` at its `placement`.
 
     - Force (3,) [N].
     - Torque (3,) [N m]. The torque of a `Spherical` is zero, and so is the torque of a `Hinge`

@@ -168,12 +168,7 @@ def _settings(robot: Robot) -> list[str]:
             name: [term.text(name, orbit=robot.orbit is not None) for term in terms]
             for name, terms in robot.disturbance.items()
         },
-        "lags of inputs [s]": {
-            name: item.lag
-            for item, names in robot.named_inputs
-            if item.lag
-            for name in names
-        },
+        **_actuators(robot),
         "outputs": outputs if outputs != ["state"] else (),
         "limits": {
             key: f"{low:g} to {high:g}" for key, (low, high) in robot.limits.items()
@@ -188,6 +183,16 @@ def _settings(robot: Robot) -> list[str]:
         f"{x.title} on frame {x.frame}: modes {', '.join(x.modes)}"
         for x in robot.appendages
     ]
+
+
+def _actuators(robot: Robot) -> dict[str, tuple[str, ...]]:
+    """Return the properties of actuators, {properties: names of the inputs that have them}."""
+    names_of: dict[str, list[str]] = {}
+    for item, names in robot.named_inputs:
+        if item.actuator:
+            name = item.GROUP if len(names) > 1 else names[0]
+            names_of.setdefault(item.actuator, []).append(name)
+    return {f"inputs ({key})": tuple(names) for key, names in names_of.items()}
 
 
 def _as_text(value: object) -> str:

@@ -226,6 +226,7 @@ class Constrained:
             least=np.ones(1),
             at=np.zeros(nq),
             packed=np.zeros(len(tree.path)),
+            twist=np.zeros(6),
         )
 
     def _correction(self, q: Array, J: Array, error: Array) -> Correction:

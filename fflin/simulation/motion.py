@@ -449,7 +449,7 @@ class Motion(StatesAndInputs, Design):
     def to_pandas(self) -> DataFrame:
         """Return times, states and inputs as a pandas data frame, with the times as its index.
 
-        The columns are those of the .csv file that `save` writes.
+        The columns are the columns of the .csv file that `save` writes.
 
         Raises
         ------

@@ -613,7 +613,7 @@ def _with_delay_note(
 ) -> Times:
     """Return the times with a note on delays for which the law was not designed, if there are any.
 
-    `delays` [s] are those of all inputs or of each input.
+    `delays` [s] is one delay for all inputs, or one for each input.
     """
     if policy is None or policy.model is None:
         return times

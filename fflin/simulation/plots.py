@@ -104,7 +104,7 @@ def plot_motion(
         States and inputs to draw: names, groups or patterns such as ``q_m``, ``thrust``,
         ``*.hinge_*``. By default, all states and inputs are drawn.
     axes : matplotlib.axes.Axes, optional
-        Axes of a grid, as of ``pyplot.subplots``, in whose place the figure is drawn.
+        Axes of a grid, such as from ``pyplot.subplots``; the figure is drawn in their place.
 
     Returns
     -------

@@ -381,8 +381,8 @@ def _relative(
 ) -> PointingError:
     """Return the statistics of the errors minus the mean of their window.
 
-    The largest error is that of all windows. For the other statistics, windows are left out if they
-    have very many rows.
+    The largest error is the maximum over all windows. For the other statistics, windows are left
+    out if they have very many rows.
     """
     per_window = len(t) * window / (t[-1] - t[0])
     most = max(int(_ROWS / per_window), 2)

@@ -234,8 +234,8 @@ def saturated(
 ) -> tuple[Saturated, ...]:
     """Return the inputs and wheel speeds that reach a nonzero limit, longest saturation first.
 
-    The inputs in `pulsed` are thrusters that are off or on, so a pulse at the limit is no
-    saturation.
+    The inputs in `pulsed` are thrusters that are off or on, so a pulse at the limit does not
+    count as saturation.
     """
     held, full = np.diff(t, append=t[-1:]), list[Saturated]()
     for curve in signals:
@@ -692,44 +692,68 @@ def verdict(motion: Motion, kinds: list[ErrorSize]) -> str:
     if motion.stopped:
         return f"stopped: {motion.stopped}"
     places = [kind for kind in kinds if kind.title in _PLACES]
-    judged = _judged(kinds)
-    moved = [kind for kind in judged if kind.largest > THERE]
     aside = [kind.last for kind in places if kind.settled is None and not kind.steered]
-    if motion.tracked and not motion.phases:
-        text = f"tracking errors at the end: {_and([kind.last for kind in judged])}"
-    elif failed := [kind.last for kind in moved if kind.settled is None]:
-        text = f"not settled: {_and(failed)} off target"
-    elif moved:
-        when = max(kind.settled or 0.0 for kind in moved)
-        band = [
-            f"{SETTLED * factor * kind.largest:.2g}\u00a0{unit} ({kind.title})"
-            for kind in moved
-            for unit, factor in [kind.scale]
-        ]
-        text = f"settled after {when:.3g}\u00a0s to within {_and(band)} of the target"
-        if late := [
-            kind.last for kind in kinds if kind.settled is None and kind.steered
-        ]:
-            subject = "positions" if judged[0].title in _PLACES else "rates"
-            text = f"{subject} {text}; not yet settled: {_and(late)}"
-        for tail, trend in (("remains", "remaining"), ("grows", "drifting")):
-            if left := [kind.last for kind in moved if kind.tail == tail]:
-                text += f"; {trend}: {_and(left)}"
-    else:
-        text = "settled: "
-        if aside:
-            text += f"{_and([kind.title for kind in judged])} "
-        text += "at the target throughout the run"
+    text = _settling(motion, kinds, some_aside=bool(aside))
     if aside:
         text += f"; not controlled: {_and(aside)}"
-    shares: dict[str, float] = {}  # fraction of the run at the lower or upper limit
+    return f"{text}; saturated inputs: {_saturated_inputs(motion)}"
+
+
+def _settling(motion: Motion, kinds: list[ErrorSize], *, some_aside: bool) -> str:
+    """Return when the controlled errors of a motion settled, or which of them did not settle.
+
+    `some_aside` states whether other errors of the pose are not controlled.
+    """
+    judged = _judged(kinds)
+    if motion.tracked and not motion.phases:
+        return f"tracking errors at the end: {_and([kind.last for kind in judged])}"
+    moved = [kind for kind in judged if kind.largest > THERE]
+    failed = [kind.last for kind in moved if kind.settled is None]
+    if failed:
+        return f"not settled: {_and(failed)} off target"
+    if moved:
+        return _settled_after(kinds, judged, moved)
+    subject = ""
+    if some_aside:
+        subject = f"{_and([kind.title for kind in judged])} "
+    return f"settled: {subject}at the target throughout the run"
+
+
+def _settled_after(
+    kinds: list[ErrorSize], judged: list[ErrorSize], moved: list[ErrorSize]
+) -> str:
+    """Return the settling time of the errors in `moved`, their band, and what remains."""
+    when = max(kind.settled or 0.0 for kind in moved)
+    bands = []
+    for kind in moved:
+        unit, factor = kind.scale
+        size = SETTLED * factor * kind.largest
+        bands.append(f"{size:.2g}\u00a0{unit} ({kind.title})")
+    text = f"settled after {when:.3g}\u00a0s to within {_and(bands)} of the target"
+    late = [kind.last for kind in kinds if kind.settled is None and kind.steered]
+    if late:
+        subject = "positions" if judged[0].title in _PLACES else "rates"
+        text = f"{subject} {text}; not yet settled: {_and(late)}"
+    for tail, trend in (("remains", "remaining"), ("grows", "drifting")):
+        left = [kind.last for kind in moved if kind.tail == tail]
+        if left:
+            text += f"; {trend}: {_and(left)}"
+    return text
+
+
+def _saturated_inputs(motion: Motion) -> str:
+    """Return the saturated inputs, each with the percentage of the run at a limit, or "none"."""
+    fractions: dict[str, float] = {}
     for item in motion.saturated:
-        shares[item.name] = shares.get(item.name, 0.0) + item.share
-    full = [f"{name}\u00a0({_percent(share)}\u00a0%)" for name, share in shares.items()]
-    listed = full[:_NAMED]
-    if len(full) > _NAMED:
-        listed.append(f"{len(full) - _NAMED} more")
-    return f"{text}; saturated inputs: {', '.join(listed) or 'none'}"
+        fractions[item.name] = fractions.get(item.name, 0.0) + item.share
+    texts = [
+        f"{name}\u00a0({_percent(fraction)}\u00a0%)"
+        for name, fraction in fractions.items()
+    ]
+    shown = texts[:_NAMED]
+    if len(texts) > _NAMED:
+        shown.append(f"{len(texts) - _NAMED} more")
+    return ", ".join(shown) or "none"
 
 
 # {unit of an error: unit and factor in the heading of a page}
@@ -742,6 +766,17 @@ def _in_deg_mm(kind: ErrorSize) -> str:
     return f"{kind.title} {factor * kind.final:.2g} {unit}"
 
 
+def _initial_to_final(kind: ErrorSize) -> str:
+    """Return the title of an error, and its initial and final value; negligible values are 0."""
+    unit, factor = _PAGE_UNITS.get(kind.unit, (kind.unit, 1.0))
+    negligible = max(_GONE * kind.largest, THERE)
+    ends = []
+    for size in (kind.initial, kind.final):
+        shown = f"{factor * size:.3g}" if size > negligible else "0"
+        ends.append(f"{shown} {unit}")
+    return f"{kind.title} {ends[0]} to {ends[1]}"
+
+
 def headline(motion: Motion) -> str:
     """Return a line for the page of a motion: what moves the robot, and how the motion ends."""
     parts = [motion._about] if motion._about else []
@@ -750,15 +785,7 @@ def headline(motion: Motion) -> str:
     kinds = [kind for kind in error_sizes(motion) if kind.title in _PLACES]
     judged = [kind for kind in kinds if kind.steered and kind.largest > THERE]
     if judged and not motion.tracked:
-        first = judged[0]
-        unit, factor = _PAGE_UNITS.get(first.unit, (first.unit, 1.0))
-        ends = [
-            f"{factor * size:.3g} {unit}"
-            if size > max(_GONE * first.largest, THERE)
-            else f"0 {unit}"
-            for size in (first.initial, first.final)
-        ]
-        parts.append(f"{first.title} {ends[0]} to {ends[1]}")
+        parts.append(_initial_to_final(judged[0]))
     if motion.stopped:
         parts.append(f"stopped: {motion.stopped}")
     elif motion.tracked and judged:

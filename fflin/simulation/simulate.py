@@ -135,7 +135,7 @@ def simulate(
         Whether the projection after each step restores momentum and centre of mass.
     sample : float, optional
         Sample time [s] of the policy, a multiple of dt; u is held between samples. The default is
-        the sampling time of the policy's model. If this model is in continuous time, the policy is
+        the sample time of the policy's model. If this model is in continuous time, the policy is
         evaluated at every stage of every integration step.
     delay : float or mapping, optional
         Time [s] from a sample until its command takes effect, a multiple of dt: one for all inputs,
@@ -272,7 +272,7 @@ def simulate(
             seed=seed,
         )
     )
-    foresees = predictor(plan)
+    predicting = predictor(plan)
     compiled = engine_of(engine, plan) == "compiled"
     hint = ""
     if not compiled and not not_compilable(plan):
@@ -291,7 +291,7 @@ def simulate(
                 _FRACTION * spent,
                 once,
             )
-        return motion_of(plan, run, foresees)
+        return motion_of(plan, run, predicting)
     except MemoryError:
         raise InputError(
             f"{plan.times.rows} rows of '{robot.name}' exceed the available memory; use a larger "
@@ -328,8 +328,10 @@ def is_detumbling(policy: object) -> bool:
     return isinstance(law, BDot | RateDamping)
 
 
-def motion_of(plan: Plan, run: Recording, foresees: Predictor | None = None) -> Motion:
-    """Build the motion from the recorded rows of a run; `foresees` computes the prediction."""
+def motion_of(
+    plan: Plan, run: Recording, predicting: Predictor | None = None
+) -> Motion:
+    """Build the motion from the recorded rows of a run; `predicting` computes the prediction."""
     plant, state, robot = plan.plant, plan.plant.state, plan.plant.robot
     if plant.field and not run.stopped:
         plant.field.require_near(run.q[np.linalg.norm(run.q[:, :3], axis=1).argmax()])
@@ -345,8 +347,8 @@ def motion_of(plan: Plan, run: Recording, foresees: Predictor | None = None) -> 
     # Beyond 180 deg from the reference, q_b jumps to the shorter rotation. A linear model does not
     # predict this jump.
     prediction = x[:0]
-    if foresees is not None and beyond is None:
-        prediction = predict(plan, foresees, x, run.steps)
+    if predicting is not None and beyond is None:
+        prediction = predict(plan, predicting, x, run.steps)
     energy, momentum, center, kept, scale = Conserved(plan).histories(
         run.t, run.q, run.v
     )
@@ -406,7 +408,7 @@ def motion_of(plan: Plan, run: Recording, foresees: Predictor | None = None) -> 
             *plan.times.notes,
             *_energy_note(plan, run, energy, float(scale[0])),
             *dict.fromkeys(notes),
-            *half_turn_notes(plan, beyond, predicted=foresees is not None),
+            *half_turn_notes(plan, beyond, predicted=predicting is not None),
         ),
         limit_names=tuple(limits),
         limits=np.array(list(limits.values())).reshape(-1, 2),
@@ -560,18 +562,20 @@ def _with_lags_of(plan: Plan, lin: LinearModel) -> LinearModel:
 
 # A prediction that overflows is omitted, so NumPy's warnings are suppressed.
 @np.errstate(over="ignore", invalid="ignore")
-def predict(plan: Plan, foresees: Predictor, x: Array, steps: int) -> Array:
+def predict(plan: Plan, predicting: Predictor, x: Array, steps: int) -> Array:
     """Return the states (N, nx) that the linear closed loop predicts.
 
     Return no rows if the model cannot predict a motion, or if the prediction is not finite.
     """
-    lin, (dt, _, every, sample, *_) = foresees[0].generator, plan.times
+    model, law = predicting
+    lin = model.generator
+    times = plan.times
+    dt, every, sample = times.dt, times.every, times.sample
     if lin is None:  # a discrete-time model without its continuous-time model
         return x[:0]
     x0, u0 = lin.x0, lin.u0
     # Indices in x of the wheel speeds that have limits.
     wheel_rows = plan.plant.state.nx // 2 + plan.limits.wheels.row
-    law = foresees[1]
     correct = law.correct if isinstance(law, PredictedLaw) else None
     applied = plan.applied(law, lambda e: (x0 + e)[wheel_rows], correct)
     rows: list[Array] = []

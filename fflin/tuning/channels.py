@@ -117,7 +117,7 @@ def _sized(given: Sized) -> dict[str, float]:
 
 
 def _expanded(sizes: dict[str, float], signals: Signals) -> dict[str, float]:
-    """Replace groups of inputs such as wheel by the names of the inputs."""
+    """Replace groups of inputs, such as "wheel", by the names of the inputs."""
     members = {
         name: size for key, size in sizes.items() for name in signals.expanded(key)
     }
@@ -218,7 +218,7 @@ def channel_of(goal: Goal, ends: Ends, plant: Plant) -> Channel:
 
 
 def _held_noise(channel: Channel) -> Channel:
-    """Return a channel whose white noise is that of the samples of a sampled model.
+    """Return a channel whose white noise equals the noise of the samples of a sampled model.
 
     The noise passes a lag sqrt(T) / (1 + s T/2) for the sample time T. The variance of the
     continuous output is then the variance of the samples.

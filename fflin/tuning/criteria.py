@@ -272,7 +272,7 @@ def _gain_piece(
 
 
 def _continuous(loop: ClosedLoop) -> tuple[Values, Values]:
-    """Return the poles in the time of the model, and their derivatives by those of the plant."""
+    """Return the poles in the time of the model, and their derivatives by the plant's poles."""
     poles = loop.poles
     dt = loop.plant.dt
     if not dt:
@@ -300,7 +300,7 @@ def _decay(goal: Decay, loop: ClosedLoop) -> list[Piece]:
 
 
 def _damping(goal: Damping, loop: ClosedLoop) -> list[Piece]:
-    """Return the required damping ratio divided by those of the least damped poles."""
+    """Return the required damping ratio divided by the ratios of the least damped poles."""
     poles, rates = _continuous(loop)
     sizes = np.abs(poles)
     values = goal.ratio * sizes / np.maximum(-poles.real, 1e-300)

@@ -9,25 +9,19 @@ import numpy as np
 
 from fflin.base.errors import InputError
 from fflin.control.lags import (
-    NO_LAGS,
     Lags,
+    lags_of_its_robot,
     lags_of_model,
-    lags_of_robot,
     model_of_loop,
 )
 from fflin.control.sensors import sensors_of_model, timing_of
-from fflin.dynamics.state import StateMap
 from fflin.linear.model import LinearModel, refuse_frozen
 from fflin.tuning.law import Matrices
 
 
 def acting_lags(lin: LinearModel) -> Lags:
     """Return the lags of the robot of a model, which act in a loop that measures its outputs."""
-    robot = lin._robot
-    if robot is None:
-        return NO_LAGS
-    state = StateMap(robot, reference=lin.reference, frame=lin.frame)
-    return lags_of_robot(robot, state, outputs=True)
+    return lags_of_its_robot(lin, outputs=True)
 
 
 def with_robot_lags(lin: LinearModel) -> LinearModel:

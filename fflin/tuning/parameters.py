@@ -33,7 +33,7 @@ class Tunable:
         Value from which the first search starts, in the unit of the parameter. By default, the
         structure chooses it for the plant.
     least, largest : float, optional
-        Bounds. By default, those of the structure, such as positive values for a frequency.
+        Bounds. By default, the bounds of the structure, such as positive values for a frequency.
     name : str, optional
         Name in the report. By default, the structure names the parameter.
 

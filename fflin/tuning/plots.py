@@ -40,7 +40,7 @@ def plot_tuned(
     path : str or Path, optional
         File to write, .png, .pdf or .svg. See `plot_motion` for possible errors.
     axes : matplotlib.axes.Axes, optional
-        Axes of a grid, as of ``pyplot.subplots``, in whose place the figure is drawn.
+        Axes of a grid, such as from ``pyplot.subplots``; the figure is drawn in their place.
 
     Returns
     -------

@@ -19,9 +19,9 @@ _NEGLIGIBLE = 1e-12
 def truncations(law: System, loop: System) -> list[System]:
     """Return the controllers of all lower orders, the lowest first.
 
-    The last states of the stable closed loop `loop` are those of the controller. Its Gramians in
-    the loop are balanced, so that the states that affect the outputs of the loop least are left out
-    first. The controller itself may be unstable.
+    The last states of the stable closed loop `loop` are the states of the controller. Its Gramians
+    in the loop are balanced, so that the states that affect the outputs of the loop least are left
+    out first. The controller itself may be unstable.
     """
     from scipy.linalg import solve_continuous_lyapunov
 

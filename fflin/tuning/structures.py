@@ -614,7 +614,7 @@ class PD(PID):
 
     .. math:: u = -\left(k_p + \frac{k_d\, s}{1 + \mathrm{lag}\, s}\right) y
 
-    The parameters are those of `PID`, without ki.
+    The parameters are the parameters of `PID` without ki.
 
     Raises
     ------

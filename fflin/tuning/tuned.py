@@ -44,7 +44,7 @@ class GoalValue:
     parameters : mapping
         Uncertain parameters at which the value occurs; empty for the nominal model.
     active : bool
-        Whether this goal limits the others: its value is the largest, or that of a hard goal that
+        Whether this goal limits the others: its value is the largest, or it is a hard goal that
         just holds.
     least : float
         Least value of all linear controllers for the nominal model, from `hinf`, within 1 %. NaN if

@@ -39,7 +39,7 @@ def second_value(
     """Return the value of a goal by a second method; None for goals of poles.
 
     Gains follow from eigenvalues of Hamiltonian matrices, instead of a search over frequencies.
-    Margins are those of the best scaling at each frequency. Variances follow from the Gramian of
+    Margins use the best scaling at each frequency. Variances follow from the Gramian of
     observability, and step responses from matrix exponentials.
     """
     if ends is None or channel is None:

@@ -209,8 +209,8 @@ class ModelDerivatives:
         """Return the matrix [dC, dD, dy0] of each parameter (P, ny, ..), by (12.2a).
 
         Row i of `rates` contains the derivatives of the accelerations with respect to parameter i.
-        Only outputs that depend on masses or accelerations have nonzero rows. The columns of C are
-        those of all states of the robot.
+        Only outputs that depend on masses or accelerations have nonzero rows. The columns of C
+        belong to all states of the robot.
         """
         lin = self.lin
         nv, x0 = len(self._nu), np.zeros(self._state.nx)

@@ -5,7 +5,7 @@ constraint forces lam by
 
     M da + F = J^T dlam,   J da = 0,
 
-see (18.2) of docs/derivation.md. The forces lam are those of the independent rows of J.
+see (18.2) of docs/derivation.md. The forces lam belong to the independent rows of J.
 """
 
 from __future__ import annotations

@@ -143,7 +143,7 @@ class LFT(Design):
 
     @property
     def dt(self) -> float:
-        """Sampling time, which is 0 because the model is in continuous time."""
+        """Sample time, which is 0 because the model is in continuous time."""
         return 0.0
 
     def at(

@@ -290,37 +290,40 @@ def _of_joints(robot: Robot) -> Iterator[Parameter]:
         )
 
 
+def _of_thruster(
+    robot: Robot, thruster: Thruster, name: str, index: int
+) -> Iterator[Parameter]:
+    """Yield the parameters of a thruster, which is the input with the given name and index."""
+    joint, placement = find_frame(robot.model, thruster.frame)
+    position, direction = np.array(thruster.position), np.array(thruster.direction)
+
+    def parameter(part: str, unit: str, value: float, wrench: Array) -> Parameter:
+        """Return a parameter whose derivative of the wrench is `wrench` (6,) in the frame."""
+        in_joint = np.array(placement.act(pin.Force(wrench)).vector)
+        made = Parameter(name, part, unit, value)
+        return replace(made, wrench=(joint, index, in_joint))
+
+    for letter, d in zip(AXES, np.eye(3), strict=True):
+        moved = np.concatenate((np.zeros(3), np.cross(d, direction)))
+        yield parameter(f"position.{letter}", "m", float(position @ d), moved)
+        # The sum of the direction and a small vector along d is normalised. So only the component
+        # of d that is perpendicular to the direction has an effect.
+        across = d - direction * (direction @ d)
+        torque = np.cross(position, across) + thruster.torque * across
+        tilted = np.concatenate((across, torque))
+        yield parameter(f"direction.{letter}", "1", float(direction @ d), tilted)
+    if thruster.torque:
+        reaction = np.concatenate((np.zeros(3), direction))
+        yield parameter("torque", "m", thruster.torque, reaction)
+
+
 def _of_inputs(robot: Robot) -> Iterator[Parameter]:
     at = 0
     for item, names in robot.named_inputs:
         first = at
         at = at + len(names)
         if isinstance(item, Thruster):
-            joint, placement = find_frame(robot.model, item.frame)
-            where, along = np.array(item.position), np.array(item.direction)
-            for letter, d in zip(AXES, np.eye(3), strict=True):
-                # The sum of the direction and a small vector along d is normalised. So only the
-                # component of d that is perpendicular to the direction has an effect.
-                turned = d - along * (along @ d)
-                moved = np.concatenate((np.zeros(3), np.cross(d, along)))
-                tilted = np.concatenate(
-                    (turned, np.cross(where, turned) + item.torque * turned)
-                )
-                changes = (
-                    ("position", "m", where, moved),
-                    ("direction", "1", along, tilted),
-                )
-                for part, unit, at_joint, wrench in changes:
-                    in_joint = np.array(placement.act(pin.Force(wrench)).vector)
-                    made = Parameter(
-                        names[0], f"{part}.{letter}", unit, float(at_joint @ d)
-                    )
-                    yield replace(made, wrench=(joint, first, in_joint))
-            if item.torque:
-                reaction = np.concatenate((np.zeros(3), along))
-                in_joint = np.array(placement.act(pin.Force(reaction)).vector)
-                made = Parameter(names[0], "torque", "m", item.torque)
-                yield replace(made, wrench=(joint, first, in_joint))
+            yield from _of_thruster(robot, item, names[0], first)
         if isinstance(item, ReactionWheel) and item.inertia:
             joint, axis = carrier(robot.model, item)
             wheel_joint = robot.model.getJointId(names[0])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import compress
 from typing import NamedTuple
 
 import numpy as np
@@ -46,7 +47,7 @@ class SampledLaw(NamedTuple):
 
     @property
     def system(self) -> System:
-        """The law at the first sample, which has the signals and the sampling time of all."""
+        """The law at the first sample, which has the signals and the sample time of all."""
         return self.systems[0]
 
     @property
@@ -96,15 +97,20 @@ def acting_part(
     that only this memory measures.
     """
     A, B, C, D, *_ = law
-    least = _ROUNDING * max(np.abs(C).max(initial=0.0), np.abs(D).max(initial=0.0))
-    kept: Mask = np.abs(C).max(axis=0, initial=0.0) > least
-    least = _ROUNDING * np.abs(A).max(initial=0.0)
-    while (acting := ~kept & (np.abs(A[kept]) > least).any(axis=0)).any():
-        kept |= acting
+    largest_gain = max(np.abs(C).max(initial=0.0), np.abs(D).max(initial=0.0))
+    kept: Mask = np.abs(C).max(axis=0, initial=0.0) > _ROUNDING * largest_gain
+    # Keep also the states on which kept states depend.
+    depends = np.abs(A) > _ROUNDING * np.abs(A).max(initial=0.0)
+    while True:
+        added = depends[kept].any(axis=0) & ~kept
+        if not added.any():
+            break
+        kept |= added
     part = law._replace(A=A[np.ix_(kept, kept)], B=B[kept], C=C[:, kept])
-    measured = np.any(B, axis=0) | np.any(D, axis=0)
-    used = np.any(part.B, axis=0) | np.any(D, axis=0)
-    idle = {name for name, x in zip(law.inputs, measured & ~used, strict=True) if x}
+    through = np.any(D, axis=0)
+    measured = np.any(B, axis=0) | through
+    used = np.any(part.B, axis=0) | through
+    idle = set(compress(law.inputs, measured & ~used))
     return part, tuple(name for name in regulated if name not in idle)
 
 
@@ -234,7 +240,8 @@ class SampledLoops:
 class PeriodicLoops(SampledLoops):
     """Closed loops of a law whose matrices repeat after N > 1 samples.
 
-    Gains are those of the system whose sample is one period, which has the signals of N samples.
+    Gains are computed for the system whose sample is one period, which has the signals of N
+    samples.
     """
 
     def _best_scale(self, row: Array) -> Array:
@@ -290,7 +297,7 @@ def measured_signals(lft: LFT, law: SampledLaw) -> Array:
     missing = [name for name in needed if name not in names]
     if missing or system.outputs != lft.input_names:
         raise InputError(
-            "the inputs and outputs of the law are not those of the robot; give the law of this "
+            "the law and the robot have different inputs and outputs; give the law of this "
             "robot"
         )
     if not law.outputs:

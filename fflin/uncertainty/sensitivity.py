@@ -373,7 +373,7 @@ def sensitivity(lin: LinearModel) -> Sensitivity:
     bodies. Therefore the equations of the linear model can be differentiated exactly. For example,
     the derivative of :math:`M^{-1}` with respect to a parameter p is
     :math:`(M^{-1})_p = -M^{-1} M_p M^{-1}`; see docs/derivation.md. If the robot has constraints,
-    the derivatives are those of the model in its independent states, at rest or in motion, and
+    the derivatives belong to the model in its independent states, at rest or in motion, and
     include the forces in the loops.
 
     Parameters

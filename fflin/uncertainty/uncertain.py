@@ -248,7 +248,7 @@ class Uncertain:
             outputs, they must depend on states only. For a sampled law, every robot is sampled
             exactly with the delays of the law's model. The loops contain the lags of the robot's
             inputs, and of the outputs that the law measures; if the robot has none, the lags of
-            the law's model. Sensors have the sampling times and delays of the law's model. The
+            the law's model. Sensors have the sample times and delays of the law's model. The
             search is then the same, but there is no guarantee for the robots that it does not try.
             For a `Gain`, only the states in
             `Gain.regulated`, and states that affect them, must be stable; for a policy, the states

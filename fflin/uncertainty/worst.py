@@ -95,8 +95,8 @@ class Worst(html.Reported):
     Attributes
     ----------
     damping : Found
-        Least damping ratio of a pole. The poles of a periodic law are those of one period, with the
-        smallest of their possible frequencies.
+        Least damping ratio of a pole. The poles of a periodic law are computed over one period,
+        with the smallest of their possible frequencies.
     margin : Found
         Least disk margin at the inputs; 0 if a loop is unstable. For policies and sampled gains, it
         has the best scaling of the inputs, as in `margins`. For a continuous `Gain`, the inputs are
@@ -105,7 +105,7 @@ class Worst(html.Reported):
         Largest gain over all frequencies from a disturbance at the inputs to the outputs. Outputs
         that depend on states which the gain does not regulate are excluded.
     unstable : int
-        Number of unstable loops among those tried.
+        Number of unstable loops among the loops tried.
     tried, excluded : int
         Number of loops tried, and of draws and corners excluded because they are not physically
         realisable.
@@ -113,8 +113,8 @@ class Worst(html.Reported):
         Factor by which all ranges may be scaled about their middles with the loop still stable. A
         value of 1 or more covers the whole set. It follows from an upper bound of the structured
         singular value over intervals of frequency, evaluated at five frequencies in each. NaN for a
-        sampled law, because the sampled model is no LFT: the worst loops are then those that the
-        search finds, without a guarantee.
+        sampled law, because the sampled model is not an LFT: the worst loops are then those that
+        the search finds, without a guarantee.
     """
 
     damping: Found
@@ -228,7 +228,7 @@ def _continuous_loops(
         if isinstance(gain, Policy):
             middle = loops.at_inputs(np.zeros(len(lft.repeats)), nu)
             scale = largest_scaled_gain(middle)[2]
-        # The inputs of the loop are those of the robot, and then the rates of the states of a
+        # The inputs of the loop are the inputs of the robot, and then the rates of the states of a
         # controller, which cannot be disturbed. `Channel` goes from the scaled inputs to the scaled
         # (S - T)/2, or to the outputs of the robot.
         no_rates = np.zeros(len(K) - nu)
@@ -268,7 +268,7 @@ def _sampled_loops(
 def _around(lft: LFT, gain: object) -> tuple[LFT, Array, Sequence[str]]:
     """Return the LFT with the states of a controller, K of u = -K x, and the judged states.
 
-    The inputs of the result are those of the robot, and then the rates of the controller's states.
+    The inputs of the result are the robot's inputs, and then the rates of the controller's states.
     """
     law = None
     if isinstance(gain, Compensator):
@@ -304,7 +304,7 @@ def _around(lft: LFT, gain: object) -> tuple[LFT, Array, Sequence[str]]:
     names = law.inputs, law.outputs
     if names != (signals, lft.input_names):
         raise InputError(
-            "the inputs and outputs of the law are not those of the robot; give the law of this "
+            "the law and the robot have different inputs and outputs; give the law of this "
             "robot"
         )
     regulated = gain.fed_back if isinstance(gain, Policy) else regulated_states(gain)

@@ -47,6 +47,11 @@ class Python:
             self.lin, fflin.PD("q_b", "tau_b"), fflin.Decay(rate=0.01), starts=1
         )
         self.lft = fflin.uncertain(self.robot, ranges).lft()
+        sensed = self.robot.replace(outputs=["base", "joints"])
+        sampled = fflin.linearize(sensed).discretize(0.1)
+        W = {"omega_b": 1e-3, "v_b": 1e-3, "qdot_m": 1e-3}
+        V = {"q_b": 1e-6, "r_b": 1e-6, "q_m": 1e-6}
+        self.compensator = fflin.lqg(fflin.lqr(sampled), fflin.kalman(sampled, W, V))
 
 
 # Of each command: what it is given, and pairs of a figure that it prints and that of Python.
@@ -113,6 +118,12 @@ CASES = {
         lambda x, py: [(x["P"], py.funnel.P), (x["tried"], py.funnel.tried)],
     ),
     "lqr": (ROBOT, lambda x, py: [(x["K"], py.gain.K), (x["P"], py.gain.P)]),
+    "lqg": (
+        f"{ROBOT} --output base --output joints --noise q_b=1e-3 --noise r_b=1e-3 "
+        "--noise q_m=1e-3 --process-noise omega_b=1e-3 --process-noise v_b=1e-3 "
+        "--process-noise qdot_m=1e-3 --sample 0.1",
+        lambda x, py: [(x["A"], py.compensator.A), (x["C"], py.compensator.C)],
+    ),
     "tvlqr": (
         f"{ROBOT} --trajectory plan.npz",
         lambda x, py: [(x["K"], py.schedule.K), (x["t"], py.schedule.t)],

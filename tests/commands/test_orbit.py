@@ -203,3 +203,24 @@ def test_errors_of_periodic_models():
     assert "differs from the field one period later" in short
     wrong = refused("tvlqr", SATELLITE, "--periodic", 8, "--sample", 60)
     assert "59.75766345816693" in wrong
+
+
+@pytest.mark.exhaustive
+def test_default_weights_of_a_periodic_regulator_are_those_of_python(tmp_path):
+    """No weights are in the file, so the limits of the magnetorquers set them in both."""
+    path = fflin.load(SATELLITE).urdf.with_name(f"{SATELLITE}.toml")
+    lines = path.read_text().splitlines()
+    kept = [line for line in lines if not line.startswith("weights")]
+    assert len(kept) < len(lines)
+    text = "\n".join(kept).replace("cubesat.urdf", "cubesat")
+    (tmp_path / "plain.toml").write_text(text)
+    design = ("--periodic", 8, "--sample", repr(PERIOD / 16))
+    code, _, err = run("tvlqr", "plain.toml", *design, "-o", "gains.npz", cwd=tmp_path)
+    assert code == 0, err
+    saved = fflin.GainSchedule.load(tmp_path / "gains.npz")
+    robot = fflin.load(SATELLITE).replace(weights={})
+    along = fflin.linearize_orbit(robot, steps=8)
+    schedule = fflin.tvlqr(along, Qf="periodic", sample=PERIOD / 16)
+    assert saved.weights == schedule.weights
+    assert "mean effect over one period" in schedule.weights
+    assert saved.K == pytest.approx(schedule.K, rel=1e-12)

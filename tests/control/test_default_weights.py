@@ -367,7 +367,7 @@ def test_a_sampled_model_gets_the_same_cost_and_keeps_its_margins(
     # Of a file it is not known what it was sampled from; the sum over samples is near the integral.
     loaded = fflin.lqr(fflin.LinearModel.load(tmp_path / "m.npz"))
     assert loaded.margins.disk > 0.6
-    if dt < 0.1 and "sampling time" not in sampled.weights:
+    if dt < 0.1 and "sample time" not in sampled.weights:
         assert sampled.weights == gain.weights
         assert loaded.K == pytest.approx(
             sampled.K, rel=0.1, abs=0.05 * np.abs(sampled.K).max()

@@ -582,7 +582,7 @@ def test_figures_of_data_sheets_are_converted():
     V = dict(zip(model.output_names, estimator.V.diagonal(), strict=True))
     # half of 10 arc seconds
     assert np.sqrt(V["q_b.y"]) == pytest.approx(10.0 / 3600.0 * DEGREE / 2.0)
-    # the angle after 1 h of samples, each of which counts for one sampling time
+    # the angle after 1 h of samples, each of which counts for one sample time
     samples = 3600.0 / SAMPLE
     angle = np.sqrt(samples * V["base.gyroscope.z"]) * SAMPLE
     assert angle == pytest.approx(0.3 * DEGREE)

@@ -421,12 +421,12 @@ def test_margins_of_laws_that_do_not_fit_are_refused():
     gain = fflin.lqr(lin)
     other = fflin.linearize(robot.replace(inputs=[fflin.BaseForce()]))
     with pytest.raises(
-        fflin.InputError, match="inputs of the law are not those of the model"
+        fflin.InputError, match="law and the model have different inputs"
     ):
         fflin.margins(gain, other)
     with pytest.raises(fflin.InputError, match="expected a linear law about a point"):
         fflin.margins(lambda t, q, v: np.zeros(3), lin)
-    with pytest.raises(fflin.InputError, match="have different sampling times"):
+    with pytest.raises(fflin.InputError, match="have different sample times"):
         fflin.margins(gain, lin.discretize(0.1), sample=0.2)
     with pytest.raises(fflin.InputError, match="delay is -1 s, expected at least 0"):
         fflin.margins(gain, lin, delay=-1.0)

@@ -1,4 +1,4 @@
-"""Filters and laws of outputs with their own sampling times and delays."""
+"""Filters and laws of outputs with their own sample times and delays."""
 
 from collections import deque
 
@@ -17,7 +17,7 @@ W = {"omega_b": 1e-12}
 
 
 def sensors(sample=0.25, delay=0.2):
-    """Return a star tracker with its own sampling time and delay, and a gyroscope."""
+    """Return a star tracker with its own sample time and delay, and a gyroscope."""
     return [
         fflin.StarTracker(
             sample=sample, delay=delay, noise={"noise_equivalent_angle": 10.0}
@@ -187,7 +187,7 @@ def test_continuous_designs_with_slow_sensors_are_refused():
     compensator = fflin.lqg(fflin.lqr(lin), fflin.kalman(lin, W))
     with pytest.raises(fflin.InputError, match="expected a Compensator"):
         fflin.OutputFeedback(lin, compensator)
-    with pytest.raises(fflin.InputError, match="another sampling time"):
+    with pytest.raises(fflin.InputError, match="another sample time"):
         fflin.MultirateFeedback(continuous.discretize(0.25), compensator)
 
 
@@ -414,9 +414,9 @@ def test_designs_for_other_sensors_are_refused(tmp_path):
     _, lin, compensator = designed()
     law = fflin.MultirateFeedback(lin, compensator)
     other, _ = satellite(sensors(sample=0.5))
-    with pytest.raises(fflin.InputError, match="other sampling times or delays"):
+    with pytest.raises(fflin.InputError, match="other sample times or delays"):
         law.bind(other)
-    with pytest.warns(fflin.FflinWarning, match="does not contain the sampling times"):
+    with pytest.warns(fflin.FflinWarning, match="does not contain the sample times"):
         lin.save(tmp_path / "model.npz")
 
 

@@ -10,7 +10,11 @@ from scipy.linalg import block_diag, expm
 import fflin
 from fflin.control.closed_loop import ClosedLoop
 from fflin.control.margins import laws_in_loop
-from fflin.control.optimal.periodic_loops import Harmonics, PeriodicLoop
+from fflin.control.optimal.periodic_loops import (
+    ChannelHarmonics,
+    Harmonics,
+    PeriodicLoop,
+)
 from fflin.control.periodic_closed_loop import PeriodicClosedLoop
 from tests.control.test_multirate import designed
 from tests.support.marks import exhaustive
@@ -274,3 +278,17 @@ def test_the_report_of_a_periodic_loop_states_that_it_has_no_phase_margin(loop):
     lin, policy = loop
     report = " ".join(str(fflin.margins(policy, lin)).split())
     assert "no channel has a phase margin" in report
+
+
+def test_the_difference_of_a_loop_with_a_factor_is_a_determinant():
+    """The eigenvalues of the responses give it for all factors, also at inserted angles."""
+    loop = random_loop(5, 4, 2)
+    channel = ChannelHarmonics(Harmonics(loop), 1)
+    angles = channel._angles
+    channel._refine(angles[1:] > 0.5 * angles[-1])
+    assert len(channel._angles) > len(angles)
+    one = loop.channel(1)
+    responses = Harmonics(one).at(channel._angles) - 0.5 * np.eye(4)
+    for factor in (0.3, 2.5):
+        expected = np.linalg.det(np.eye(4) - (factor - 1.0) * responses)
+        np.testing.assert_allclose(channel._with_factor(factor), expected, rtol=1e-9)

@@ -156,7 +156,7 @@ def test_a_gain_of_another_model_is_refused(lin):
     moved = fflin.linearize(robot, fflin.configuration(robot, {"joint_1": 0.3}))
     for model, words in (
         (moved, "point"),
-        (lin.discretize(0.1), "sampling time"),
+        (lin.discretize(0.1), "sample time"),
         (fflin.linearize(robot, frame="local"), "frame"),
         (fflin.linearize(fflin.load("ets_vii")), "states"),
     ):

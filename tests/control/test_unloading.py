@@ -194,7 +194,7 @@ def test_a_multirate_law_unloads_the_wheels_and_the_attitude_stays():
 def test_a_multirate_law_of_other_sensors_is_refused():
     alone, design, _ = map(with_star_tracker, cubesat())
     other = with_star_tracker(design, sample=0.25)
-    with pytest.raises(fflin.InputError, match="other sampling times or delays"):
+    with pytest.raises(fflin.InputError, match="other sample times or delays"):
         fflin.unload_wheels(multirate_law(alone), other, RATE)
 
 

@@ -100,6 +100,15 @@ def test_the_velocity_nearest_in_kinetic_energy_conserves_momentum_of_a_loop():
     np.testing.assert_allclose(change, 0.0, atol=1e-11 * np.abs(before).max())
 
 
+def test_a_velocity_on_the_manifold_is_not_corrected_again():
+    robot = fflin.load("dual_arm", constraints=[fflin.Weld("tool_left", "tool_right")])
+    closure = Closure(fflin.StateMap(robot))
+    rng = np.random.default_rng(2)
+    for _ in range(5):
+        q, v = fflin.closed(robot, robot.neutral(), rng.normal(size=robot.nv))
+        np.testing.assert_array_equal(closure.velocity(q, v), v)
+
+
 def test_two_constraints_of_the_same_name_are_refused():
     twice = [fflin.Weld("tool_left"), fflin.Weld("tool_left")]
     with pytest.raises(fflin.InputError, match="two constraints are named 'tool_left'"):

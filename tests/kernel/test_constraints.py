@@ -6,7 +6,7 @@ import pytest
 
 import fflin
 from fflin.dynamics.constraints import Constraints
-from fflin.kernel import constraints, forward
+from fflin.kernel import bodies, constraints, forward
 from fflin.simulation.lanes import mechanics_of
 from fflin.simulation.plant import Plant
 from tests.dynamics.test_constraints import CASES, constrained_tree
@@ -65,6 +65,28 @@ def test_both_engines_solve_the_equations_of_motion_with_multipliers(kind, to):
     np.testing.assert_allclose(held.multipliers, forces, atol=tolerance)
     change = (point.wrench - before)[[3, 4, 5, 0, 1, 2]]
     np.testing.assert_allclose(change, wrench - push, atol=tolerance)
+
+
+@pytest.mark.parametrize(("kind", "to"), CASES)
+def test_factors_of_all_rows_are_the_solutions_of_single_rows(kind, to):
+    plant, q, v, u = moving(np.random.default_rng(7), kind, to)
+    mechanics, held, _, work = in_kernel(plant, q, v, u)
+    tree = mechanics.tree
+    constraints.locate(work, mechanics, held, q)
+    constraints.write_jacobian(work, mechanics, held)
+    bodies.factorise(work, tree)
+    constraints.factorise(work, tree, held)
+    r, size = len(held.error), len(tree.row)
+    Z = held.jacobian.reshape(r, size).copy()
+    for column in Z:
+        bodies.solve_inwards(work, tree, column, 0)
+    Z *= held.roots
+    Q, R = held.basis.reshape(r, size), np.triu(held.triangle.reshape(r, r))
+    np.testing.assert_allclose(R.T @ Q, Z, rtol=0.0, atol=1e-14 * np.abs(Z).max())
+    # Gram-Schmidt's rounding errors grow with the condition number of Z.
+    apart = 1e-15 * np.linalg.cond(Z)
+    np.testing.assert_allclose(Q @ Q.T, np.eye(r), rtol=0.0, atol=10 * apart)
+    np.testing.assert_allclose(held.squares, (Z**2).sum(axis=1), rtol=1e-14)
 
 
 @pytest.mark.parametrize(("kind", "to"), CASES)

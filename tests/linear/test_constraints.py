@@ -9,6 +9,8 @@ import pinocchio as pin
 import pytest
 
 import fflin
+from fflin.dynamics.aba import Aba
+from fflin.dynamics.classical import Conditioning
 from fflin.linear.constrained_check import ConstrainedReferences
 from fflin.linear.files import given
 from fflin.linear.nonlinear import TRUNCATION, jacobians
@@ -398,3 +400,62 @@ def test_the_truncation_error_of_the_differences_is_estimated_in_full():
     # The next term of the error is smaller by about the square of the step.
     assert error == pytest.approx(estimate, rel=0.3**2)
     assert max(abs(x[0, 0] - value[0, 0]) for x in again) < 0.95 * error
+
+
+def nearly_flat(angle):
+    """A parallelogram at an angle [rad] from its flat posture, at rest with a holding torque."""
+    robot = parallelogram(0.6, 1.5, 0.8, 1.1)
+    left = np.pi / 2 - angle
+    guess = {"left": left, "bar": -left, "right": left}
+    q = fflin.closed(robot, fflin.configuration(robot, guess))
+    torque = (0.6 + 1.5) * 9.81 * 0.8 * np.sin(left)
+    return robot, q, fflin.effort(robot, {"left": torque})
+
+
+@pytest.mark.parametrize("angle", exhaustive(1e-2, 1e-3, 1e-4, 3e-5, 1e-5))
+def test_check_agrees_with_linearize_near_a_flat_posture(angle):
+    robot, q, u = nearly_flat(angle)
+    lin = fflin.linearize(robot, q, u=u, independent=["left"])
+    inertia = 2.0 * 0.6 * 0.8**2 / 3.0 + 1.5 * 0.8**2
+    stiffness = (0.6 + 1.5) * 9.81 * 0.8 * np.sin(angle)
+    assert lin.A[1, 0] == pytest.approx(-stiffness / inertia, abs=1e-9)
+    check = fflin.check(robot, lin)
+    assert check.ok, check
+    if angle != 1e-3:  # there, the rounding error is about the limit
+        assert bool(check.remarks) == (angle < 1e-3)
+    moved = replace(lin, A=lin.A + np.array(((0.0, 0.0), (0.1, 0.0))) * stiffness)
+    if angle > 1e-3:
+        assert not fflin.check(robot, moved).ok
+    floating = robot.replace(constraints=[robot.constraints[1]])
+    v = fflin.velocity(floating, {"left": 0.3, "bar": -0.3, "right": 0.3})
+    q, v = fflin.closed(floating, q, v)
+    check = fflin.check(floating, fflin.linearize(floating, q, v))
+    assert check.ok, check
+
+
+@pytest.mark.exhaustive
+def test_check_states_which_errors_it_cannot_detect_near_a_flat_posture():
+    robot, q, u = nearly_flat(1e-4)
+    lin = fflin.linearize(robot, q, u=u, independent=["left"])
+    check = fflin.check(robot, lin)
+    assert "near a singular posture" in check.remarks[0]
+    assert "are not detected" in " ".join(str(check).split())
+    assert "are not detected" in check._repr_html_()
+
+
+def test_the_condition_of_the_constraints_is_inverse_to_the_angle_from_a_flat_posture():
+    """Also where the square of the smallest singular value is a rounding error."""
+    conditions = []
+    for angle in (1e-2, 1e-5):
+        robot, q, _ = nearly_flat(angle)
+        constraints = Aba(fflin.StateMap(robot))
+        conditions.append(constraints.conditioning(q, np.zeros(robot.nv)).condition)
+    assert conditions[1] / conditions[0] == pytest.approx(1e3, rel=1e-3)
+
+
+def test_the_regularisation_of_the_check_balances_its_two_errors():
+    """The error of fourth order equals the rounding error of the solver."""
+    at_point = Conditioning(least=0.3, condition=50.0)
+    rounding = 8.0 * np.finfo(float).eps * 50.0**2 / at_point.regularisation
+    assert at_point.regularisation**4 / 64.0 == pytest.approx(rounding, rel=1e-12)
+    assert at_point.error == pytest.approx(2.0 * rounding, rel=1e-12)

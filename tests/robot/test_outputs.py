@@ -179,9 +179,26 @@ def test_reports_of_a_robot_show_the_fields_of_sensors_and_the_lags_of_inputs():
         "outputs: star_tracker (sample 0.25 s, delay 0.2 s, noise noise_equivalent_angle 10), "
         "gyroscope:base (lag 0.1 s, noise 1e-05, bias bias_instability 1)" in text
     )
-    lags = "tau_b.x = 0.3, tau_b.y = 0.3, tau_b.z = 0.3"
-    assert f"lags of inputs [s]: {lags}" in text
+    assert "inputs (lag 0.3 s): tau_b" in text
     card = robot._repr_html_()
     assert "noise_equivalent_angle 10" in card
     assert "lag [s]" in card
     assert "lag [s]" not in fflin.load("cubesat")._repr_html_()
+
+
+def test_reports_of_a_robot_show_the_pulses_of_thrusters():
+    fields = {"on_off": True, "least_impulse": 0.05, "isp": 220.0, "lag": 0.02}
+    fast = fflin.Thruster("base", (0, 0, 0), (1, 0, 0), "main", max=22.0, **fields)
+    others = [
+        fflin.Thruster("base", (0, 0, 0.1), axis, max=1.0, isp=60.0)
+        for axis in ((1, 0, 0), (-1, 0, 0))
+    ]
+    plain = fflin.Thruster("base", (0, 0, 0.2), (0, 1, 0), "plain", max=1.0)
+    robot = fflin.load("cubesat", inputs=[fast, *others, plain])
+    report = robot_info(robot)
+    assert max(map(len, report.splitlines())) <= 80
+    text = " ".join(report.split())
+    given = "on-off, least impulse 0.05 N s, isp 220 s, lag 0.02 s"
+    assert f"inputs ({given}): main inputs" in text
+    assert "inputs (isp 60 s): thruster_2, thruster_3" in text
+    assert "plain" not in text

@@ -6,7 +6,7 @@ import pytest
 import fflin
 from tests.support.marks import exhaustive
 
-H = 0.1  # sampling time [s]
+H = 0.1  # sample time [s]
 
 
 def satellite(inputs=None):

@@ -143,7 +143,7 @@ def _part(response: complex, sign: float) -> float:
 
 
 def _changes(loop: Loop, sign: float, grid: Grid) -> list[float]:
-    """Return the frequencies between those of a grid at which M(jw) + sign M(-jw) changes sign."""
+    """Return the frequencies between points of a grid at which M(jw) + sign M(-jw) changes sign."""
     from scipy.optimize import brentq
 
     def value(frequency: float) -> float:

@@ -27,7 +27,7 @@ _CENTRES = 60
 _NEWTON = 30
 
 # The search over frequency ends after _DIVISIONS intervals. An interval narrower than _NARROW times
-# its frequency is not divided. Of the frequencies of the poles, it starts at those that are apart
+# its frequency is not divided. It starts at frequencies of poles that are apart
 # by the factor _APART.
 _DIVISIONS = 400
 _NARROW = 1e-9
@@ -191,7 +191,7 @@ def _centre(M: Values, y: Array, t: float) -> Array:
         both = right @ N.conj().T
         gradient = 2.0 * (both.diagonal() - t * P.diagonal() + 1.0).real
         # With X = diag(e^(2 y)), S = t X - M^H X M and its derivative C_i = t E_i - m_i^H m_i, the
-        # second derivatives are those of -log det S + sum(2 y) by 2 y, times four.
+        # second derivatives are four times the second derivatives of -log det S + sum(2 y) by 2 y.
         cross = np.abs(right) ** 2
         curvature = t * t * np.abs(P) ** 2 - t * (cross + cross.T) + np.abs(both) ** 2
         curvature = 4.0 * (
@@ -329,8 +329,8 @@ def largest_scaled_gain(loop: Loop) -> tuple[float, float, Array]:
     The result also contains the frequency [rad/s] at which it occurs, and the scaling there.
 
     The value is bounded at a few frequencies near the poles. A fixed scaling then bounds it at all
-    frequencies but those between the crossings of its gain, which follow from eigenvalues. These
-    intervals are searched in the same way, with the best scaling at their middle.
+    frequencies except between the crossings of its gain, which follow from eigenvalues. The
+    intervals between crossings are searched in the same way, with the best scaling at their middle.
     """
     poles = np.linalg.eigvals(loop.F)
     starts = {0.0, np.inf, *np.abs(poles).tolist(), *np.abs(poles.imag).tolist()}

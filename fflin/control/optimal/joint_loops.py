@@ -174,7 +174,8 @@ class Loops:
     def torques(self, basis: Array, coefficients: Array) -> Array:
         """Return weighted torques (4, m) whose sum of squares is the mean effort of the loops.
 
-        The inertia is that of the middle of the path, and terms quadratic in the rates are ignored.
+        The inertia is computed at the middle of the path, and terms quadratic in the rates are
+        ignored.
         """
         inertia = self.base.inertia(self.middle)[np.ix_(self.moved, self.moved)]
         rates = np.gradient(basis, self.t, axis=0)

@@ -88,7 +88,7 @@ def monodromy(F: Array) -> Array:
 def lifted(loop: PeriodicLoop) -> tuple[Array, Array, Array, Array]:
     """Return A, B, C and D of a system whose sample is a period of the loop.
 
-    Its signals are those of the N samples: the n channels of the first sample come first.
+    Its signals are the signals of all N samples: the n channels of the first sample come first.
     """
     count, size, channels = loop.G.shape
     rows = loop.H.shape[1]
@@ -282,6 +282,8 @@ class ChannelHarmonics:
         self._unit = np.eye(harmonics.count)
         self._angles = harmonics.angles
         self._response = self._of_channel(harmonics.responses)
+        # Eigenvalues (k, N) of the responses, which give the determinants for all factors.
+        self._eigenvalues = np.linalg.eigvals(self._response)
 
     def _of_channel(self, responses: Values) -> Values:
         """Return the responses (k, N, N) of the channel's signal to a signal added to it."""
@@ -334,7 +336,7 @@ class ChannelHarmonics:
 
     def _with_factor(self, factor: float) -> Values:
         """Return det(E - (factor - 1) response) at all angles."""
-        values: Values = np.linalg.det(self._unit - (factor - 1.0) * self._response)
+        values: Values = np.prod(1.0 - (factor - 1.0) * self._eigenvalues, axis=1)
         return values
 
     def _with_delay(self, samples: int) -> Values:
@@ -366,6 +368,8 @@ class ChannelHarmonics:
         response = self._of_channel(self._harmonics.at(angles))
         self._angles = np.insert(self._angles, at + 1, angles)
         self._response = np.insert(self._response, at + 1, response, axis=0)
+        eigenvalues = np.linalg.eigvals(response)
+        self._eigenvalues = np.insert(self._eigenvalues, at + 1, eigenvalues, axis=0)
 
 
 def difference_with_delay(

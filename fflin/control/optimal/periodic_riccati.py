@@ -23,7 +23,7 @@ _SWEEPS = 4
 
 
 def sample_transition(weights: Array, whole: Array) -> Array:
-    """Return the transition (3, nx, nx) of a sample: T, G and W, see `transitions` of the room.
+    """Return T, G and W (3, nx, nx) of a sample, as `differential_riccati.transitions` does.
 
     `weights` (nx + nu, nx + nu) is the cost matrix of the sample for the error and the input, and
     `whole` (nx, nx + nu) maps both to the next error. The cross term of the cost is removed first.
@@ -33,9 +33,10 @@ def sample_transition(weights: Array, whole: Array) -> Array:
     N, R = weights[:nx, nx:], weights[nx:, nx:]
     gain = np.linalg.solve(R, np.column_stack((N.T, B.T)))
     of_cross, of_input = gain[:, :nx], gain[:, nx:]
+    T = A - B @ of_cross
     G = B @ of_input
     W = weights[:nx, :nx] - N @ of_cross
-    return np.array((A - B @ of_cross, 0.5 * (G + G.T), 0.5 * (W + W.T)))
+    return np.array((T, 0.5 * (G + G.T), 0.5 * (W + W.T)))
 
 
 def over_period(maps: Iterable[Array]) -> Array:

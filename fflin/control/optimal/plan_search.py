@@ -204,7 +204,7 @@ class Search(NamedTuple):
                     break
                 near = np.maximum(_LESS * near, _LEAST * first)
                 continue
-            # With a large Levenberg-Marquardt cost, a small reduction is no sign of a minimum.
+            # With a large Levenberg-Marquardt cost, a small reduction does not indicate a minimum.
             converged = small and bool((near <= 1.1 * _LEAST * first).all())
             if small or gain >= _MUCH * saved:
                 near = np.maximum(_LESS * near, _LEAST * first)
@@ -214,11 +214,11 @@ class Search(NamedTuple):
             if converged and (limited == known).all():
                 break
         iterations += iteration + 1
-        # A dearer search does not help if the solver failed.
-        dear = self.price >= _LARGEST_PRICE or step is None
-        if _ENDS < trial.outside(limited) <= _HOPELESS and not dear:
-            dearer = self._replace(price=_RAISE * self.price)
-            return dearer.best(trial.q, trial.v, trial.u, iterations)
+        # A larger penalty does not help if the solver failed.
+        final = self.price >= _LARGEST_PRICE or step is None
+        if _ENDS < trial.outside(limited) <= _HOPELESS and not final:
+            stricter = self._replace(price=_RAISE * self.price)
+            return stricter.best(trial.q, trial.v, trial.u, iterations)
         trial = self._closed(trial, limited, first, left)
         return trial, self._optimality(trial, limited, first, iterations)
 
@@ -403,7 +403,7 @@ class Search(NamedTuple):
         """Return the optimal steps of the knots and of the inputs, or None if there are none.
 
         `effort` is the gradient of the effort. The gaps `missed` and the distances `room` from the
-        limits are by default those of the trial.
+        limits are by default the gaps and distances of the trial.
         """
         u = trial.u
         kept, T = models.charts

@@ -1,0 +1,195 @@
+"""Kalman filter of the command lqg: its noise, disturbances and standard deviations."""
+
+from __future__ import annotations
+
+import math
+from argparse import Namespace
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+import fflin
+from fflin.base.errors import InputError, listed
+from fflin.base.names import by_name, group_of
+from fflin.base.tables import cut, grid
+from fflin.base.validation import Array
+from fflin.commands.builders import once, refuse
+from fflin.control.data_sheet import output_keys
+from fflin.control.estimator import BIAS, DISTURBANCE
+from fflin.control.recovery import Filter, recovering_filter
+from fflin.control.sensors import sensors_of_model
+from fflin.linear.model import LinearModel
+from fflin.robot.disturbance import UNITS, terms_of
+from fflin.robot.outputs import FullState
+
+# Time [s] within which the random walk of a default disturbance reaches its size in robot.toml.
+_WALK = 100.0
+
+_NONE = "none"
+
+_EXAMPLES = (
+    '[[output]] type = "star_tracker" noise = { noise_equivalent_angle = 10.0 } and [[output]] '
+    'type = "gyroscope" frame = "base" noise = { angle_random_walk = 0.05 }'
+)
+
+
+class Slow(NamedTuple):
+    """Disturbances that a filter estimates: intensities and frequencies [Hz] by name."""
+
+    noise: dict[str, float]
+    frequency: dict[str, float]
+
+
+class FilterDesign(NamedTuple):
+    """Filter of the command lqg, with a line on its process noise."""
+
+    filter: Filter
+    note: str
+
+
+def filter_of(lin: LinearModel, gain: fflin.Gain, arguments: Namespace) -> FilterDesign:
+    """Return the filter of a model with the noise of its robot and of the options.
+
+    Without --process-noise, the noise acts at the inputs, as `recovering_filter` chooses it.
+    """
+    slow = _disturbances(lin, gain, arguments)
+    design = partial(
+        fflin.kalman,
+        lin,
+        V=_measurement_noise(lin, arguments),
+        wheel_speeds=arguments.wheel_speeds,
+        disturbance_noise=slow.noise or None,
+        bias_noise=once("--bias-noise", arguments.bias_noise) or None,
+        disturbance_frequency=slow.frequency or None,
+    )
+    if given := once("--process-noise", arguments.process_noise):
+        return FilterDesign(design(W=given), "process noise: as given")
+
+    def of_inputs(covariance: Array) -> Filter:
+        return design(W=covariance, G=lin.undelayed.B)
+
+    estimator, factor = recovering_filter(gain, lin, of_inputs)
+    note = (
+        f"process noise: at the inputs, {factor:g} R^-1 of the regulator per sample, the least "
+        "power of ten with which the disk margin is 2/3, or the margin is largest; "
+        "--process-noise sets other noise"
+    )
+    return FilterDesign(estimator, note)
+
+
+def _measurement_noise(lin: LinearModel, arguments: Namespace) -> dict[str, float]:
+    """Return the variances of --noise, or raise `InputError` if an output has no noise."""
+    robot = lin._robot
+    assert robot is not None  # since the command linearised it
+    if all(isinstance(output, FullState) for output in robot.outputs):
+        raise InputError(
+            f"'{robot.name}' has no sensors, which the filter needs; add outputs to the robot "
+            f"file, such as {_EXAMPLES}, or give --output"
+        )
+    given = once("--noise", arguments.noise)
+    keys = output_keys(given, lin.output_names)
+    known = by_name(
+        "output", {keys[key]: x for key, x in given.items()}, lin.output_names
+    )
+    sensors = sensors_of_model(lin)
+    missing = [
+        name
+        for index, name in enumerate(lin.output_names)
+        if index not in known and sensors[name].noise is None
+    ]
+    if missing:
+        raise InputError(
+            f"the outputs {listed(missing)} have no noise; add noise to their [[output]] in the "
+            "robot file, or give --noise NAME=SIGMA"
+        )
+    return {key: sigma**2 for key, sigma in given.items()}
+
+
+def _disturbances(lin: LinearModel, gain: fflin.Gain, arguments: Namespace) -> Slow:
+    """Return the disturbances of --disturbance, or by default those in the robot file.
+
+    With integral action, the filter by default estimates none.
+    """
+    if arguments.disturbance == [(_NONE, None)]:
+        refuse(arguments, ("disturbance_frequency",), "no disturbance is estimated")
+        return Slow({}, {})
+    sizes, frequencies = _of_robot(lin)
+    frequencies |= once("--disturbance-frequency", arguments.disturbance_frequency)
+    given = once("--disturbance", arguments.disturbance)
+    if not given and gain.integrals:
+        refuse(arguments, ("disturbance_frequency",), "the gain has integral action")
+        return Slow({}, {})
+    if not given:
+        pushed = {"tau_b": "q_b", "F_b": "r_b"}
+        regulated = {group_of(name) for name in gain.regulated or gain.state_names}
+        given = {name: None for name in sizes if pushed[name] in regulated}
+    noise = {}
+    for name, intensity in given.items():
+        force = _force(name)
+        if intensity is not None:
+            noise[name] = intensity
+        elif force in sizes:
+            noise[name] = sizes[force] ** 2 / _WALK
+        else:
+            raise InputError(
+                f"--disturbance {name}: [disturbance] of the robot file has no {force}; give the "
+                f"intensity of its random walk, --disturbance {name}=INTENSITY"
+            )
+    forces = {_force(name) for name in noise}
+    kept = {name: x for name, x in frequencies.items() if _force(name) in forces}
+    return Slow(noise, kept)
+
+
+def _force(name: str) -> str:
+    """Return the group of a disturbance, such as tau_b for tau_b and for tau_b.x."""
+    return name.partition(".")[0]
+
+
+def _of_robot(lin: LinearModel) -> tuple[dict[str, float], dict[str, float]]:
+    """Return the largest component and the frequency [Hz] of the disturbances of a robot."""
+    assert lin._robot is not None
+    sizes, frequencies = dict[str, float](), dict[str, float]()
+    for name, term in terms_of(lin._robot.disturbance):
+        size = float(np.abs((term.constant, term.amplitude)).max())
+        if size:
+            sizes[name] = max(size, sizes.get(name, 0.0))
+        if term.periodic:
+            frequencies[name] = term.frequency
+    return sizes, frequencies
+
+
+def deviations(estimator: Filter, lin: LinearModel) -> dict[str, tuple[float, str]]:
+    """Return {signal: (standard deviation, unit)} of the error of a steady-state filter.
+
+    The errors are those of the prediction, before the measurements of a sample. For a periodic
+    filter, they are the largest of a period. Attitudes are in deg. Earlier values of outputs and of
+    commands are left out.
+    """
+    P = np.atleast_3d(estimator.P.T).T
+    sigma = np.sqrt(np.diagonal(P, axis1=1, axis2=2).max(axis=0))
+    units = dict(zip(lin.state_names, lin.state_units, strict=True))
+    sensed = dict(zip(lin.output_names, lin.output_units, strict=True))
+    estimated = estimator.estimated or estimator.state_names
+    result = dict[str, tuple[float, str]]()
+    for name, value in zip(estimator.state_names, sigma.tolist(), strict=True):
+        if name not in estimated or name in lin.added:
+            continue
+        if name.startswith(DISTURBANCE):
+            force = group_of(name.removeprefix(DISTURBANCE))
+            result[name] = value, UNITS.get(force, "SI")
+        elif name.startswith(BIAS):
+            result[name] = value, sensed[name.removeprefix(BIAS)]
+        elif group_of(name) == "q_b":
+            # q_b is half of a small rotation.
+            result[name] = math.degrees(2.0 * value), "deg"
+        elif name in units:
+            result[name] = value, units[name]
+    return result
+
+
+def deviations_table(values: dict[str, tuple[float, str]]) -> str:
+    """Format the standard deviations of the error of a filter."""
+    rows = [["estimate", "unit", "standard deviation"]]
+    rows += [[name, unit, f"{value:.3g}"] for name, (value, unit) in values.items()]
+    return grid(cut(rows, "see --json"), "ll")

@@ -1,0 +1,194 @@
+"""The command lqg: its law equals the design in Python, and other commands fly and export it."""
+
+import json
+
+import numpy as np
+import pytest
+
+import fflin
+from tests.support.c_code import COMPILERS, needs_compiler, outcome
+from tests.support.commands import refused, run
+
+HEAD = """urdf = "cubesat"
+disturbance = { tau_b = [2e-6, -1e-6, 0] }
+"""
+WHEELS = "".join(
+    f'[[input]]\ntype = "reaction_wheel"\naxis = {axis}\ninertia = 1e-5\nmax = 1e-3\n'
+    for axis in np.eye(3).tolist()
+)
+TORQUE = '[[input]]\ntype = "base_torque"\nmax = 1e-3\n'
+THRUSTER = """[[input]]
+type = "thruster"
+frame = "base"
+position = [0.1, 0, 0]
+direction = [0, 1, 0]
+max = 0.1
+"""
+TRACKER = """[[output]]
+type = "star_tracker"
+noise = { noise_equivalent_angle = 10.0 }
+"""
+GYROSCOPE = """[[output]]
+type = "gyroscope"
+frame = "base"
+noise = { angle_random_walk = 0.1 }
+bias = { bias_instability = 5.0 }
+"""
+LATE = "sample = 0.5\ndelay = 0.25\n"
+TIMES = ("--sample", 0.25, "--delay", 0.25)
+
+
+@pytest.fixture
+def write(tmp_path, monkeypatch):
+    """Work in an empty folder; return a function that writes a robot file from its parts."""
+    monkeypatch.chdir(tmp_path)
+
+    def written(*parts, name="satellite.toml"):
+        (tmp_path / name).write_text("".join((HEAD, *parts)))
+        return name
+
+    return written
+
+
+def design(robot):
+    """Return the sampled model and the compensator in Python, with the noise of the command."""
+    model = fflin.linearize(robot).discretize(0.25, delay=0.25)
+    gain = fflin.lqr(model)
+    noise = {"tau_b": (2e-6) ** 2 / 100.0}
+    found = []
+    for exponent in range(0, -7, -1):
+        W = 10.0**exponent * np.linalg.inv(gain.R)
+        B = model.undelayed.B
+        estimator = fflin.kalman(model, W, G=B, disturbance_noise=noise)
+        compensator = fflin.lqg(gain, estimator)
+        found.append(compensator)
+        if compensator.pace:  # the regulator had to be made slower for the margin
+            found.pop()
+            break
+    return model, found[-1]
+
+
+@pytest.mark.exhaustive
+def test_the_law_of_the_command_is_the_design_in_python_and_is_flown(write):
+    satellite = write(TORQUE, TRACKER, GYROSCOPE)
+    code, out, err = run("lqg", satellite, *TIMES, "-o", "law.npz", "--json")
+    assert (code, err) == (0, "")
+    report = json.loads(out)
+    assert report["files"] == ["law.npz"] and report["margins"]["disk"] >= 2 / 3
+    robot = fflin.load(satellite)
+    model, compensator = design(robot)
+    assert np.abs(np.array(report["A"]) - compensator.A).max() < 1e-9
+    saved = fflin.Compensator.load("law.npz")
+    assert np.array_equal(saved.delay, [0.25, 0.25, 0.25])
+    policy = fflin.OutputFeedback(model, saved)
+    q0 = fflin.configuration(robot, rpy=(1, -2, 1))
+    flight = {"duration": 20.0, "dt": 0.05, "limits": "urdf"}
+    motion = fflin.simulate(robot, policy, q0=q0, **flight, noise=0.0)
+    options = ("--controller", "law.npz", "--rpy", 1, -2, 1, "--no-noise")
+    times = ("--duration", 20, "--dt", 0.05, "-o", "flown.npz")
+    code, out, err = run("simulate", satellite, *options, *times)
+    assert (code, err) == (0, "")
+    assert np.array_equal(fflin.Motion.load("flown.npz").q[-1], motion.q[-1])
+    # Both commands state the margins of the same loop.
+    line = "margins of the linear loop, all inputs at once"
+    assert line in out and line in run("lqg", satellite, *TIMES)[1]
+
+
+def test_the_table_states_the_standard_deviations_of_the_filter(write):
+    satellite = write(TORQUE, TRACKER, GYROSCOPE)
+    _, out, _ = run(
+        "lqg", satellite, *TIMES, "--process-noise", "omega_b=1e-10", "--json"
+    )
+    report = json.loads(out)
+    model = fflin.linearize(fflin.load(satellite)).discretize(0.25, delay=0.25)
+    noise = {"tau_b": (2e-6) ** 2 / 100.0}
+    estimator = fflin.kalman(model, {"omega_b": 1e-10}, disturbance_noise=noise)
+    sigma = dict(zip(estimator.state_names, np.sqrt(np.diag(estimator.P)), strict=True))
+    shown = report["standard_deviations"]
+    # q_b is half of a small rotation.
+    assert shown["q_b.x"] == pytest.approx(np.degrees(2.0 * sigma["q_b.x"]))
+    for name in ("omega_b.y", "disturbance.tau_b.x", "bias.base.gyroscope.z"):
+        assert shown[name] == pytest.approx(sigma[name])
+    units = report["units"]
+    assert units["q_b.x"] == "deg" and units["disturbance.tau_b.x"] == "N m"
+    assert not any(name.startswith("past") for name in shown)
+
+
+@pytest.mark.exhaustive
+def test_sensors_with_their_own_times_are_flown_with_all_inputs(write):
+    satellite = write(WHEELS, THRUSTER, TRACKER, LATE, GYROSCOPE)
+    options = ("--inputs", "wheels", "-o", "law.mat")
+    code, out, err = run("lqg", satellite, *TIMES, *options, "--json")
+    assert (code, err) == (0, "")
+    assert json.loads(out)["margins"]["disk"] >= 2 / 3
+    law = fflin.MultirateCompensator.load("law.mat")
+    assert law.A.shape[0] == 2 and law.output_names == tuple(
+        f"wheel_{k}" for k in (1, 2, 3)
+    )
+    flight = ("--rpy", 1, -2, 1, "--duration", 5, "--dt", 0.05, "--controller")
+    command = ("simulate", satellite, *flight, "law.mat", "-o")
+    assert run(*command, "all.npz")[::2] == (0, "")
+    assert run(*command, "wheels.npz", "--inputs", "wheels")[::2] == (0, "")
+    motions = [fflin.Motion.load(name) for name in ("all.npz", "wheels.npz")]
+    assert np.abs(motions[0].q - motions[1].q).max() < 1e-12
+    assert not motions[0].u[:, 3].any()
+
+
+@needs_compiler
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("times", ["", LATE])
+def test_the_law_becomes_c_code(write, tmp_path, times):
+    satellite = write(WHEELS, THRUSTER, TRACKER, times, GYROSCOPE)
+    run("lqg", satellite, *TIMES, "--inputs", "wheels", "-o", "law.json")
+    options = ("-o", "flight", "--robot", satellite, "--limits", "urdf")
+    code, _, err = run("export", "law.json", *options)
+    assert (code, err) == (0, "")
+    assert outcome(tmp_path / "flight", COMPILERS[0])[0] == 0
+
+
+@pytest.mark.exhaustive
+def test_disturbances_of_the_robot_file_are_estimated_unless_the_gain_integrates(write):
+    satellite = write(TORQUE, TRACKER, GYROSCOPE)
+
+    def states(*options):
+        noise = ("--process-noise", "omega_b=1e-10")
+        code, out, err = run("lqg", satellite, *TIMES, *noise, *options, "--json")
+        assert code == 0, err
+        names = json.loads(out)["state_names"]
+        kinds = ("disturbance", "integral", "bias")
+        return [sum(name.startswith(kind) for name in names) for kind in kinds]
+
+    assert states() == [3, 0, 3]
+    assert states("--disturbance", "none") == [0, 0, 3]
+    assert states("--disturbance", "tau_b.x=1e-12") == [1, 0, 3]
+    assert states("--integral", "q_b") == [0, 3, 3]
+    assert states("--disturbance-frequency", "tau_b=0.01") == [9, 0, 3]
+
+
+def test_wrong_or_missing_data_are_refused_in_one_line(write):
+    satellite = write(TORQUE, TRACKER, GYROSCOPE)
+    assert "add --sample H" in refused("lqg", satellite)
+    assert "has no sensors" in refused("lqg", "cubesat", "--sample", 1)
+    no_noise = refused("lqg", "cubesat", "--sample", 1, "--output", "base")
+    assert "q_b.x" in no_noise and "--noise NAME=SIGMA" in no_noise
+    options = (*TIMES, "--disturbance", "F_b")
+    assert "--disturbance F_b=INTENSITY" in refused("lqg", satellite, *options)
+    late = write(TORQUE, TRACKER, LATE, GYROSCOPE, name="late.toml")
+    assert "disturbance_noise" in refused("lqg", late, *TIMES, "--integral", "q_b")
+    assert "no reaction wheels" in refused("lqg", late, *TIMES, "--inputs", "wheels")
+    run("lqg", satellite, *TIMES, "-o", "law.npz")
+    negative = ("--controller", "law.npz", "--negative-feedback")
+    assert "sign of its feedback" in refused("simulate", satellite, *negative)
+    wheels = write(WHEELS, TRACKER, GYROSCOPE, name="wheels.toml")
+    other = refused("simulate", wheels, "--controller", "law.npz")
+    assert "tau_b.x" in other and "--inputs of the design" in other
+
+
+def test_an_output_that_shows_the_missing_states_is_named(write):
+    both = write(WHEELS, TORQUE, '[[input]]\ntype = "base_force"\n', TRACKER, GYROSCOPE)
+    message = refused("lqg", both, *TIMES)
+    assert "r_b.z" in message and '[[output]] (type = "base"' in message
+    rates = write(WHEELS, TORQUE, TRACKER, GYROSCOPE, name="rates.toml")
+    message = refused("lqg", rates, *TIMES)
+    wheels = '["wheel_1", "wheel_2", "wheel_3"]'
+    assert f'[[output]] (type = "rates", joints = {wheels})' in message
