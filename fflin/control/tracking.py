@@ -31,7 +31,7 @@ from fflin.control.policy import (
 )
 from fflin.control.trajectory_end import SteadyEnd, resting_end, steady_regulator
 from fflin.control.tvlqr import FilterSchedule, GainSchedule
-from fflin.dynamics.coordinates import Frame, refuse_constraints
+from fflin.dynamics.coordinates import Frame
 from fflin.dynamics.outputs import Measuring
 from fflin.dynamics.state import StateMap
 from fflin.dynamics.state_rows import moved_by, moving_error
@@ -389,7 +389,6 @@ class TrajectoryOutputFeedback(OutputSensing, TrajectoryFeedback):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        refuse_constraints(self.trajectory.robot, "filters along trajectories")
         expected = "a FilterSchedule, as fflin.tvkalman returns it"
         seen = instance("filter", self.filter, FilterSchedule, expected)
         gains = self.schedule
@@ -464,7 +463,8 @@ class TrajectoryOutputFeedback(OutputSensing, TrajectoryFeedback):
                 # At this sample, the reference changes from the trajectory to the robot at rest, so
                 # the velocity error jumps.
                 stop = self.reference(self.duration)[1] - lin.v
-                jump[len(jump) // 2 :] = StateMap(self.trajectory.robot).velocities(
-                    stop
-                )
+                state = StateMap(self.trajectory.robot)
+                half = len(jump) // 2
+                picked = [state.names.index(name) for name in seen.state_names[:half]]
+                jump[half:] = state.velocities(stop)[picked]
         return Sample(A - B @ K - L @ (C - D @ K), L, -K, 0.0 * D.T, u, y, jump)

@@ -19,6 +19,9 @@ from fflin.tuning.plant import Plant
 # Eigenvectors with a larger condition number are not used for responses.
 _CONDITION = 1e7
 
+# Real parts below this fraction of the largest pole are rounding errors, as in `margins`.
+_ROUNDING = 1e-9
+
 # An algebraic loop with a smaller singular value is singular.
 _SINGULAR = 1e-12
 
@@ -83,7 +86,7 @@ class ClosedLoop:
         if not self.well_posed or not np.isfinite(self.A).all():
             return False
         largest = np.abs(self.poles).max(initial=0.0)
-        return bool(self.poles.real.max(initial=-np.inf) < -1e-11 * largest)
+        return bool(self.poles.real.max(initial=-np.inf) < -_ROUNDING * largest)
 
     def system(self, channel: Channel) -> tuple[Array, Array, Array, Array]:
         """Return A, B, C and D of a channel in the closed loop."""

@@ -67,12 +67,18 @@ class Problem:
     """Goals of a structured law for several plants.
 
     The vector x contains the coordinates of the free parameters, and then the logarithms of the
-    scalings of the channels of each margin, without the first channel.
+    scalings of the channels of each margin, without the first channel. `tight` contains logarithms
+    by which hard goals are tighter.
     """
 
     def __init__(
-        self, structured: Structured, measures: Sequence[Measure], cases: list[Case]
+        self,
+        structured: Structured,
+        measures: Sequence[Measure],
+        cases: list[Case],
+        tight: Array | None = None,
     ) -> None:
+        self.tight: Array = np.zeros(len(measures)) if tight is None else tight
         self.structured = structured
         self.measures = measures
         self.cases = cases
@@ -115,7 +121,7 @@ class Problem:
         structured = self.structured.simpler
         if structured is None:
             return None
-        return Problem(structured, self.measures, self.cases)
+        return Problem(structured, self.measures, self.cases, self.tight)
 
     def extended(self, simple: Problem, x: Array) -> Array:
         """Return the point of the law of a simpler problem at x."""
@@ -214,7 +220,9 @@ class Problem:
             return result / piece.value
 
         where = math.log(piece.where) if piece.where > 0.0 else piece.where
-        value = math.log(piece.value) + (_TIGHT if hard else 0.0)
+        value = math.log(piece.value)
+        if hard:
+            value += _TIGHT + float(self.tight[key[1]])
         return Term(value, hard, key, where, gradient)
 
     def abscissas(self, x: Array) -> list[Term] | None:

@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -45,6 +45,13 @@ _REFINED = 0.9
 
 # Random models that are examined in all rounds but the last.
 _FEW = 24
+
+# A hard goal that holds in the search but not in the report is tightened so often, and only if it
+# exceeds its limit by less than this factor.
+_TIGHTENINGS, _NEARLY = 3, 1.05
+
+# Factor by which such a goal is then below its limit.
+_BELOW = 1.0 - 1e-6
 
 # A pole of the plant is fixed if a test of Hautus has a smaller singular value.
 _FIXED = 1e-9
@@ -152,7 +159,9 @@ def tune(
         task = _Task(structure, every, points, say)
         problem, minimum, values = task.first(starts, steps, seed)
         problem, minimum = task.with_worst(problem, minimum, steps)
-        return task.result(problem, minimum, values, time.process_time() - started)
+        problem, minimum, figures = task.checked(problem, minimum, steps)
+        seconds = time.process_time() - started
+        return task.result(problem, minimum, figures, values, seconds)
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,6 +172,14 @@ class _Worst:
     point: Point
     case: Case
     piece: Piece | None
+    check: float = math.nan
+
+    @property
+    def larger(self) -> float:
+        """The larger of the value and its check."""
+        if math.isnan(self.check):
+            return self.value
+        return max(self.value, self.check)
 
 
 class _Task:
@@ -203,6 +220,7 @@ class _Task:
                         self.used[index] = True
         self.cases: dict[int, Case] = {}
         self.chosen: list[Point] = list(points.fixed)
+        self.tight: Array = np.zeros(len(self.measures))
 
     def case(self, point: Point) -> Case:
         """Return the plant of a model with the channels of the goals."""
@@ -222,7 +240,7 @@ class _Task:
     def problem(self) -> Problem:
         """Return the problem of the models that are chosen."""
         cases = [self.case(point) for point in self.chosen]
-        return Problem(self.structured, self.measures, cases)
+        return Problem(self.structured, self.measures, cases, self.tight.copy())
 
     def first(
         self, starts: int, steps: int, seed: int
@@ -343,46 +361,103 @@ class _Task:
                     results[index] = _Worst(value, point, case, piece)
         return [result for result in results if result is not None]
 
+    @property
+    def examined(self) -> list[Point]:
+        """All models, each once."""
+        every = [*self.chosen, *self.points.candidates]
+        return list({id(point): point for point in every}.values())
+
+    def figures(self, problem: Problem, x: Array) -> list[_Worst]:
+        """Return the largest value of each goal over all models, and its check."""
+        law = problem.law(x)
+        figures = []
+        for index, worst in enumerate(self.worst(problem, x, self.examined)):
+            measure, channel = self.measures[index], worst.case.channels[index]
+            loops = worst.case.loops(law)
+            check = None
+            if loops is not None and worst.piece is not None:
+                check = second_value(measure.goal, measure.ends, channel, loops[index])
+            figures.append(worst if check is None else replace(worst, check=check))
+        return figures
+
+    def checked(
+        self, problem: Problem, minimum: Minimum, steps: int
+    ) -> tuple[Problem, Minimum, list[_Worst]]:
+        """Return the problem, the result and its figures.
+
+        A hard goal that holds in the search can exceed its limit a little in the check, or at a
+        model that is not in the search. It is then tightened, and the search continues.
+        """
+        figures = self.figures(problem, minimum.x)
+        for _ in range(_TIGHTENINGS):
+            if minimum.violation > 0.0 or not self._tighten(figures):
+                break
+            problem = self.problem()
+            on_step = step_texts(self.say, "search with tightened hard goals")
+            more = minimise(
+                problem.evaluate,
+                minimum.x,
+                problem.bounds,
+                steps=steps,
+                on_step=on_step,
+            )
+            problem, minimum = self.with_worst(problem, more.after(minimum), steps)
+            figures = self.figures(problem, minimum.x)
+        return problem, minimum, figures
+
+    def _tighten(self, figures: Sequence[_Worst]) -> bool:
+        """Tighten the hard goals that nearly hold, and return whether there are any."""
+        if all(measure.goal.hard for measure in self.measures):
+            return False
+        nearly = np.array(
+            [
+                measure.goal.hard and 1.0 < worst.larger < _NEARLY
+                for measure, worst in zip(self.measures, figures, strict=True)
+            ]
+        )
+        excess = np.log([worst.larger / _BELOW for worst in figures])
+        self.tight = np.where(nearly, self.tight + excess, self.tight)
+        return bool(nearly.any())
+
     def result(
         self,
         problem: Problem,
         minimum: Minimum,
+        worst: list[_Worst],
         starts: tuple[float, ...],
         seconds: float,
     ) -> Tuned:
         """Return the tuned law with its report."""
-        every = [*self.chosen, *self.points.candidates]
-        distinct = list({id(point): point for point in every}.values())
-        worst = self.worst(problem, minimum.x, distinct)
+        factor = max(figure.larger for figure in worst)
+        conflict: tuple[str, ...] = ()
+        if factor > 1.0:
+            relaxed, figures = self._relaxed(problem, minimum)
+            largest = max(figure.larger for figure in figures)
+            if largest <= 1.0:
+                minimum, worst = relaxed.after(minimum), figures
+            else:
+                conflict = self._conflict(relaxed)
+            factor = min(factor, largest)
         law = problem.law(minimum.x)
         level = self._soft_level([found.value for found in worst])
         uncertain = None
         if self.points.lft is not None:
             uncertain = UncertainLoop(self.points.lft, law, self.used)
         goals = []
-        for index, (found, measure) in enumerate(
-            zip(worst, self.measures, strict=True)
-        ):
-            check, where = math.nan, math.nan
-            loops = found.case.loops(law)
-            if loops is not None and found.piece is not None:
-                channel = found.case.channels[index]
-                second = second_value(measure.goal, measure.ends, channel, loops[index])
-                check = math.nan if second is None else second
-                where = found.piece.where
+        for found, measure in zip(worst, self.measures, strict=True):
+            where = math.nan if found.piece is None else found.piece.where
             hard = measure.goal.hard
             active = is_active(found.value, hard, level)
             bound = math.nan
             if uncertain is not None:
                 self.say(f"bound over the whole ranges: {measure.goal.label}")
-                largest = max(found.value, 0.0 if math.isnan(check) else check)
-                bound = uncertain.bound(measure.goal, measure.ends, largest)
+                bound = uncertain.bound(measure.goal, measure.ends, found.larger)
             goals.append(
                 GoalValue(
                     measure.goal.label,
                     hard,
                     found.value,
-                    check,
+                    found.check,
                     where,
                     dict(found.point.parameters),
                     active,
@@ -392,10 +467,6 @@ class _Task:
             )
         values = problem.values(minimum.x)[0].tolist()
         parameters = self.structured.parameters
-        factor = max(goal.worst for goal in goals)
-        conflict: tuple[str, ...] = ()
-        if not all(goal.met for goal in goals):
-            factor, conflict = self._contradiction(problem, minimum)
         return Tuned(
             law,
             self.lin,
@@ -406,7 +477,7 @@ class _Task:
             conflict=conflict,
             stationarity=minimum.stationarity,
             points=tuple(dict(point.parameters) for point in self.chosen),
-            examined=len(distinct),
+            examined=len(self.examined),
             starts=starts,
             seconds=seconds,
             history=np.exp(np.array(minimum.history).reshape(-1, 2)),
@@ -443,15 +514,16 @@ class _Task:
         except (InputError, MissingPackageError):
             return math.nan
 
-    def _contradiction(
+    def _relaxed(
         self, problem: Problem, minimum: Minimum
-    ) -> tuple[float, tuple[str, ...]]:
-        """Return the least factor by which all goals would hold, and the goals that limit it."""
+    ) -> tuple[Minimum, list[_Worst]]:
+        """Return the law with the least factor by which all goals would hold, and its figures."""
         relaxed = minimum
+        loose = Problem(self.structured, self.measures, problem.cases)
         if any(measure.goal.hard for measure in self.measures):
 
             def evaluate(x: Array) -> list[Term] | None:
-                terms = problem.evaluate(x)
+                terms = loose.evaluate(x)
                 if terms is None:
                     return None
                 return [term._replace(is_constraint=False) for term in terms]
@@ -463,6 +535,10 @@ class _Task:
                 steps=_RELAXING,
                 on_step=step_texts(self.say, "search for the least factor"),
             )
+        return relaxed, self.figures(problem, relaxed.x)
+
+    def _conflict(self, relaxed: Minimum) -> tuple[str, ...]:
+        """Return the goals that limit the least factor."""
         weights: dict[int, float] = {}
         for key, weight in (relaxed.weights or {}).items():
             index = key[1] if isinstance(key, tuple) else 0
@@ -473,7 +549,7 @@ class _Task:
             for index in largest
             if weights[index] > 1e-3
         )
-        return math.exp(relaxed.objective), labels
+        return labels
 
     def _why_unstable(self, problem: Problem) -> str:
         """Return why no start was stable."""

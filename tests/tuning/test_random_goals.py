@@ -90,3 +90,54 @@ def test_a_goal_that_is_called_met_is_met_by_other_robots_of_the_ranges(seed):
         assert value <= goal.worst * 1.002
         assert not (goal.met and goal.worst < 0.998) or value <= 1.0
         assert math.isnan(goal.bound) or value <= goal.bound
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("seed", [1])
+def test_a_hard_step_that_limits_the_other_goals_holds_by_both_methods(seed):
+    rng = np.random.default_rng(seed)
+    robot = fflin.load(
+        "servicer_7dof",
+        lock=["joint_*"],
+        inputs=[fflin.BaseTorque()],
+        outputs=[fflin.BasePose()],
+        stiffness={"panel_*": 10.0 ** rng.uniform(1.0, 3.0)},
+        damping={"panel_*": 10.0 ** rng.uniform(-1.5, 0.7)},
+    )
+    law = random_law(rng)
+    axis = rng.choice(list("xyz"))
+    settling = 10.0 ** rng.uniform(0.7, 1.8)
+    within = rng.choice([0.01, 0.05, 0.1])
+    overshoot, hard = rng.uniform(0.02, 0.5), bool(rng.random() < 0.3)
+    step = fflin.Track(f"q_b.{axis}", settling, within, overshoot, hard=hard)
+    margin = fflin.Margin(rng.uniform(0.4, 0.8), hard=bool(rng.random() < 0.5))
+    goals = [step, margin]
+    if rng.random() < 0.5:
+        above, below = rng.uniform(4.0, 15.0), 10.0 ** rng.uniform(-1.0, 1.0)
+        goals.append(fflin.RollOff({"q_b": NOISE}, {"tau_b": 1.0}, above, below))
+    assert hard
+    tuned = fflin.tune(fflin.linearize(robot), law, goals, starts=1, steps=60)
+    # The step just holds, and only just by the finer instants of the check.
+    assert tuned.met and 0.99 < tuned.goals[0].worst <= 1.0
+    assert tuned.factor <= 1.0 and tuned.conflict == ()
+
+
+def contradicting(factor):
+    """Goals that contradict each other, with limits that are larger by a factor."""
+    return [
+        fflin.Margin(1.0 / factor),
+        fflin.MaxGain({"tau_b": TORQUE}, {"q_b": 3e-5 * factor}),
+        fflin.RollOff({"q_b": NOISE}, {"tau_b": 1.0}, above=8.0, below=0.03 * factor),
+    ]
+
+
+@pytest.mark.exhaustive
+def test_goals_hold_if_they_are_relaxed_by_the_least_factor_but_not_by_less():
+    lin = fflin.linearize(random_plant(np.random.default_rng(0)).robot)
+    law = fflin.LowPass((0.5, 30.0), order=2) * fflin.PD("q_b", "tau_b", shared=True)
+    first = fflin.tune(lin, law, contradicting(1.0), starts=3, steps=100)
+    assert not first.met and first.factor > 1.5
+    easier = contradicting(1.01 * first.factor)
+    assert fflin.tune(lin, law, easier, starts=3, steps=100).met
+    harder = contradicting(0.95 * first.factor)
+    assert not fflin.tune(lin, law, harder, starts=3, steps=100).met
