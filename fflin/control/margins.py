@@ -131,6 +131,16 @@ def closed_loop(
     return ClosedLoop(laws, lin, delay, sample, at)
 
 
+def matrices_of_period(policy: Policy, lin: LinearModel) -> tuple[Array, float]:
+    """Return the matrices (N, nx, nx) of a loop for each sample of its period, and its dt [s].
+
+    The states of the loop are the states of the model, then the states of the law.
+    """
+    loop = closed_loop(policy, lin, None, None)
+    assert isinstance(loop, PeriodicClosedLoop)
+    return loop.nominal().F, loop.dt
+
+
 def delayed_model(
     policy: Policy | Gain, lin: LinearModel, delay: float | None
 ) -> tuple[LinearModel, float]:

@@ -42,7 +42,8 @@ class PeriodicClosedLoop(ClosedLoop):
             *(np.array(matrices) for matrices in zip(*loops, strict=True))
         )
 
-    def _nominal(self) -> PeriodicLoop:
+    def nominal(self) -> PeriodicLoop:
+        """Return the loop with the delays of its inputs."""
         loop = self.periodic(self.with_delays(self.delays))
         if not all(np.isfinite(matrices).all() for matrices in loop):
             raise InputError(
@@ -54,7 +55,7 @@ class PeriodicClosedLoop(ClosedLoop):
     @property
     def states(self) -> int:
         """Number of states of the loop."""
-        return len(self._nominal().F[0])
+        return len(self.nominal().F[0])
 
     @property
     def harmonics(self) -> int:
@@ -63,7 +64,7 @@ class PeriodicClosedLoop(ClosedLoop):
 
     def disk_margin(self) -> float:
         """Return the disk margin for changes of all channels at once."""
-        loop = self._nominal()
+        loop = self.nominal()
         if not _is_stable(loop):
             return 0.0
         return disk_margin(Harmonics(loop).peak()[0])
@@ -75,7 +76,7 @@ class PeriodicClosedLoop(ClosedLoop):
 
     def margins(self) -> Margins:
         """Return the margins of all channels."""
-        loop = self._nominal()
+        loop = self.nominal()
         if not _is_stable(loop):
             return self.no_margins()
         harmonics = Harmonics(loop)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
 from functools import partial
-from itertools import pairwise
+from itertools import cycle, pairwise
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -806,19 +806,13 @@ def time_to_settle(robot: Robot, policy: Feedback, q: Array, v: Array | None) ->
     SHORTEST. If an error has not settled in 99 % of LONGEST, return SHORTEST.
     """
     lin = policy.lin
-    closed = policy.closed_loop()
-    assert closed is not None
-    A, dt = closed
-    step = dt or _LOOK
-    if not dt:
-        no_inputs = np.zeros((len(A), 0))
-        A, _ = held_exponential(A, no_inputs, step)
+    matrices, step = _steps_of_loop(policy)
     v = np.zeros(robot.nv) if v is None else v
     _, initial_error = policy.deviation(robot)(0.0, q, v)
-    history = np.zeros((math.ceil(LONGEST / step) + 1, len(A)))
+    history = np.zeros((math.ceil(LONGEST / step) + 1, len(matrices[0])))
     # After the errors of the model, the loop may have controller states, which are zero at first.
     history[0, : len(initial_error)] = initial_error
-    for state, next_state in pairwise(history):
+    for A, (state, next_state) in zip(cycle(matrices), pairwise(history), strict=False):
         next_state[:] = A @ state
     unsettled = np.zeros(len(history), dtype=bool)
     wheels = {f"q_m.{name}" for name in lin.wheels}
@@ -831,3 +825,21 @@ def time_to_settle(robot: Robot, policy: Feedback, q: Array, v: Array | None) ->
     if last_unsettled >= 0.99 * LONGEST:
         return SHORTEST
     return max(SHORTEST, 10.0 * math.ceil(last_unsettled / 10.0))
+
+
+def _steps_of_loop(policy: Feedback) -> tuple[Array, float]:
+    """Return the matrices (N, nx, nx) of a period of the linear closed loop, and their step [s].
+
+    Only laws of sensors with their own sample times have more than one matrix.
+    """
+    closed = policy.closed_loop()
+    if closed is None:
+        from fflin.control.margins import matrices_of_period
+
+        return matrices_of_period(policy, policy.lin)
+    A, dt = closed
+    step = dt or _LOOK
+    if not dt:
+        no_inputs = np.zeros((len(A), 0))
+        A, _ = held_exponential(A, no_inputs, step)
+    return A[None], step

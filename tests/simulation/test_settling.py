@@ -94,3 +94,21 @@ def test_states_that_are_not_fed_back_do_not_change_the_duration_of_a_run():
     time = time_to_settle(robot, policy, q, None)
     assert 60.0 < time < 600.0
     assert time_to_settle(robot, policy, beside, None) == time
+
+
+@pytest.mark.exhaustive
+def test_a_loop_of_sensors_with_different_sample_times_settles_as_it_is_simulated():
+    sensors = [fflin.StarTracker(sample=0.5, delay=0.25), fflin.Gyroscope("base")]
+    robot = fflin.load("cubesat", inputs=[fflin.BaseTorque()], outputs=sensors)
+    lin = fflin.linearize(robot).discretize(0.25)
+    weights = fflin.bryson(lin, {"q_b": 1.0, "omega_b": 0.1}), 1e10 * np.eye(3)
+    law = fflin.lqg(fflin.lqr(lin, *weights), fflin.kalman(lin, 1e-10, 1e-8))
+    policy = fflin.MultirateFeedback(lin, law)
+    q = fflin.configuration(robot)
+    q[3:7] = [np.sin(0.005), 0.0, 0.0, np.cos(0.005)]
+    time = time_to_settle(robot, policy, q, None)
+    motion = fflin.simulate(robot, policy, q0=q, duration=time + 20.0, dt=0.05)
+    error = motion.attitude_error / motion.attitude_error.max()
+    assert 60.0 < time < 600.0
+    assert error[motion.t > time].max() < 0.01
+    assert error[motion.t > time - 10.0].max() > 0.01
