@@ -9,7 +9,7 @@ import numpy as np
 from fflin.base.errors import InputError
 from fflin.base.names import input_keys
 from fflin.base.process import in_one_thread
-from fflin.base.validation import instance, number, positive
+from fflin.base.validation import Array, instance, number, positive
 from fflin.control.closed_loop import ClosedLoop
 from fflin.control.delayed import is_delayed, law_with_memory
 from fflin.control.gain import Gain
