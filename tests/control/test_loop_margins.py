@@ -577,5 +577,5 @@ def test_a_model_may_have_more_outputs_than_the_law_measures(sample):
     budgets = [fflin.error_budget(law, lin, **causes) for lin in (model, larger)]
     assert budgets[0].total[:3] == pytest.approx(budgets[1].total[:3], rel=1e-9)
     gyroscope = fflin.linearize(robot.replace(outputs=sensors[1:]))
-    with pytest.raises(fflin.InputError, match="the law measures q_b.x, which"):
+    with pytest.raises(fflin.InputError, match="the law measures q_b"):
         fflin.margins(law, gyroscope)
