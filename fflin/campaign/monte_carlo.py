@@ -25,6 +25,7 @@ from fflin.campaign.runs import KINDS, CampaignJob, chunk_size, expect, notes_on
 from fflin.campaign.spreads import placed
 from fflin.kernel.tree import LANES
 from fflin.robot.robot import Robot
+from fflin.simulation.motion import Motion
 from fflin.simulation.plan import SimulationOptions
 from fflin.simulation.report import pushed
 
@@ -219,6 +220,11 @@ def monte_carlo(
     >>> len(runs), runs.fraction("attitude < 1 deg").value > 0.5
     (16, True)
     """
+    if isinstance(robot, Motion):
+        raise InputError(
+            "robot has type Motion, expected a fflin.Robot; a campaign simulates one phase: give "
+            "the robot of this phase, and q0 and v0 from a row of the motion"
+        )
     require_known("option of monte_carlo", options, sorted(_OPTIONS))
     runs, seed = whole("runs", runs, 1), whole("seed", seed, 0)
     width, confidence = share("width", width), share("confidence", confidence)

@@ -531,9 +531,25 @@ def designed(
     """Return the robot, the robot for the design, and the linear model and gain of the design."""
     robot = load_robot(arguments)
     design = robot_of_design(robot, arguments.allocate)
-    lin = model_to_regulate(design, arguments, *point_of(design, arguments))
+    if getattr(arguments, "after", None):
+        point = _end_of_motion(design, arguments)
+    else:
+        point = point_of(design, arguments)
+    lin = model_to_regulate(design, arguments, *point)
     gain = gain_of(lin, arguments, robot, allocated=design is not robot)
     return robot, design, lin, gain
+
+
+def _end_of_motion(
+    robot: fflin.Robot, arguments: Namespace
+) -> tuple[Array, Array | None, pin.SE3 | None]:
+    """Return the operating point at rest in the last row of the motion of --after."""
+    from fflin.commands.phases import last_state
+
+    names = ("joint", "rpy", "position", "velocity", "relative_equilibrium")
+    refuse(arguments, names, "the operating point is the end of the motion of --after")
+    q, _ = last_state(robot, arguments.after)
+    return q, None, reference_of(arguments)
 
 
 def tuning_of(

@@ -412,7 +412,16 @@ def montecarlo(arguments: Namespace) -> Report:
     check_pictures(robot, arguments)
     policy, settings = loop_of(robot, arguments)
     settings.pop("linear", None)  # the runs are not compared with a linear model
-    for name in ("runs", "seed", "until", "width", "confidence", "workers", "threads"):
+    for name in (
+        "runs",
+        "seed",
+        "until",
+        "width",
+        "confidence",
+        "workers",
+        "threads",
+        "engine",
+    ):
         settings[name] = getattr(arguments, name)
     if arguments.no_noise:
         settings["noise"] = 0.0

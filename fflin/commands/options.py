@@ -88,6 +88,7 @@ OPTIONS: dict[str, dict[str, str]] = {
     },
     "lqr": {
         **_AT_POINT,
+        POINT: f"{_AT_POINT[POINT]} after",
         CONTROLLER: f"{_WEIGHTS} integral delay dt allocate",
         OUTPUT: "output-file plot",
     },
@@ -137,7 +138,7 @@ OPTIONS: dict[str, dict[str, str]] = {
     "montecarlo": {
         **_LOOP,
         "": "ROBOT DISPERSIONS",
-        "runs": "runs seed until width confidence workers threads no-noise",
+        "runs": "runs seed until width confidence engine workers threads no-noise",
         "pointing errors": "pointing accuracy budget",
         OUTPUT: f"goal worst plot output-file force html {_PICTURES}",
     },
@@ -446,6 +447,8 @@ ABOUT: dict[str, str] = {
     "lqr dt": "former name of --sample",
     "lqr delay": "design the regulator for commands that act T s after their sample. Without "
     "--sample, the sample time is T",
+    "lqr after": "regulate to the configuration at the end of the motion in FILE, at rest. Design "
+    "in this way the gain of a phase that begins with a latch (--weld)",
     "lqr output-file": "save the gain to FILE",
     "lqr plot": "plot the poles, the loop gain of each input and the stability margins to FILE",
     "process-noise": "intensity of the process noise on a state, as the covariance of a sample. "
@@ -502,6 +505,8 @@ ABOUT: dict[str, str] = {
     "sweep engine": "compute the points in compiled code or in Python. By default, the code is "
     "compiled if numba is installed and the outputs are the state",
     "sweep workers": "distribute the work over N processes; at most one per core",
+    "montecarlo engine": "simulate in compiled code or in Python. By default, the runs use compiled "
+    "code if numba is installed and the loop is supported",
     "montecarlo output-file": "save the runs (.csv and .mat are tables for other programs; with "
     ".h5, the same command resumes after an interruption) to FILE",
     "montecarlo force": "replace the file of -o even if it contains the runs of another command",

@@ -33,11 +33,7 @@ def start_after(robot: fflin.Robot, path: Path) -> PhaseStart:
     robot close in an impact, as in `latch`. Constraints without a placement hold their frames in
     the pose that they have at this time.
     """
-    motion = fflin.Motion.load(path)
-    state = StateMap(robot)
-    made = f"{path} was made for '{motion.robot}'"
-    require_same(made, state, "state", motion.state_names, motion.state_units)
-    q, v = motion.q[-1], motion.v[-1]
+    q, v = last_state(robot, path)
     if not robot.constraints:
         return PhaseStart(q, v, None)
     rows = Constraints(robot)
@@ -47,3 +43,12 @@ def start_after(robot: fflin.Robot, path: Path) -> PhaseStart:
     free = robot.replace(constraints=[], independent=[])
     impact = fflin.latch(free, robot.constraints, q=q, v=v)
     return PhaseStart(impact.q, impact.v, impact)
+
+
+def last_state(robot: fflin.Robot, path: Path) -> tuple[Array, Array]:
+    """Return q (nq,) and v (nv,) in the last row of the motion in a file, for a robot."""
+    motion = fflin.Motion.load(path)
+    made = f"{path} was made for '{motion.robot}'"
+    names, units = motion.state_names, motion.state_units
+    require_same(made, StateMap(robot), "state", names, units)
+    return motion.q[-1], motion.v[-1]

@@ -526,6 +526,7 @@ def _constrained_model(gain: Gain, state: StateMap, made: str) -> LinearModel:
     require_same(made, state, "input", gain.input_names, gain.input_units)
     q, v = state.to_pinocchio(np.array([values[name] for name in state.names]))
     independent = states[: len(states) // 2]
+    _require_closed(made, state, q)
     try:
         return linearize(
             state.robot,
@@ -542,6 +543,24 @@ def _constrained_model(gain: Gain, state: StateMap, made: str) -> LinearModel:
             "given robot with its constraints; give the robot with the constraints of the gain, "
             f"or make the gain again ({error})"
         ) from error
+
+
+def _require_closed(made: str, state: StateMap, q: Array) -> None:
+    """Raise `InputError` if the constraints of a robot hold other poses than at q (nq,).
+
+    The message begins with `made`.
+    """
+    from fflin.dynamics.closure import NEAR, Closure
+
+    closure = Closure(state)
+    closure.constraints.settle(q)
+    distance, off = closure.distance(q)
+    if distance > NEAR:
+        raise InputError(
+            f"{made} at a posture where the given robot is off {off}, because this constraint "
+            "closed in another posture; design the gain where the constraint closes, by fflin.lqr "
+            "at that q or by `fflin lqr --after FILE` with the motion before it"
+        )
 
 
 def sampled_for(gain: Gain, lin: LinearModel) -> LinearModel:

@@ -19,8 +19,8 @@ from fflin.robot.fields import travel_of
 from fflin.robot.robot import Robot
 
 # A configuration whose residual is at most _SILENT is closed without a warning. If its residual
-# exceeds _NEAR, it is refused. Both are in m and rad.
-_SILENT, _NEAR = 1e-9, 1e-6
+# exceeds NEAR, it is refused. Both are in m and rad.
+_SILENT, NEAR = 1e-9, 1e-6
 
 # Newton's method: residual [m, rad] at which q counts as closed from the start, step at which the
 # iteration ends, and largest residual at its end per metre of distance from the world's origin.
@@ -120,7 +120,7 @@ class Closure:
             self._jacobian = q, jacobian
             return q
         distance, text = self.distance(q)
-        if not distance <= _NEAR:
+        if not distance <= NEAR:
             raise ConstraintError(
                 f"q is off {text}; close it with fflin.closed(robot, q), or give the constraint "
                 "another placement"
@@ -147,7 +147,7 @@ class Closure:
         scale = 1.0 / np.sqrt(self._inertia(q).diagonal())
         apart = float(np.linalg.norm((nu - kept) / scale))
         speed = float(np.linalg.norm(nu / scale))
-        if apart <= _NEAR * speed:
+        if apart <= NEAR * speed:
             return self.state.spread(kept)
         title = self._title(int(np.argmax(np.abs(rate * space.row_scale))))
         raise ConstraintError(
@@ -384,7 +384,7 @@ def closed_point(robot: Robot, q: Array, v: Array | None) -> tuple[Array, Array 
     closure = Closure(StateMap(robot))
     closure.constraints.settle(q)
     distance, text = closure.distance(q)
-    if distance > _NEAR:
+    if distance > NEAR:
         warnings.warn(
             f"the point is off {text}; the nearest closed configuration is used instead",
             FflinWarning,

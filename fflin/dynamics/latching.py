@@ -15,7 +15,7 @@ from fflin.dynamics.impact import (
     state_before,
 )
 from fflin.dynamics.state import StateMap
-from fflin.robot.constraints import Constraint, checked_constraints
+from fflin.robot.constraints import Constraint, Weld, checked_constraints
 from fflin.robot.robot import Robot
 
 # Unit of each component of the impulse on a constraint's frame.
@@ -65,7 +65,8 @@ def latch(
     ConstraintError
         If the frames are too far from the placement, or the constraints of the robot are violated.
     InputError
-        If an argument has a wrong size or value, or no constraint is given.
+        If an argument has a wrong size or value, no constraint is given, or a `Weld` of the robot
+        already holds the frames of a given constraint.
 
     Examples
     --------
@@ -83,6 +84,8 @@ def latch(
         raise InputError(
             "no constraint is given, expected Weld, Hinge or Spherical objects that close"
         )
+    for item in closing:
+        _require_open(robot, item)
     q, v = state_before(robot, q, v)
     before = (robot, q, v)
     whole = robot.replace(constraints=[*robot.constraints, *closing], independent=[])
@@ -104,3 +107,15 @@ def latch(
         _before=before,
         _units=_UNITS * len(closing),
     )
+
+
+def _require_open(robot: Robot, constraint: Constraint) -> None:
+    """Raise `InputError` if the robot already welds the frames of a constraint."""
+    frames = {constraint.frame, constraint.to}
+    for weld in robot.constraints:
+        if isinstance(weld, Weld) and {weld.frame, weld.to} == frames:
+            to = "inertial space" if constraint.to is None else f"'{constraint.to}'"
+            raise InputError(
+                f"'{constraint.frame}' is already welded to {to} by the constraint "
+                f"'{weld.title}' of the robot; leave out this constraint"
+            )

@@ -286,3 +286,18 @@ def test_a_full_disk_is_reported_and_leaves_no_file(folder):
         assert not {x.name for x in small.iterdir()} - {"x.png"}
     finally:
         subprocess.run(["umount", small], check=True)
+
+
+@pytest.mark.exhaustive
+def test_the_engine_is_chosen(folder):
+    command = ("montecarlo", "planar_detumble", *SHORT, "--runs", 2, "--engine")
+    assert run(*command, "python", "-o", "runs.npz", cwd=folder)[0] == 0
+    assert fflin.Campaign.load(folder / "runs.npz").engine == "python"
+    assert "--engine" in refused(*command, "fortran", cwd=folder)
+
+
+def test_a_motion_instead_of_a_robot_is_refused_with_advice():
+    robot = fflin.load("planar_detumble")
+    motion = fflin.simulate(robot, duration=0.1, dt=0.05)
+    with pytest.raises(fflin.InputError, match=r"Motion.* one phase"):
+        fflin.monte_carlo(motion, None, {"q_b": 0.1}, runs=1)

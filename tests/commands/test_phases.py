@@ -58,3 +58,27 @@ def test_a_start_besides_the_file_and_other_robots_are_refused(tmp_path):
     assert "--after" in refused(*again, "--rpy", "1", "0", "0")
     text = refused("simulate", "dual_arm", *HOW, "--after", path)
     assert "was made for 'cubesat'" in text
+
+
+@pytest.mark.exhaustive
+def test_a_gain_is_designed_at_the_end_of_a_motion(tmp_path):
+    motion, elsewhere, gain = (tmp_path / f"{x}.npz" for x in ("m", "other", "gain"))
+    start = ("--joint", "left_2=0.5", "--joint", "right_2=-0.6")
+    short = ("--dt", "0.1", "--duration", "0.2", "--engine", "python")
+    assert run("simulate", "dual_arm", *start, *TARGET, *short, "-o", motion)[0] == 0
+    design = ("lqr", "dual_arm", *WELD)
+    assert run(*design, *BENT, "-o", elsewhere)[0] == 0
+    fly = ("simulate", "dual_arm", *WELD, *short, "--after", motion)
+    text = refused(*fly, "--gain", elsewhere)
+    assert "is off constraint 'tool_left/tool_right' by" in text
+    assert "fflin lqr --after FILE" in text
+    # The advice of the message: the same gain at the posture of the latch.
+    assert run(*design, "--after", motion, "-o", gain)[0] == 0
+    assert run(*fly, "--gain", gain)[0] == 0
+    q = fflin.Motion.load(motion).q[-1]
+    welded = fflin.load("dual_arm").replace(
+        constraints=[fflin.Weld("tool_left", "tool_right")]
+    )
+    expected = fflin.lqr(fflin.linearize(welded, q))
+    np.testing.assert_allclose(fflin.Gain.load(gain).K, expected.K, rtol=1e-9)
+    assert "--after" in refused(*design, *BENT, "--after", motion)

@@ -85,3 +85,24 @@ def test_what_cannot_latch_is_refused():
     apart = fflin.Weld("tool_left", "tool_right", placement=pin.SE3.Identity())
     with pytest.raises(fflin.ConstraintError, match="tool_left/tool_right"):
         fflin.latch(robot, apart, q=q)
+
+
+def test_a_pair_that_is_already_welded_is_refused():
+    robot = fflin.load("dual_arm")
+    grasp = fflin.Weld("tool_right", "tool_left", name="grasp")
+    latched = fflin.latch(robot, grasp)
+    again = [
+        grasp,
+        fflin.Weld("tool_right", "tool_left", name="second"),
+        fflin.Weld("tool_left", "tool_right"),
+        fflin.Spherical("tool_left", "tool_right"),
+    ]
+    for constraint in again:
+        with pytest.raises(fflin.InputError, match=r"already welded .* 'grasp'"):
+            fflin.latch(latched.robot, constraint, q=latched.q)
+    held = fflin.latch(robot, fflin.Weld("base"))
+    with pytest.raises(fflin.InputError, match="'base' is already welded to inertial"):
+        fflin.latch(held.robot, fflin.Weld("base", name="other"))
+    # A hinge may be locked afterwards.
+    hinge = fflin.latch(robot, fflin.Hinge("tool_right", "tool_left"))
+    assert len(fflin.latch(hinge.robot, grasp, q=hinge.q).robot.constraints) == 2
