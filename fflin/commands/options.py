@@ -505,8 +505,8 @@ ABOUT: dict[str, str] = {
     "sweep engine": "compute the points in compiled code or in Python. By default, the code is "
     "compiled if numba is installed and the outputs are the state",
     "sweep workers": "distribute the work over N processes; at most one per core",
-    "montecarlo engine": "simulate in compiled code or in Python. By default, the runs use compiled "
-    "code if numba is installed and the loop is supported",
+    "montecarlo engine": "simulate in compiled code or in Python. By default, the runs use "
+    "compiled code if numba is installed and the loop is supported",
     "montecarlo output-file": "save the runs (.csv and .mat are tables for other programs; with "
     ".h5, the same command resumes after an interruption) to FILE",
     "montecarlo force": "replace the file of -o even if it contains the runs of another command",
