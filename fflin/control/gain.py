@@ -20,6 +20,7 @@ from fflin.base.record import Design
 from fflin.base.tables import cut, folded, grid, matrix, signals
 from fflin.base.validation import Array, Mask, Poles, Values, Vector
 from fflin.control.delayed import is_delayed, law_with_memory
+from fflin.control.loop_margins import FRAGILE
 from fflin.control.optimal.disk import (
     Loop,
     as_continuous,
@@ -47,9 +48,6 @@ if TYPE_CHECKING:
 # The report omits a gain with more entries than this, which is the number of entries of K for a
 # robot with 3 joints and one input for each degree of freedom.
 _LARGE = 9 * 18
-
-# A disk margin below this gives a warning.
-_FRAGILE = 0.3
 
 # A gain whose Riccati equation has at most this relative residual has the margins of the optimal
 # gain, except for errors that are small compared with them.
@@ -626,15 +624,11 @@ class Integrals(NamedTuple):
 def cautions(gain: Gain) -> list[str]:
     """Return warnings about a small disk margin at the inputs, and about negative thrust."""
     messages: list[str] = []
-    if _may_be_fragile(gain) and (margins := gain.margins).disk < _FRAGILE:
+    if _may_be_fragile(gain) and gain.margins.disk < FRAGILE:
         remedy = "give a diagonal R, such as the R of the default weights"
         if gain.dt:
             remedy = "shorten dt, or slow the loop as the default weights do"
-        messages.append(
-            f"the phase margin at the inputs is only {margins.phase:.2g} deg (disk margin "
-            f"{margins.disk:.2g}, below {_FRAGILE:g}): a small delay or model error makes the loop "
-            f"unstable; {remedy}"
-        )
+        messages.append(f"{fragility(gain.margins)}; {remedy}")
     keys = zip(input_keys(gain), gain.input_names, gain.K, gain.u0, strict=True)
     thrusters = [
         name
@@ -655,6 +649,17 @@ def cautions(gain: Gain) -> list[str]:
             "(type continuous in the URDF) to fly it as a wheel"
         )
     return messages
+
+
+def fragility(margins: Margins) -> str:
+    """Return a warning about a small disk margin at the inputs of a loop."""
+    if not margins.disk:
+        return "the loop is unstable"
+    return (
+        f"the phase margin at the inputs is only {margins.phase:.2g} deg (disk margin "
+        f"{margins.disk:.2g}, below {FRAGILE:g}): a small delay or model error makes the loop "
+        "unstable"
+    )
 
 
 def _why_not_regulated(names: list[str]) -> str:
@@ -830,14 +835,14 @@ def _regulated(gain: Gain) -> Array:
 
 
 def _may_be_fragile(gain: Gain) -> bool:
-    """Return whether the disk margin may be below _FRAGILE.
+    """Return whether the disk margin may be below FRAGILE.
 
     Both conditions below exclude it, and are quicker than the margin itself.
     """
-    if guaranteed_margin(gain) >= _FRAGILE and not is_delayed(gain.state_names):
+    if guaranteed_margin(gain) >= FRAGILE and not is_delayed(gain.state_names):
         return False
     F, G, H, D = asymmetry(gain)
-    bound = 1.0 / _FRAGILE
+    bound = 1.0 / FRAGILE
     if np.linalg.norm(D, 2) >= bound:
         return True
     _, on_axis = gain_crossings(F, G, H, D, bound)
