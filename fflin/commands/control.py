@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from argparse import Namespace
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
@@ -10,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import fflin
-from fflin.base.errors import DetectabilityError, FileError, InputError
+from fflin.base.errors import DetectabilityError, FflinWarning, FileError, InputError
 from fflin.base.names import chosen, input_keys
 from fflin.base.process import Progress, Status
 from fflin.base.tables import folded
@@ -64,6 +65,11 @@ _TORQUE_OF_OTHERS = (
     "the law commands a torque on the base, which thrusters or magnetorquers produce: `fflin "
     "simulate` and `montecarlo` allocate it, in Python fflin.Allocation does; "
     "--no-allocate tunes a law that commands each of them"
+)
+
+_LARGER_MARGIN = (
+    "compare other --process-noise and larger --r, or omit both for the default noise and "
+    "weights"
 )
 
 _NOT_ALLOCATED = (
@@ -125,6 +131,7 @@ def lqg(arguments: Namespace) -> Report:
     compensator = fflin.lqg(gain, estimator)
     policy = policy_of(compensator, model)
     margins = margins_at_once(policy, None, None)
+    _warn_of_margins(margins)
     errors = deviations(estimator, model)
     notes = [f"weights: {gain.weights}", note]
     # The report of the compensator already contains the note on a slow bias.
@@ -325,12 +332,14 @@ def simulate(arguments: Namespace) -> Report:
         text += f"\n{folded([line])}"
     if detumbling_law(arguments) is not None and not motion.stopped:
         record["detumbling_time"] = fflin.detumbling_time(motion)
+    settled = None
     if window is not None and not motion.stopped:
         pointing = motion.pointing(window, accuracy=arguments.accuracy)
+        settled = pointing.after
         record["pointing"] = pointing
         text += f"\n\n{pointing}"
     if arguments.budget and not motion.stopped:
-        budget = budget_of(robot, policy, motion, arguments)
+        budget = budget_of(robot, policy, motion, arguments, settled)
         record["budget"] = budget
         text += f"\n\n{budget}"
     return Report(robot.name, record, text, files, code, interrupted)
@@ -349,15 +358,31 @@ def _margins_of(policy: object, settings: Mapping[str, Any]) -> tuple[object, st
 
 def _margins_line(margins: GainMargins | None) -> str:
     """Return a line on the margins of a loop for all inputs at once."""
+    from fflin.control.loop_margins import FRAGILE
+
     if margins is None:
         return "margins of the linear loop: see fflin.margins(policy, lin)"
     if not margins.disk:
         return "margins of the linear loop: none, because it is unstable"
     low, high = margins.gain
-    return (
+    line = (
         f"margins of the linear loop, all inputs at once: gain {low:.3g} to {high:.3g}, phase "
         f"{margins.phase:.3g} deg (disk margin {margins.disk:.3g})"
     )
+    if margins.disk < FRAGILE:
+        line += "; a small delay or model error makes the loop unstable"
+    return line
+
+
+def _warn_of_margins(margins: GainMargins | None) -> None:
+    """Warn of a small disk margin of a loop with a filter, by the rule of `lqr`."""
+    from fflin.control.gain import fragility
+    from fflin.control.loop_margins import FRAGILE
+
+    if margins is None or margins.disk >= FRAGILE:
+        return
+    text = f"with the filter, {fragility(margins)}; {_LARGER_MARGIN}"
+    warnings.warn(text, FflinWarning, stacklevel=3)
 
 
 def _window(arguments: Namespace) -> float | None:

@@ -90,10 +90,12 @@ class ClosedLoop:
         """
         source = lin.generator if self.dt else lin
         model = lin if source is None else source
-        if self.law.inputs == lin.output_names:
-            C, D = model.C, model.D
+        measured = self.law.inputs
+        if set(measured) <= set(lin.output_names):
+            rows = [lin.output_names.index(name) for name in measured]
+            C, D = model.C[rows], model.D[rows]
         else:
-            rows = [lin.state_names.index(name) for name in self.law.inputs]
+            rows = [lin.state_names.index(name) for name in measured]
             C = np.eye(len(model.A))[rows]
             D = np.zeros((len(rows), model.B.shape[1]))
         kept = self.kept_states(model, C[self._signals_used])

@@ -17,9 +17,10 @@ from fflin.base import html, svg
 from fflin.base.errors import FflinError, InputError, listed, require_known
 from fflin.base.names import group_of, input_keys, with_units, without_past
 from fflin.base.record import Design
-from fflin.base.tables import cut, folded, grid, matrix, signals
+from fflin.base.tables import counted, cut, folded, grid, matrix, signals
 from fflin.base.validation import Array, Mask, Poles, Values, Vector
 from fflin.control.delayed import is_delayed, law_with_memory
+from fflin.control.loop_margins import FRAGILE
 from fflin.control.optimal.disk import (
     Loop,
     as_continuous,
@@ -48,8 +49,9 @@ if TYPE_CHECKING:
 # robot with 3 joints and one input for each degree of freedom.
 _LARGE = 9 * 18
 
-# A disk margin below this gives a warning.
-_FRAGILE = 0.3
+# A pole of a sampled design with at most this magnitude is shown as zero. Delays cause such poles,
+# and rounding errors move them, because they are multiple.
+_DEADBEAT = 1e-6
 
 # A gain whose Riccati equation has at most this relative residual has the margins of the optimal
 # gain, except for errors that are small compared with them.
@@ -626,15 +628,11 @@ class Integrals(NamedTuple):
 def cautions(gain: Gain) -> list[str]:
     """Return warnings about a small disk margin at the inputs, and about negative thrust."""
     messages: list[str] = []
-    if _may_be_fragile(gain) and (margins := gain.margins).disk < _FRAGILE:
+    if _may_be_fragile(gain) and gain.margins.disk < FRAGILE:
         remedy = "give a diagonal R, such as the R of the default weights"
         if gain.dt:
             remedy = "shorten dt, or slow the loop as the default weights do"
-        messages.append(
-            f"the phase margin at the inputs is only {margins.phase:.2g} deg (disk margin "
-            f"{margins.disk:.2g}, below {_FRAGILE:g}): a small delay or model error makes the loop "
-            f"unstable; {remedy}"
-        )
+        messages.append(f"{fragility(gain.margins)}; {remedy}")
     keys = zip(input_keys(gain), gain.input_names, gain.K, gain.u0, strict=True)
     thrusters = [
         name
@@ -655,6 +653,17 @@ def cautions(gain: Gain) -> list[str]:
             "(type continuous in the URDF) to fly it as a wheel"
         )
     return messages
+
+
+def fragility(margins: Margins) -> str:
+    """Return a warning about a small disk margin at the inputs of a loop."""
+    if not margins.disk:
+        return "the loop is unstable"
+    return (
+        f"the phase margin at the inputs is only {margins.phase:.2g} deg (disk margin "
+        f"{margins.disk:.2g}, below {FRAGILE:g}): a small delay or model error makes the loop "
+        "unstable"
+    )
 
 
 def _why_not_regulated(names: list[str]) -> str:
@@ -751,15 +760,36 @@ def table_of_poles(design: HasPoles, matrix: str) -> str:
     """
     if not len(design.poles):
         return f"{matrix} has no poles"
-    return f"poles of {matrix}, slowest first\n\n{grid(cut(_pole_rows(design)), 'l')}"
+    parts = [f"poles of {matrix}, slowest first", grid(cut(_pole_rows(design)), "l")]
+    if deadbeat := int(_at_zero(design).sum()):
+        parts.append(_of_delay(deadbeat))
+    return "\n\n".join(parts)
 
 
 def folded_poles(design: HasPoles, matrix: str) -> str:
     """Return the table of the poles of a matrix in HTML, which the reader can open."""
     if not len(design.poles):
         return ""
-    rows = cut(_pole_rows(design), "see poles")
-    return html.folded(f"poles of {matrix}, slowest first", html.table(rows, "l"))
+    table = html.table(cut(_pole_rows(design), "see poles"), "l")
+    if deadbeat := int(_at_zero(design).sum()):
+        table += html.paragraph(_of_delay(deadbeat))
+    return html.folded(f"poles of {matrix}, slowest first", table)
+
+
+def _at_zero(design: HasPoles) -> Mask:
+    """Return which poles of a sampled design are zero, as those of delays are.
+
+    The result is false for all poles if all are zero, because the table has no other rows.
+    """
+    zero: Mask = np.abs(design.poles) < _DEADBEAT
+    if not design.dt or zero.all():
+        zero = np.zeros(len(zero), dtype=bool)
+    return zero
+
+
+def _of_delay(count: int) -> str:
+    """Return a line on poles at zero."""
+    return f"{counted(count, 'pole')} at zero (delay)"
 
 
 def poles_figure(design: HasPoles, matrix: str) -> str:
@@ -768,8 +798,8 @@ def poles_figure(design: HasPoles, matrix: str) -> str:
 
 
 def _pole_rows(design: HasPoles) -> list[list[str]]:
-    """Return a table of the poles, slowest first."""
-    poles = design.poles[design.poles.imag >= 0.0]
+    """Return a table of the poles, slowest first, without the poles of delays."""
+    poles = design.poles[(design.poles.imag >= 0.0) & ~_at_zero(design)]
     rates = rates_of(poles, design.dt)
     pole_title = "pole" if design.dt else "pole [1/s]"
     heads = [pole_title, "frequency [rad/s]", "damping", "times"]
@@ -830,14 +860,14 @@ def _regulated(gain: Gain) -> Array:
 
 
 def _may_be_fragile(gain: Gain) -> bool:
-    """Return whether the disk margin may be below _FRAGILE.
+    """Return whether the disk margin may be below FRAGILE.
 
     Both conditions below exclude it, and are quicker than the margin itself.
     """
-    if guaranteed_margin(gain) >= _FRAGILE and not is_delayed(gain.state_names):
+    if guaranteed_margin(gain) >= FRAGILE and not is_delayed(gain.state_names):
         return False
     F, G, H, D = asymmetry(gain)
-    bound = 1.0 / _FRAGILE
+    bound = 1.0 / FRAGILE
     if np.linalg.norm(D, 2) >= bound:
         return True
     _, on_axis = gain_crossings(F, G, H, D, bound)

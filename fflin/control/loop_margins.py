@@ -10,6 +10,9 @@ from fflin.base.html import Reported
 from fflin.base.tables import cut, folded, grid
 from fflin.base.validation import FrozenArrays, Values
 
+# A disk margin below this gives a warning.
+FRAGILE = 0.3
+
 Place = Literal["inputs", "outputs"]
 
 
@@ -133,6 +136,8 @@ class Margins(FrozenArrays, Reported):
         )
         if self.disk_reached > self.disk * (1.0 + 1e-3):
             together += f"; a change of {self.disk_reached:.3g} makes the loop unstable"
+        if self.disk < FRAGILE:
+            together += "; a small delay or model error makes the loop unstable"
         parts = [together]
         if self.samples > 1:
             parts.append(

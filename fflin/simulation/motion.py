@@ -20,15 +20,15 @@ from fflin.base.tables import data_frame
 from fflin.base.validation import Array, Open, Vector, instance
 from fflin.base.writing import RECORDS, as_path, check_ending
 from fflin.dynamics.coordinates import frame_of
-from fflin.dynamics.impact import Impact, joint_called
+from fflin.dynamics.impact import Impact
 from fflin.dynamics.state import Actuation, StateMap
 from fflin.dynamics.state_rows import attitude_errors, moving_errors, state_history
 from fflin.linear.files import arguments, labels, write_table
 from fflin.linear.model import StatesAndInputs
 from fflin.linear.trajectory import Trajectory
-from fflin.robot.joints import ROOT
 from fflin.robot.orbit import Orbit, orbit_from_json
 from fflin.robot.robot import Robot
+from fflin.simulation.phases import in_coordinates_of, named_phase, require_start
 from fflin.simulation.pointing import pointing
 from fflin.simulation.report import (
     Passed,
@@ -48,11 +48,6 @@ FORMATS = (*RECORDS, ".csv")
 
 # Frames per second of the page that notebooks show, chosen for a small file.
 _FPS = 10.0
-
-# Tolerance [SI units] of positions and rates when phases are joined: a phase must start where the
-# phase before it ended. If the largest rate at this time exceeds 1, the tolerance is multiplied by
-# that rate.
-_MET = 1e-6
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -338,7 +333,8 @@ class Motion(StatesAndInputs, Design):
         *later : Impact or Motion
             Later phases in order. An impact, which `capture` or `jam` returns, happens at the last
             row of the phase before it. A motion, which `simulate` returns, starts where the phase
-            before it ended.
+            before it ended, with the same mass properties. Only a capture adds a payload. A release
+            needs no impact: simulate the robot without the payload or the constraint.
 
         Returns
         -------
@@ -351,8 +347,8 @@ class Motion(StatesAndInputs, Design):
         ------
         InputError
             If no phase is given, or the last phase is an impact. Also if a phase does not begin at
-            the end of the phase before it, has another frame or more inputs than this motion, or
-            was read from a file.
+            the end of the phase before it, has other mass properties without an impact, has another
+            frame or more inputs than this motion, or was read from a file.
         """
         if not later:
             raise InputError(
@@ -381,7 +377,7 @@ class Motion(StatesAndInputs, Design):
         event = ""  # impact directly before the next motion, which names its phase
         for part in parts[1:]:
             if isinstance(part, Impact):
-                _require_start(part.event, *part._before, (robot, q, v))
+                require_start(part.event, *part._before, (robot, q, v))
                 robot = part.robot
                 q = part.q
                 v = part.v
@@ -390,8 +386,8 @@ class Motion(StatesAndInputs, Design):
                 whole = replace(whole, notes=(*whole.notes, note))
             else:
                 instance("a phase", part, Motion, "a Motion, or an Impact before one")
-                name = event or _named_phase(robot, part)
-                _require_start(name, part._robot, part.q[0], part.v[0], (robot, q, v))
+                name = event or named_phase(robot, part._robot)
+                require_start(name, part._robot, part.q[0], part.v[0], (robot, q, v))
                 robot = part._robot
                 q = part.q[-1]
                 v = part.v[-1]
@@ -503,67 +499,6 @@ def require_motion(motion: object) -> Motion:
     return instance("motion", motion, Motion, "a Motion, as fflin.simulate returns it")
 
 
-def _require_start(
-    name: str, robot: Robot, q: Array, v: Array, end: tuple[Robot, Array, Array]
-) -> None:
-    """Raise `InputError` if a phase does not begin where the phase before it ended.
-
-    `name` is the name of the phase, whose robot begins at q (nq,) and v (nv,). `end` contains the
-    robot, q and v at the end of the phase before it.
-    """
-    end_robot, end_q, end_v = end
-    starts = _in_coordinates_of(end_robot, robot, end_q, q[None], v[None])
-    start_q, start_v = (rows[0] for rows in starts)
-    model = end_robot.model
-    apart = np.maximum(
-        np.abs(pin.difference(model, end_q, start_q)), np.abs(start_v - end_v)
-    )
-    if apart.max() > _MET * max(1.0, np.abs(end_v).max()):
-        # The joint whose entries of v contain the entry that differs most: its first entry is the
-        # last first entry that is not after it.
-        worst = int(apart.argmax())
-        joint = int(np.searchsorted(model.idx_vs, worst, side="right")) - 1
-        raise InputError(
-            f"'{name}' does not begin where the motion before it ended: "
-            f"'{model.names[joint]}' differs by {apart.max():.2g} in position or rate; "
-            "start from q and v in the last row of that motion"
-        )
-
-
-def _named_phase(before: Robot, motion: Motion) -> str:
-    """Return the name of a phase after a motion of the robot `before`.
-
-    The name is the robot, or the constraints that the robot no longer has.
-    """
-    held = [item.title for item in motion._robot.constraints]
-    released = [item.title for item in before.constraints if item.title not in held]
-    if released:
-        return f"{', '.join(released)} released"
-    return motion.robot
-
-
-def _in_coordinates_of(
-    robot: Robot, other: Robot, last: Array, q: Array, v: Array
-) -> tuple[Array, Array]:
-    """Convert rows q (N, nq) and v (N, nv) of the robot `other` to the coordinates of `robot`.
-
-    Joints that `other` lacks are at rest, at their positions in `last` (nq,), a configuration of
-    `robot`.
-    """
-    new_q = np.tile(last, (len(q), 1))
-    new_v = np.zeros((len(q), robot.nv))
-    for name in list(robot.model.names)[ROOT:]:
-        if not other.model.existJointName(name):
-            continue
-        to = joint_called(robot, name)
-        source = joint_called(other, name)
-        q_of_joint = q[:, source.idx_q : source.idx_q + source.nq]
-        v_of_joint = v[:, source.idx_v : source.idx_v + source.nv]
-        new_q[:, to.idx_q : to.idx_q + to.nq] = q_of_joint
-        new_v[:, to.idx_v : to.idx_v + to.nv] = v_of_joint
-    return new_q, new_v
-
-
 def _named_frame(motion: Motion) -> str:
     """Return the frame of a motion for messages."""
     text = f"'{motion.frame}'"
@@ -604,7 +539,7 @@ def _longer(whole: Motion, motion: Motion, name: str) -> Motion:
     last = whole.q[-1]
     near = whole.x[-1]
     t = motion.t - motion.t[0] + whole.t[-1]
-    convert = partial(_in_coordinates_of, state.robot, other_state.robot, last)
+    convert = partial(in_coordinates_of, state.robot, other_state.robot, last)
     q, v = convert(motion.q, motion.v)
     target = np.zeros(0)
     if whole.target.size and motion.target.size:

@@ -19,7 +19,7 @@ from fflin.base.rotation import rotation_matrices
 from fflin.base.tables import counted
 from fflin.base.validation import Array
 from fflin.dynamics.coordinates import Frame, frame_of
-from fflin.dynamics.impact import Capture, Impact, inertia_at
+from fflin.dynamics.impact import Capture, Impact, inertia_at, joint_called
 from fflin.dynamics.integrators import DEFAULT_INTEGRATOR
 from fflin.dynamics.state import Actuation, StateMap
 from fflin.linear.model import LinearModel
@@ -54,7 +54,7 @@ ARROW, _FAR = 0.62, 20.0
 # Length of the arrow for the largest force of the constraints, relative to the robot's size.
 REACTION = 0.4
 
-# The flight of a payload before its capture is integrated in steps of at most _STEP [s]. Within a
+# The flight of a free payload is integrated in steps of at most _STEP [s]. Within a
 # step, the phase of the payload's fastest oscillation changes by at most _SWING [rad].
 _STEP, _SWING = 0.05, 0.3
 
@@ -436,24 +436,59 @@ def payloads(
     for k, caught in enumerate(parts):
         if not isinstance(caught, Capture):
             continue
+        payload = caught.payload
         before = motion.t[shown[shown < first[k]]] - motion.t[first[k]]
-        poses = _flight(caught, frame, before)
-        for part, start, end in zip(parts[k:], first[k:], first[k + 1 :], strict=False):
-            rows = shown[(shown >= start) & (shown < end)] - start
+        start = (caught.payload_q, caught.payload_v)
+        poses = _flight(payload, *start, frame, before[::-1])[::-1]
+        last: Motion | None = None  # last phase in which the robot holds the payload
+        for j in range(k, len(parts)):
+            part = parts[j]
+            if isinstance(part, Impact):
+                continue
+            rows = shown[(shown >= first[j]) & (shown < first[j + 1])]
+            if caught.prefix not in dict(part._robot.attached):
+                break
+            last = part
+            end = first[j + 1]
             if len(rows):
-                poses += _held(caught, part._robot, part.q[rows])
+                poses += _held(caught, part._robot, part.q[rows - first[j]])
+        if last is not None:
+            after = motion.t[shown[shown >= end]] - motion.t[end - 1]
+            start = _released(caught, last._robot, last.q[-1], last.v[-1])
+            poses += _flight(payload, *start, frame, after)
         yield caught, np.array(poses)
 
 
-def _flight(caught: Capture, frame: Frame, t: Array) -> list[Array]:
-    """Return the poses of a payload at times t (N,) [s] before its capture, which is at t = 0.
+def _released(caught: Capture, robot: Robot, q: Array, v: Array) -> tuple[Array, Array]:
+    """Return the configuration and velocity of a payload that the robot holds at q and v."""
+    model = robot.model
+    payload = caught.payload
+    data = model.createData()
+    pin.forwardKinematics(model, data, q, v)
+    frame = model.getFrameId(caught.prefix, pin.FrameType.BODY)
+    placement = pin.updateFramePlacement(model, data, frame)
+    root = payload.model.jointPlacements[ROOT]
+    payload_q = payload.neutral()
+    payload_v = np.zeros(payload.nv)
+    payload_q[:7] = pin.SE3ToXYZQUAT(root.actInv(placement))
+    local = pin.ReferenceFrame.LOCAL
+    payload_v[:6] = pin.getFrameVelocity(model, data, frame, local).vector
+    for name in payload.model.names[ROOT + 1 :]:
+        joint = joint_called(payload, name)
+        held = joint_called(robot, f"{caught.prefix}.{name}")
+        payload_q[joint.idx_q :][: joint.nq] = q[held.idx_q :][: held.nq]
+        payload_v[joint.idx_v :][: joint.nv] = v[held.idx_v :][: held.nv]
+    return payload_q, payload_v
 
-    The free flight is integrated backwards from the capture, without damping and disturbances.
+
+def _flight(payload: Robot, q: Array, v: Array, frame: Frame, t: Array) -> list[Array]:
+    """Return the poses of a free payload at times t (N,) [s], which is at q and v at t = 0.
+
+    All times have the same sign, and their magnitudes increase. The free flight is integrated
+    without damping and disturbances.
     """
-    payload = caught.payload.replace(damping=0.0, disturbance=None)
+    payload = payload.replace(damping=0.0, disturbance=None)
     state = StateMap(payload, frame=frame)
-    q = caught.payload_q
-    v = caught.payload_v
     plant = Plant(state)
     now = 0.0
     poses = list[Array]()
@@ -461,13 +496,13 @@ def _flight(caught: Capture, frame: Frame, t: Array) -> list[Array]:
     softness = np.linalg.inv(state.project(inertia_at(payload, q))).diagonal()[6:]
     # [rad/s] upper bound of frequencies
     rate = np.sqrt(softness @ payload.springs.stiffness)
-    for time in t[::-1].tolist():
-        steps = math.ceil((now - time) * max(1.0 / _STEP, rate / _SWING))
+    for time in t.tolist():
+        steps = math.ceil(abs(now - time) * max(1.0 / _STEP, rate / _SWING))
         for _ in range(steps):
             take = DEFAULT_INTEGRATOR(payload.model, (time - now) / steps).step
             q, v = take(lambda _, q, v: plant.stage(0.0, q, v, none)[0], 0.0, q, v)
         now = time
-        poses.insert(0, body_poses(payload, q))
+        poses.append(body_poses(payload, q))
     return poses
 
 

@@ -155,7 +155,9 @@ def test_runs_of_another_robot_are_not_repeated(oblique, tmp_path):
     with pytest.raises(fflin.InputError, match="another URDF"):
         loaded.replay(0, robot=fflin.load("cubesat"), policy=policy)
     fewer = robot.replace(appendages=[])
-    with pytest.raises(fflin.InputError, match="not that of the campaign"):
+    with pytest.raises(
+        fflin.InputError, match="the robot or policy differs from the campaign"
+    ):
         loaded.replay(0, robot=fewer, policy=None)
 
 

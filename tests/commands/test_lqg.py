@@ -7,7 +7,7 @@ import pytest
 
 import fflin
 from tests.support.c_code import COMPILERS, needs_compiler, outcome
-from tests.support.commands import refused, run
+from tests.support.commands import refused, run, warned
 
 HEAD = """urdf = "cubesat"
 disturbance = { tau_b = [2e-6, -1e-6, 0] }
@@ -112,6 +112,26 @@ def test_the_table_states_the_standard_deviations_of_the_filter(write):
     units = report["units"]
     assert units["q_b.x"] == "deg" and units["disturbance.tau_b.x"] == "N m"
     assert not any(name.startswith("past") for name in shown)
+
+
+def test_a_small_disk_margin_is_a_warning(write):
+    satellite = write(TORQUE, TRACKER, GYROSCOPE)
+    model = fflin.linearize(fflin.load(satellite)).discretize(1.0)
+    gain = fflin.lqr(model, weights={"q": {"q_b": 1000.0}})
+    estimator = fflin.kalman(model, {"v_b": 1e-6, "omega_b": 1e-6})
+    law = fflin.OutputFeedback(model, fflin.lqg(gain, estimator))
+    disk = fflin.margins(law, model).disk
+    assert 0.0 < disk < 0.3
+    options = ("--sample", 1.0, "--disturbance", "none")
+    noise = ("--process-noise", "v_b=1e-6", "--process-noise", "omega_b=1e-6")
+    [warning] = [
+        text
+        for text in warned("lqg", satellite, *options, "--q", "q_b=1000", *noise)
+        if "filter" in text
+    ]
+    assert f"(disk margin {disk:.2g}, below 0.3)" in warning
+    assert "--process-noise" in warning
+    assert not warned("lqg", satellite, "--sample", 0.25)
 
 
 @pytest.mark.exhaustive

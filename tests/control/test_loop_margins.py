@@ -554,3 +554,28 @@ def test_the_margins_of_an_allocation_are_those_of_its_inner_policy():
         for model in (lin, late):
             found = fflin.margins(fflin.Allocation(policy, robot), model)
             assert found.disk == pytest.approx(expected.disk, rel=1e-9)
+
+
+@pytest.mark.parametrize("sample", [None, *exhaustive(0.5)])
+def test_a_model_may_have_more_outputs_than_the_law_measures(sample):
+    wheels = [fflin.ReactionWheel(axis, inertia=1e-5) for axis in np.eye(3)]
+    sensors = [fflin.StarTracker(sample=sample), fflin.Gyroscope("base")]
+    robot = fflin.load("cubesat", inputs=wheels, outputs=sensors)
+    more = [fflin.JointVelocities(("wheel_*",)), *reversed(sensors)]
+    model = fflin.linearize(robot).discretize(0.25)
+    noise = {"v_b": 1e-6, "omega_b": 1e-10}
+    compensator = fflin.lqg(fflin.lqr(model), fflin.kalman(model, noise, 1e-8))
+    flown = fflin.OutputFeedback if sample is None else fflin.MultirateFeedback
+    law = flown(model, compensator)
+    larger = fflin.linearize(robot.replace(outputs=more))
+    assert larger.output_names[0] == "qdot_m.wheel_1"
+    margins = [fflin.margins(law, lin) for lin in (model, larger)]
+    # The loops have the same states, signals and matrices.
+    assert margins[0].disk == pytest.approx(margins[1].disk, rel=1e-9)
+    assert 0.3 < margins[1].disk < 1.0
+    causes = {"noise": {"gyroscope": 1e-5}}
+    budgets = [fflin.error_budget(law, lin, **causes) for lin in (model, larger)]
+    assert budgets[0].total[:3] == pytest.approx(budgets[1].total[:3], rel=1e-9)
+    gyroscope = fflin.linearize(robot.replace(outputs=sensors[1:]))
+    with pytest.raises(fflin.InputError, match="the law measures q_b"):
+        fflin.margins(law, gyroscope)

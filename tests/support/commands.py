@@ -25,6 +25,7 @@ def run(*arguments, cwd=None, **environment):
 def warned(*arguments, cwd=None):
     """Call a command that succeeds; return its warnings."""
     code, _, complained = _called(arguments, cwd, {})
+    hear_lines(complained)
     assert code == 0, complained
     start = "fflin: warning: "
     return {

@@ -1,6 +1,6 @@
 """The page of a motion of several phases: what is caught flies to the grasp, and is held."""
 
-from types import SimpleNamespace
+from itertools import pairwise
 
 import numpy as np
 import pinocchio as pin
@@ -8,7 +8,7 @@ import pytest
 
 import fflin
 from fflin.robot.joints import ROOT
-from fflin.view.pages import _flight
+from fflin.view.pages import _flight, payloads
 from tests.support.phases import DEBRIS, TWIST, phases
 
 # Positions travel as 32-bit floats, of metres.
@@ -155,9 +155,55 @@ def test_in_orbit_a_payload_came_as_it_flies_there(frame):
     flown = fflin.simulate(
         payload, None, q0=q, v0=v, duration=8.0, dt=0.05, frame=frame
     )
-    end = SimpleNamespace(payload=payload, payload_q=flown.q[-1], payload_v=flown.v[-1])
-    first, *_, last = _flight(end, frame, np.array([-8.0, -4.0, -0.05]))
+    end = payload, flown.q[-1], flown.v[-1]
+    last, *_, first = _flight(*end, frame, np.array([-0.05, -4.0, -8.0]))
     assert first[0] == pytest.approx(q, abs=1e-6)
     assert last[0] == pytest.approx(flown.q[-2], abs=1e-9)
     other = {"lvlh": "hill", "hill": "lvlh"}[frame]
-    assert np.abs(_flight(end, other, np.array([-8.0]))[0][0] - q).max() > 0.1
+    assert np.abs(_flight(*end, other, np.array([-8.0]))[0][0] - q).max() > 0.1
+
+
+def test_a_released_body_flies_on():
+    robot = fflin.load("servicer_7dof")
+    how = {"duration": 1.0, "dt": 0.1, "engine": "python"}
+    v = fflin.velocity(robot, {"joint_3": 0.1, "omega_b.x": 0.05, "v_b.y": 0.02})
+    first = fflin.simulate(robot, q0=robot.neutral(), v0=v, **how)
+    end = {"q": first.q[-1], "v": first.v[-1]}
+    caught = fflin.capture(robot, "tool", DEBRIS, **end, payload_v=TWIST)
+    held = fflin.simulate(caught.robot, q0=caught.q, v0=caught.v, **how)
+    free = fflin.simulate(robot, q0=held.q[-1], v0=held.v[-1], **how)
+    whole = first.then(caught, held, free)
+    rows = np.arange(len(whole.t))
+    [(_, poses)] = payloads(whole, "hybrid", rows)
+    assert len(poses) == len(rows)
+    ends = np.cumsum([len(first.t), len(held.t)])
+    before, after = ends[1] - 1, ends[1]
+    assert poses[after] == pytest.approx(poses[before], abs=1e-12)
+    released = pin.XYZQUATToSE3(poses[before, 0])
+    frame = caught.robot.model.getFrameId("payload", pin.FrameType.BODY)
+    data = caught.robot.create_data()
+    model = caught.robot.model
+    pin.forwardKinematics(model, data, held.q[-1], held.v[-1])
+    twist = pin.getFrameVelocity(model, data, frame, pin.ReferenceFrame.WORLD)
+    center = released.act(DEBRIS.lever)
+    speed = twist.linear + np.cross(twist.angular, center)
+    last = pin.XYZQUATToSE3(poses[-1, 0])
+    assert np.linalg.norm(speed) > 1e-3
+    assert last.act(DEBRIS.lever) == pytest.approx(center + speed, abs=1e-9)
+    momentum = [
+        pose.rotation @ DEBRIS.inertia @ pose.rotation.T @ rate
+        for pose, rate in (
+            (released, twist.angular),
+            (last, _rate(poses[-3:, 0], how["dt"])),
+        )
+    ]
+    # The rates are extrapolated from differences; their relative errors are of size (rate dt)^2.
+    size = np.linalg.norm(momentum[0])
+    assert momentum[1] == pytest.approx(momentum[0], abs=1e-4 * size)
+
+
+def _rate(poses, dt):
+    """Return the angular velocity at the last of three poses, in world axes."""
+    turns = [pin.XYZQUATToSE3(pose).rotation for pose in poses]
+    halfway = [pin.log3(b @ a.T) / dt for a, b in pairwise(turns)]
+    return 1.5 * halfway[1] - 0.5 * halfway[0]
