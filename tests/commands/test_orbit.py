@@ -63,6 +63,7 @@ def test_controllability_and_observability_over_a_period():
     assert "without --periodic" in refused("analyze", "cubesat", "--motion", "free")
 
 
+@pytest.mark.exhaustive
 def test_the_first_line_does_not_state_an_undecided_rank():
     robot = fflin.load(SATELLITE)
     result = fflin.controllability(fflin.linearize_orbit(robot, steps=8))

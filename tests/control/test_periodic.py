@@ -205,6 +205,7 @@ ARM_Q = {"q_b": 1.0, "q_m": 1.0, "omega_b": 1e4, "qdot_m": 1e-3}
 ARM_R = {"wheel": 1e4, "tau_m": 1e4}
 
 
+@pytest.mark.exhaustive
 @pytest.mark.filterwarnings("ignore:ets_vii. unphysical", "ignore:the phase margin")
 def test_a_circular_orbit_gives_the_gain_of_lqr_for_wheels_and_joints():
     along = arm_with_wheels(fflin.CircularOrbit(altitude=1200e3))
@@ -251,6 +252,7 @@ def test_an_elliptic_orbit_gives_the_cost_of_a_backward_sweep_for_wheels_and_joi
     assert not schedule.P[:, others].any()
 
 
+@pytest.mark.exhaustive
 @pytest.mark.filterwarnings("ignore:ets_vii. unphysical")
 def test_wheel_speeds_without_weight_may_keep_their_momentum():
     """Momentum normal to the orbit costs nothing, so its rounding errors must not grow."""
