@@ -58,7 +58,7 @@ def test_a_trajectory_at_rest_gives_the_motion_of_the_law_about_its_point():
     policy = law.follow(resting(robot, pin.SE3.Identity()))
     options = {
         "q0": fflin.configuration(robot, rpy=(3, -1, 2)),
-        "duration": 5.0,
+        "duration": 2.5,
         "dt": SAMPLE,
     }
     plain, following = (
@@ -102,7 +102,7 @@ def test_equal_rates_follow_as_an_output_feedback_does():
     trajectory = slew(robot)
     options = {
         "q0": fflin.configuration(robot, rpy=(1, 2, -1)),
-        "duration": 8.0,
+        "duration": 4.0,
         "dt": SAMPLE,
     }
     ordinary, periodic = (
@@ -153,6 +153,7 @@ def test_a_slew_of_30_degrees_with_a_late_star_tracker():
     assert noisy.attitude_error[-1] < 0.05
 
 
+@pytest.mark.exhaustive
 def test_a_slow_sensor_follows_a_trajectory():
     """A slow value is compared with the reference at the time of its measurement."""
     robot = satellite(sample=0.2, delay=0.1, noise=False)
