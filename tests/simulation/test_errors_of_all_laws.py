@@ -36,6 +36,7 @@ WITHOUT_OUTPUTS = {
     "Feedback",
     "OutputSensing",
     "LinearLaw",
+    "PointLaw",
     "StateFeedback",
     "ScheduledFeedback",
     "TrajectoryFeedback",
@@ -123,6 +124,10 @@ def following(robot):
     return output_feedback(robot).follow(resting(robot))
 
 
+def following_at_different_rates(robot):
+    return multirate_feedback(robot).follow(resting(robot))
+
+
 def allocation(law):
     """Return a function of a robot that returns the allocation of a law."""
     return lambda robot: fflin.Allocation(law(robot), robot)
@@ -136,12 +141,13 @@ LAWS = {
     "predictive": (OutputMpc, output_mpc),
     "along a trajectory": (fflin.TrajectoryOutputFeedback, along_trajectory),
     "following": (Following, following),
+    "following at different rates": (Following, following_at_different_rates),
     "allocation": (fflin.Allocation, allocation(output_feedback)),
     "allocation of following": (fflin.Allocation, allocation(following)),
     "allocation along a trajectory": (fflin.Allocation, allocation(along_trajectory)),
 }
 COMPILED = [name for name in LAWS if name != "predictive"]
-DELAYED = {"different rates"}
+DELAYED = {"different rates", "following at different rates"}
 
 
 def pair(name):
