@@ -859,8 +859,12 @@ def budget_of(
     policy: fflin.Policy | None,
     motion: fflin.Motion | None,
     arguments: Namespace,
+    after: float | None = None,
 ) -> fflin.ErrorBudget:
-    """Return the error budget of a loop, compared with its motion if there is one."""
+    """Return the error budget of a loop, compared with its motion if there is one.
+
+    The errors of the motion are counted from the time `after` [s] on, by default in its last half.
+    """
     if policy is None or policy.model is None or not policy.laws_of_period():
         raise InputError(
             "--budget needs a linear regulator about a point; remove --budget, or the options for "
@@ -879,6 +883,7 @@ def budget_of(
         robot=robot,
         motion=motion,
         limit_cycle=motion is not None,
+        after=after,
     )
 
 

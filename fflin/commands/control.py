@@ -332,12 +332,14 @@ def simulate(arguments: Namespace) -> Report:
         text += f"\n{folded([line])}"
     if detumbling_law(arguments) is not None and not motion.stopped:
         record["detumbling_time"] = fflin.detumbling_time(motion)
+    settled = None
     if window is not None and not motion.stopped:
         pointing = motion.pointing(window, accuracy=arguments.accuracy)
+        settled = pointing.after
         record["pointing"] = pointing
         text += f"\n\n{pointing}"
     if arguments.budget and not motion.stopped:
-        budget = budget_of(robot, policy, motion, arguments)
+        budget = budget_of(robot, policy, motion, arguments, settled)
         record["budget"] = budget
         text += f"\n\n{budget}"
     return Report(robot.name, record, text, files, code, interrupted)

@@ -418,9 +418,11 @@ def _analysis_of_period(arguments: Namespace) -> Report:
 
 def _rank(ranks: fflin.Controllability | fflin.Observability, adjective: str) -> str:
     """Return whether all states are controllable, or observable, for the headline."""
-    from fflin.analysis.ranks import FROZEN
+    from fflin.analysis.ranks import FROZEN, GRAMIAN
 
     nx = len(ranks.basis)
+    if ranks.method == GRAMIAN and ranks.margin.doubts:
+        return f"{adjective.removesuffix('able')}ability undecided"
     if ranks.bound < nx:
         most = "at most " if ranks.method == FROZEN else ""
         return f"not {adjective} ({most}{ranks.bound}/{nx})"

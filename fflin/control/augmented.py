@@ -19,7 +19,6 @@ from fflin.base.validation import (
     positive,
     quantity,
 )
-from fflin.control.data_sheet import Sheet, bias_intensities
 from fflin.control.estimator import BIAS, DISTURBANCE
 from fflin.dynamics.integrators import held_cost, held_exponential
 from fflin.linear.linearization import linearize
@@ -77,12 +76,14 @@ class AddedStates:
 def added_states(
     lin: LinearModel,
     disturbance_noise: Mapping[str, float] | None,
-    bias_noise: Mapping[str, Sheet] | None,
+    biases: Mapping[int, float],
     disturbance_frequency: Mapping[str, float | Sequence[float]] | None,
 ) -> AddedStates:
-    """Return the states of disturbances and biases with the arguments of `kalman`."""
+    """Return the states of disturbances and biases with the arguments of `kalman`.
+
+    `biases` contains the result of `bias_intensities`.
+    """
     forces, frequencies = _chosen_forces(lin, disturbance_noise, disturbance_frequency)
-    biases = bias_intensities(lin, bias_noise)
     to_x, to_y = _force_columns(lin, tuple(forces))
     names, size, rates = list[str](), list[float](), [0.0]
     blocks, acting = list[Array](), [np.zeros((len(forces), 0))]

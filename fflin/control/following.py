@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -14,7 +14,7 @@ from fflin.base.validation import Array, instance
 from fflin.control.loops import Loop, Sample, StateMeasuring, Step
 from fflin.control.policy import Command, Noise, OutputForm, Policy, Reference
 from fflin.control.sensed_laws import sensed
-from fflin.control.sensors import timing_of_robot
+from fflin.control.sensors import SensorTiming, require_timing, timing_of_robot
 from fflin.control.trajectory_end import resting_end
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.coordinates import Frame
@@ -42,17 +42,20 @@ class Following(Policy):
     ----------
     law : Policy
         Sampled linear law about the point of its model.
-    terms : Sample
-        Matrices of this law.
+    terms : sequence of Sample
+        Matrices of this law at each sample of its period.
     trajectory : Trajectory
     noise : callable, optional
         Function noise(t) that returns the measurement noise.
+    timing : SensorTiming, optional
+        Sample times and delays that the sensors must have. By default, they may be any.
     """
 
     law: Policy
-    terms: Sample = field(repr=False)
+    terms: Sequence[Sample] = field(repr=False)
     trajectory: Trajectory
     noise: Noise | None = None
+    timing: SensorTiming | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         instance("trajectory", self.trajectory, Trajectory, "a fflin.Trajectory")
@@ -151,6 +154,11 @@ class Following(Policy):
     def with_sensor_errors(self, error: Callable[[float], Array]) -> Policy:
         """Return the law with errors of its sensors."""
         return replace(self, noise=error)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Remarks on the law."""
+        return self.law.notes
 
     def loop_notes(self, held: float = 0.0) -> tuple[str, ...]:
         """Return the notes on the loop of the law about its point."""
@@ -252,14 +260,17 @@ class Following(Policy):
         if self.noise is not None and not self.senses_outputs:
             return None
         path = ReferencePath(self, robot)
-        return OutputForm(self._loop(robot), path.terms, self.samples)
+        period = len(path.about_point)
+        # The last samples have the final reference, and contain each matrix of the period.
+        samples = self.samples + period - 1
+        return OutputForm(self._loop(robot), path.terms, samples, period)
 
     def _loop(self, robot: Robot) -> Loop:
         """Return the command of the law for a robot."""
         self._require_fit(robot)
         path = ReferencePath(self, robot)
-        correction = path.about_point.E
-        windup = (lambda _: correction) if correction.size else None
+        corrected = path.about_point[0].E.size
+        windup = (lambda t: path.matrices(t).E) if corrected else None
         return Loop(
             path.state,
             self.sample_time,
@@ -301,22 +312,18 @@ def _with_inputs_of(lin: LinearModel, trajectory: Trajectory) -> Trajectory:
     )
 
 
-def _with_delays(terms: Sample, law: Following, state: StateMap) -> Sample:
-    """Return a law in series with the delays of the sensors of a robot.
+def _with_sensors(
+    terms: Sequence[Sample], law: Following, state: StateMap
+) -> list[Sample]:
+    """Return a law in series with the sensors of a robot, for each sample of a common period.
 
-    The delays act on the differences of measured and planned outputs. So a late measurement is
-    compared with the reference at the time of the measurement.
+    The sensors act on the differences of measured and planned outputs. So a late or held
+    measurement is compared with the reference at the time of the measurement.
     """
     if not law.senses_outputs:
-        return terms
-    late = sensed([terms], timing_of_robot(state, law.sample_time))
-    if len(late) > 1:
-        raise InputError(
-            f"outputs of '{state.robot.name}' have a sample other than {law.sample_time:g} s, the "
-            "sample time of the law, which follow does not support; leave out sample of these "
-            "outputs"
-        )
-    return late[0]
+        return list(terms)
+    require_timing(law.timing, state, law.sample_time)
+    return sensed(terms, timing_of_robot(state, law.sample_time))
 
 
 class ReferencePath:
@@ -334,14 +341,22 @@ class ReferencePath:
             self._aba = Aba(StateMap(law.trajectory.robot, frame="local"))
         terms = law.terms
         if not law.senses_outputs:
-            terms = terms._replace(B=terms.B @ self.S, D=terms.D @ self.S)
-        self.about_point = _with_delays(terms, law, state)
+            terms = [
+                term._replace(B=term.B @ self.S, D=term.D @ self.S) for term in terms
+            ]
+        # Law about its point at each sample of its period.
+        self.about_point = _with_sensors(terms, law, state)
 
     @property
     def sizes(self) -> tuple[int, int]:
         """Number of states of the law, and of its measured values."""
-        nz, ny = self.about_point.B.shape
+        nz, ny = self.about_point[0].B.shape
         return nz, ny
+
+    def matrices(self, t: float) -> Sample:
+        """Return the law about its point at the sample at time t [s]."""
+        sample = round(t / self.law.sample_time)
+        return self.about_point[sample % len(self.about_point)]
 
     def at(self, t: float) -> tuple[Step, Measuring | StateMeasuring, Array]:
         """Return the step of the law, its measurements, and the state of the reference."""
@@ -367,5 +382,5 @@ class ReferencePath:
         if self._aba is not None:
             a = self._aba.acceleration(q, v, u)
         y = np.asarray(measure(x, q, v, a))
-        terms = self.about_point._replace(u0=self.law.feedforward(t), y0=y)
+        terms = self.matrices(t)._replace(u0=self.law.feedforward(t), y0=y)
         return terms, measure, x

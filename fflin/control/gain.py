@@ -17,7 +17,7 @@ from fflin.base import html, svg
 from fflin.base.errors import FflinError, InputError, listed, require_known
 from fflin.base.names import group_of, input_keys, with_units, without_past
 from fflin.base.record import Design
-from fflin.base.tables import cut, folded, grid, matrix, signals
+from fflin.base.tables import counted, cut, folded, grid, matrix, signals
 from fflin.base.validation import Array, Mask, Poles, Values, Vector
 from fflin.control.delayed import is_delayed, law_with_memory
 from fflin.control.loop_margins import FRAGILE
@@ -48,6 +48,10 @@ if TYPE_CHECKING:
 # The report omits a gain with more entries than this, which is the number of entries of K for a
 # robot with 3 joints and one input for each degree of freedom.
 _LARGE = 9 * 18
+
+# A pole of a sampled design with at most this magnitude is shown as zero. Delays cause such poles,
+# and rounding errors move them, because they are multiple.
+_DEADBEAT = 1e-6
 
 # A gain whose Riccati equation has at most this relative residual has the margins of the optimal
 # gain, except for errors that are small compared with them.
@@ -775,15 +779,36 @@ def table_of_poles(design: HasPoles, matrix: str) -> str:
     """
     if not len(design.poles):
         return f"{matrix} has no poles"
-    return f"poles of {matrix}, slowest first\n\n{grid(cut(_pole_rows(design)), 'l')}"
+    parts = [f"poles of {matrix}, slowest first", grid(cut(_pole_rows(design)), "l")]
+    if deadbeat := int(_at_zero(design).sum()):
+        parts.append(_of_delay(deadbeat))
+    return "\n\n".join(parts)
 
 
 def folded_poles(design: HasPoles, matrix: str) -> str:
     """Return the table of the poles of a matrix in HTML, which the reader can open."""
     if not len(design.poles):
         return ""
-    rows = cut(_pole_rows(design), "see poles")
-    return html.folded(f"poles of {matrix}, slowest first", html.table(rows, "l"))
+    table = html.table(cut(_pole_rows(design), "see poles"), "l")
+    if deadbeat := int(_at_zero(design).sum()):
+        table += html.paragraph(_of_delay(deadbeat))
+    return html.folded(f"poles of {matrix}, slowest first", table)
+
+
+def _at_zero(design: HasPoles) -> Mask:
+    """Return which poles of a sampled design are zero, as those of delays are.
+
+    The result is false for all poles if all are zero, because the table has no other rows.
+    """
+    zero: Mask = np.abs(design.poles) < _DEADBEAT
+    if not design.dt or zero.all():
+        zero = np.zeros(len(zero), dtype=bool)
+    return zero
+
+
+def _of_delay(count: int) -> str:
+    """Return a line on poles at zero."""
+    return f"{counted(count, 'pole')} at zero (delay)"
 
 
 def poles_figure(design: HasPoles, matrix: str) -> str:
@@ -792,8 +817,8 @@ def poles_figure(design: HasPoles, matrix: str) -> str:
 
 
 def _pole_rows(design: HasPoles) -> list[list[str]]:
-    """Return a table of the poles, slowest first."""
-    poles = design.poles[design.poles.imag >= 0.0]
+    """Return a table of the poles, slowest first, without the poles of delays."""
+    poles = design.poles[(design.poles.imag >= 0.0) & ~_at_zero(design)]
     rates = rates_of(poles, design.dt)
     pole_title = "pole" if design.dt else "pole [1/s]"
     heads = [pole_title, "frequency [rad/s]", "damping", "times"]

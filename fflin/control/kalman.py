@@ -19,7 +19,12 @@ from fflin.base.errors import DetectabilityError, InputError, listed
 from fflin.base.names import input_keys
 from fflin.base.validation import Array, ArrayLike, dimension, shaped
 from fflin.control.augmented import AddedStates, added_states
-from fflin.control.data_sheet import Noises, Sheet, measurement_noise
+from fflin.control.data_sheet import (
+    Noises,
+    Sheet,
+    bias_intensities,
+    measurement_noise,
+)
 from fflin.control.estimator import BIAS, Estimator
 from fflin.control.filter_problem import FilterProblem
 from fflin.control.lqr import at_fixed_point
@@ -190,9 +195,12 @@ def kalman(
 
 
 def stationary_kalman(lin: LinearModel, W: Weight, V: Noises) -> Estimator:
-    """Return the filter of `kalman` for outputs that are measured at each sample."""
+    """Return the filter of `kalman` for outputs that are measured at each sample.
+
+    It estimates the states alone, also if outputs declare a bias.
+    """
     try:
-        return _stationary(_problem(lin, W, V, None, None, (None, None, None)))
+        return _stationary(_problem(lin, W, V, None, None, None))
     except np.linalg.LinAlgError as error:
         raise _no_filter(error) from None
 
@@ -213,18 +221,27 @@ def _problem(
         Mapping[str, float] | None,
         Mapping[str, Sheet] | None,
         Mapping[str, float | Sequence[float]] | None,
-    ],
+    ]
+    | None,
 ) -> FilterProblem:
     """Return the data of a filter with the arguments of `kalman`.
 
-    `slow` contains `disturbance_noise`, `bias_noise` and `disturbance_frequency`.
+    `slow` contains `disturbance_noise`, `bias_noise` and `disturbance_frequency`. If it is None,
+    the filter estimates no disturbances and no biases.
     """
     whole = at_fixed_point(lin)
     noise, through = disturbance(whole, W, G)
     sensed = measurement_noise(whole, V)
     covariance = weight("V", sensed, whole.output_names, definite=True)
     # Disturbances are not delayed, so they do not act on the commands that are on their way.
-    added = added_states(whole.undelayed, *slow).padded(len(whole.added))
+    model = whole.undelayed
+    added = added_states(model, None, {}, None)
+    if slow is not None:
+        forces, biases, frequencies = slow
+        added = added_states(
+            model, forces, bias_intensities(model, biases), frequencies
+        )
+    added = added.padded(len(whole.added))
     _require_not_felt(whole, added)
     part = _estimated_part(whole, through @ noise, wheel_speeds)
     in_part = selection(part.state_names, whole.state_names)

@@ -27,6 +27,7 @@ from fflin.base.writing import RECORDS, as_path, check_ending, reason
 from fflin.control.compensator import Compensator
 from fflin.control.law_files import in_time_of_file
 from fflin.control.loops import NOT_CORRECTED
+from fflin.control.multirate import MultirateCompensator
 from fflin.control.policies import LinearLaw, OutputSensing
 from fflin.control.policy import (
     Noise,
@@ -271,6 +272,11 @@ class OutputFeedback(LinearController):
     def __init__(
         self, lin: LinearModel, compensator: Compensator, noise: Noise | None = None
     ) -> None:
+        if isinstance(compensator, MultirateCompensator):
+            raise InputError(
+                "the compensator is for outputs with their own sample or delay; use "
+                "fflin.MultirateFeedback(lin, compensator)"
+            )
         instance(
             "compensator",
             compensator,

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from fflin.base import html
-from fflin.base.tables import folded, grid
+from fflin.base.tables import counted, folded, grid
 from fflin.base.validation import Array, Mask, Poles, Vector
 from fflin.control.estimator import EstimatingDesign, added_notes
 from fflin.control.filter_problem import FilterProblem
@@ -156,7 +156,7 @@ class MultirateEstimator(_Periodic):
         return (
             f"{self.robot}: estimator of {len(self.estimated)} states from "
             f"{len(self.output_names)} outputs, sampled at {self.dt:g} s, with a period of "
-            f"{self.samples} samples"
+            f"{counted(self.samples, 'sample')}"
         )
 
 
@@ -244,8 +244,8 @@ class MultirateCompensator(_Periodic):
         nu, nz = self.C.shape
         return (
             f"{self.robot}: compensator with {nz} states, from {len(self.input_names)} outputs of "
-            f"the robot to {nu} inputs, sampled at {self.dt:g} s, with a period of {self.samples} "
-            "samples"
+            f"the robot to {nu} inputs, sampled at {self.dt:g} s, with a period of "
+            f"{counted(self.samples, 'sample')}"
         )
 
 

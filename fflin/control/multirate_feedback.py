@@ -10,10 +10,15 @@ from fflin.base.errors import InputError
 from fflin.base.validation import Array, Mask, instance
 from fflin.control.loops import NOT_CORRECTED, Loop, PredictedLaw, Sample
 from fflin.control.multirate import MultirateCompensator
-from fflin.control.policies import Feedback, OutputSensing, at_samples
+from fflin.control.policies import OutputSensing, PointLaw, at_samples
 from fflin.control.policy import Command, Noise, OutputForm, Predictor, System
 from fflin.control.sensed_laws import sensed
-from fflin.control.sensors import timing_of_model, timing_of_robot
+from fflin.control.sensors import (
+    SensorTiming,
+    require_timing,
+    timing_of_model,
+    timing_of_robot,
+)
 from fflin.dynamics.outputs import Measuring
 from fflin.dynamics.state import StateMap
 from fflin.linear.fit import about_point, require_fit
@@ -22,7 +27,7 @@ from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
 
 
-class MultirateFeedback(OutputSensing, Feedback):
+class MultirateFeedback(OutputSensing, PointLaw):
     """Feedback of outputs that are measured at different rates, by the compensator of `lqg`.
 
     At each sample of the model, u - u0 = C z is applied, and the measurements that arrive correct
@@ -111,7 +116,12 @@ class MultirateFeedback(OutputSensing, Feedback):
         felt: Mask = np.any(lin.C[used], axis=0)
         return tuple(compress(lin.state_names, felt))
 
-    def terms(self) -> list[Sample]:
+    @property
+    def designed_timing(self) -> SensorTiming | None:
+        """Sample times and delays of the design; None if the model's robot is unknown."""
+        return None if self.lin._robot is None else timing_of_model(self.lin)
+
+    def terms_of_period(self) -> list[Sample]:
         """Return the matrices and offsets for each sample of the period."""
         law = self.compensator
         lin = self.lin
@@ -127,7 +137,7 @@ class MultirateFeedback(OutputSensing, Feedback):
         names = self.lin.output_names, self.lin.input_names
         return [
             System(term.A, term.B, term.C, term.D, self.lin.dt, *names)
-            for term in self.terms()
+            for term in self.terms_of_period()
         ]
 
     def bind(self, robot: Robot) -> Command:
@@ -142,13 +152,8 @@ class MultirateFeedback(OutputSensing, Feedback):
         lin = self.lin
         state = self.state_map(robot)
         require_fit(lin, robot, state, sensed=True)
-        known = lin._robot is not None
-        if known and timing_of_robot(state, lin.dt) != timing_of_model(lin):
-            raise InputError(
-                f"the outputs of '{robot.name}' have other sample times or delays than the "
-                "outputs of the law's model; design the law for the sensors of this robot"
-            )
-        terms = self.terms()
+        require_timing(self.designed_timing, state, lin.dt)
+        terms = self.terms_of_period()
         at = at_samples(terms, lin.dt)
         measure = Measuring(state, lin.q)
         near = state.read(lin.q, lin.v)
@@ -167,11 +172,11 @@ class MultirateFeedback(OutputSensing, Feedback):
         """Return the law with its sensors as data for the compiled loop."""
         terms = self._sensed_terms(self.state_map(robot))
         at = at_samples(terms, self.lin.dt)
-        return OutputForm(self.bind(robot), at, len(terms), True)
+        return OutputForm(self.bind(robot), at, len(terms), len(terms))
 
     def _sensed_terms(self, state: StateMap) -> list[Sample]:
         """Return the law in series with the sensors of a robot, for each sample of a period."""
-        return sensed(self.terms(), timing_of_robot(state, self.lin.dt))
+        return sensed(self.terms_of_period(), timing_of_robot(state, self.lin.dt))
 
     def prediction(self, lin: LinearModel, state: StateMap) -> Predictor | None:
         """Return the predictor of the closed loop with the model `lin`."""

@@ -12,6 +12,7 @@ import numpy as np
 from fflin.base.errors import FflinWarning, InputError, listed, located
 from fflin.base.names import chosen, group_of, input_keys
 from fflin.base.process import Progress
+from fflin.base.tables import counted
 from fflin.base.validation import Array, ArrayLike, Mask, number, whole
 from fflin.control.optimal.initial_guess import JointMotion, initial_guess
 from fflin.control.optimal.plan_search import Search, excess
@@ -454,7 +455,7 @@ def _faults(made: _Made, note: str) -> Iterator[str]:
     elif not optimality.stationary:
         yield (
             "the plan reaches the goal, but is not a minimum of the effort: the search ended after "
-            f"{optimality.iterations} iterations, the gradient is still "
+            f"{counted(optimality.iterations, 'iteration')}, the gradient is still "
             f"{optimality.stationarity:.1e} of the gradient of the effort, and the complementarity "
             f"is {optimality.complementarity:.1e}, expected at most {STATIONARY:.0e}"
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
@@ -43,7 +44,7 @@ from fflin.control.policy import (
     unstable_note,
 )
 from fflin.control.sensed_laws import sensed
-from fflin.control.sensors import timing_of_robot
+from fflin.control.sensors import SensorTiming, timing_of_robot
 from fflin.dynamics.coordinates import LINEAR, Chart, Frame
 from fflin.dynamics.integrators import held_exponential
 from fflin.dynamics.outputs import Measuring
@@ -123,7 +124,66 @@ def at_samples(terms: Sequence[Sample], dt: float) -> Callable[[float], Sample]:
     return lambda t: terms[round(t / dt) % len(terms)]
 
 
-class LinearLaw(Feedback):
+class PointLaw(Feedback):
+    """Linear law about a point, whose matrices may repeat after some samples."""
+
+    noise: Noise | None = None
+
+    @abstractmethod
+    def terms_of_period(self) -> list[Sample]:
+        """Return the matrices and offsets for each sample of the period."""
+
+    @property
+    def designed_timing(self) -> SensorTiming | None:
+        """Sample times and delays that the sensors must have; None if they may be any."""
+        return None
+
+    def follow(self, trajectory: Trajectory) -> Following:
+        """Return the law that follows a trajectory: u = u*(t) + law(y - y*(t)).
+
+        The law must be sampled, and is designed about a point at rest. u*(t) are the inputs of the
+        trajectory, and y*(t) its outputs, or its states for a `StateFeedback`. Positions and
+        attitudes are measured relative to the base pose of the trajectory, so a slew may have any
+        angle. Each command u* is the mean input of the trajectory during the sample in which it
+        acts.
+
+        After the end of the trajectory, the law holds its last configuration at rest. Only wheels
+        keep their speeds. If the inputs are delayed, the robot waits at the start for the longest
+        delay, so that each input of the trajectory acts at its time.
+
+        Outputs may have their own sample times and delays. A late or held measurement is compared
+        with the trajectory at the time of the measurement.
+
+        The law keeps the matrices about its point. They fit a trajectory if the trajectory's rates
+        are small compared with the bandwidth of the law, and if the joints stay near the point. For
+        other trajectories, use `tvlqr` and `tvkalman`.
+
+        Parameters
+        ----------
+        trajectory : Trajectory
+            Trajectory for the same states, inputs and outputs as the model of the law, such as the
+            result of `plan`.
+
+        Returns
+        -------
+        Policy
+            Policy for `simulate` and campaigns. In Python and in compiled code, it keeps the
+            estimates, integrals and earlier commands of the law.
+
+        Raises
+        ------
+        InputError
+            If the law is continuous, its base is displaced or moves at the operating point, the
+            robot of the trajectory has other signals, or no inputs hold the robot at the end. Also
+            if inputs are delayed and the base moves at the start of the trajectory, or the outputs
+            of the robot have other sample times or delays than the design of a `MultirateFeedback`.
+        """
+        return Following(
+            self, self.terms_of_period(), trajectory, self.noise, self.designed_timing
+        )
+
+
+class LinearLaw(PointLaw):
     r"""Linear law with a state z, from measured outputs or states to the inputs.
 
     .. math:: \dot z = A z + B (y - y_0) + E (u_a - u),\qquad u - u_0 = C z + D (y - y_0)
@@ -135,7 +195,6 @@ class LinearLaw(Feedback):
 
     system: System
     windup: Array = NOT_CORRECTED
-    noise: Noise | None = None
 
     @property
     def is_gain(self) -> bool:
@@ -168,7 +227,10 @@ class LinearLaw(Feedback):
         if len(terms) == 1:
             return OutputForm(self._loop(robot), lambda _: terms[0], None)
         return OutputForm(
-            self._loop(robot), at_samples(terms, self.sample_time), len(terms), True
+            self._loop(robot),
+            at_samples(terms, self.sample_time),
+            len(terms),
+            len(terms),
         )
 
     def _periodic_terms(self, state: StateMap) -> list[Sample]:
@@ -257,6 +319,10 @@ class LinearLaw(Feedback):
         y0 = lin.y0 if self.senses_outputs else lin.x0[: len(lin.robot_states)]
         return Sample(A, B, C, D, lin.u0, y0, E=self.windup)
 
+    def terms_of_period(self) -> list[Sample]:
+        """Return the matrices and offsets of the only sample."""
+        return [self.terms()]
+
     def prediction(self, lin: LinearModel, state: StateMap) -> Predictor | None:
         """Return the predictor of the closed loop with the model `lin`."""
         if self.is_gain:
@@ -272,44 +338,6 @@ class LinearLaw(Feedback):
         if self.senses_outputs:
             terms = sensed(terms, timing_of_robot(state, self.sample_time))
         return lin, PredictedLaw(terms, lambda e, u: y0 + C @ e + D @ (u - lin.u0))
-
-    def follow(self, trajectory: Trajectory) -> Following:
-        """Return the law that follows a trajectory: u = u*(t) + law(y - y*(t)).
-
-        The law must be sampled, and is designed about a point at rest. u*(t) are the inputs of the
-        trajectory, and y*(t) its outputs, or its states for a `StateFeedback`. Positions and
-        attitudes are measured relative to the base pose of the trajectory, so a slew may have any
-        angle. Each command u* is the mean input of the trajectory during the sample in which it
-        acts.
-
-        After the end of the trajectory, the law holds its last configuration at rest. Only wheels
-        keep their speeds. If the inputs are delayed, the robot waits at the start for the longest
-        delay, so that each input of the trajectory acts at its time.
-
-        The law keeps the matrices about its point. They fit a trajectory if the trajectory's rates
-        are small compared with the bandwidth of the law, and if the joints stay near the point. For
-        other trajectories, use `tvlqr` and `tvkalman`.
-
-        Parameters
-        ----------
-        trajectory : Trajectory
-            Trajectory for the same states, inputs and outputs as the model of the law, such as the
-            result of `plan`.
-
-        Returns
-        -------
-        Policy
-            Policy for `simulate` and campaigns. In Python and in compiled code, it keeps the
-            estimates, integrals and earlier commands of the law.
-
-        Raises
-        ------
-        InputError
-            If the law is continuous, its base is displaced or moves at the operating point, the
-            robot of the trajectory has other signals, or no inputs hold the robot at the end. Also
-            if inputs are delayed and the base moves at the start of the trajectory.
-        """
-        return Following(self, self.terms(), trajectory, self.noise)
 
     def _measured(self, lin: LinearModel) -> tuple[Array, Array, Array]:
         """Return C, D and y0 of the values that the law measures of a model."""

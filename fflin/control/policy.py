@@ -138,8 +138,8 @@ class OutputForm(NamedTuple):
     terms: Callable[[float], Any]  # `policies.Sample` at a time [s]
     # number of different samples from t = 0 on; None if all are the same
     samples: int | None
-    # whether the samples repeat; otherwise, the last one applies from then on
-    cyclic: bool = False
+    # number of the last samples that repeat from then on; if it is 1, the last sample applies
+    period: int = 1
 
 
 class PathForm(NamedTuple):

@@ -11,6 +11,8 @@ from fflin.control.data_sheet import Deviations, declared_deviations
 from fflin.control.policy import Noise, Policy
 from fflin.dynamics.outputs import sensors_by_signal
 from fflin.dynamics.state import StateMap
+from fflin.linear.fit import signals_of
+from fflin.robot.outputs import Output
 
 # The generators of the drift have this number in their seed, so that the drift is independent of
 # the noise.
@@ -73,23 +75,43 @@ def declared_errors(
 ) -> Deviations | None:
     """Return the errors that the outputs of a robot declare for the sensors of a law.
 
-    `sample` [s] is the sample time of the law. The result is None if the law is continuous, does
-    not measure outputs, has its own noise, or its outputs declare no errors.
+    `state` belongs to the simulated robot, and `sample` [s] is the sample time of the law. An
+    `Allocation` measures the outputs of its `design`, whose errors also count. The result is None
+    if the law is continuous, does not measure outputs, has its own noise, or its outputs declare no
+    errors.
     """
-    lin = policy.model
-    if not sample or not policy.senses_outputs or lin is None:
+    if not sample or not policy.senses_outputs:
         return None
     if policy.measurement_noise is not None:
         # The noise of the law replaces the noise of the outputs.
         return None
-    sensors = sensors_by_signal(state)
-    if all(one.noise is None and one.bias is None for one in sensors.values()):
-        return None
-    units = dict(zip(lin.output_names, lin.output_units, strict=True))
-    if any(name not in units for name in policy.sensors):
-        return None
+    sensors = _erring_outputs(state)
+    units = _units_of_outputs(state)
+    design = policy.commanded_robot
+    if design is not None:
+        measured = StateMap(design, reference=state.reference, frame=state.frame)
+        sensors = _erring_outputs(measured) | sensors
+        units = _units_of_outputs(measured) | units
     names = policy.sensors
-    return declared_deviations(names, [units[name] for name in names], sensors, sample)
+    if not any(name in sensors for name in names):
+        return None
+    units_of_sensors = [units.get(name, "") for name in names]
+    return declared_deviations(names, units_of_sensors, sensors, sample)
+
+
+def _erring_outputs(state: StateMap) -> dict[str, Output]:
+    """Return {name of an entry of y: its output} for the outputs that declare errors."""
+    return {
+        name: output
+        for name, output in sensors_by_signal(state).items()
+        if output.noise is not None or output.bias is not None
+    }
+
+
+def _units_of_outputs(state: StateMap) -> dict[str, str]:
+    """Return {name of an entry of y: its unit} for the outputs of a robot."""
+    names, units = signals_of(state, "output")
+    return dict(zip(names, units, strict=True))
 
 
 def note_on_errors(names: tuple[str, ...], sizes: Deviations, seed: int) -> str:

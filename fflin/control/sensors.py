@@ -107,6 +107,19 @@ def timing_of_robot(state: StateMap, dt: float) -> SensorTiming:
     return timing_of(list(sensors.values()), list(sensors), dt)
 
 
+def require_timing(designed: SensorTiming | None, state: StateMap, dt: float) -> None:
+    """Raise `InputError` if the outputs of a robot have other times than the outputs of a design.
+
+    `designed` is None if they may have any. dt [s] is the sample time of the law.
+    """
+    if designed is None or timing_of_robot(state, dt) == designed:
+        return
+    raise InputError(
+        f"the outputs of '{state.robot.name}' have other sample times or delays than the outputs "
+        "of the law's model; design the law for the sensors of this robot"
+    )
+
+
 def _samples(what: str, time: float, dt: float, *, least: int) -> int:
     """Return a time [s] as a whole number of samples of dt [s], or raise `InputError`."""
     ratio = time / dt

@@ -435,7 +435,7 @@ class TrajectoryOutputFeedback(OutputSensing, TrajectoryFeedback):
         """
         if self.trajectory.period:
             samples = len(self.filter.A)
-            return OutputForm(self.bind(robot), self.terms, samples, cyclic=True)
+            return OutputForm(self.bind(robot), self.terms, samples, samples)
         return OutputForm(self.bind(robot), self.terms, len(self.filter.A) + 2)
 
     @cached_property

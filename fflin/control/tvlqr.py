@@ -23,6 +23,7 @@ from fflin.control.gain import ModelDesign
 from fflin.control.mean_field import mean_model, mean_rule
 from fflin.control.optimal import differential_riccati as riccati
 from fflin.control.optimal import periodic_riccati
+from fflin.control.optimal.periodic_loops import monodromy
 from fflin.control.trajectory_end import steady_end, steady_regulator
 from fflin.control.weights import (
     Rule,
@@ -506,22 +507,21 @@ def tvlqr(
     with riccati.bounded_by(remedy):
         if sample is not None:
             stages = list(held_stages(traj, dt, cost, R))
-            if periodic:
-                at_end = periodic_end(traj, stages[::-1])
-            gains, costs, residual = riccati.samples_back(reversed(stages), at_end)
-            t = traj.samples(dt)
-            P = costs[::-1]
-            K = np.concatenate((gains[::-1], gains[:1]))
             A, B = np.split(np.array([whole for _, whole in stages]), [len(Q)], axis=2)
             if periodic:
+                K, P, residual = _periodic_samples(traj, stages, regulated)
+                at_end = P[-1]
                 multipliers = loop_multipliers(A - B @ K[:-1], regulated)
+            else:
+                K, P, residual = _samples_back(stages, at_end)
+            t = traj.samples(dt)
         else:
             if periodic:
-                t, P, maps = _periodic_back(traj, lambda times: at(times, 0))
-                at_end = P[-1]
-                multipliers = loop_multipliers(
-                    periodic_riccati.loop_factors(maps, P), regulated
+                t, P, factors = _periodic_back(
+                    traj, lambda times: at(times, 0), regulated
                 )
+                at_end = P[-1]
+                multipliers = loop_multipliers(factors, regulated)
                 A, B = traj.matrices_at(t)
             else:
                 t, P, A, B = _solved_back(traj, at, at_end)
@@ -698,6 +698,56 @@ def _of_regulated(traj: LinearTrajectory, Q: Array) -> tuple[Array, Mask, str]:
     return Q, regulated, text
 
 
+def _solved_states(traj: LinearTrajectory, regulated: Mask) -> Mask:
+    """Return the mask (nx,) of the states for which the periodic Riccati equation is solved.
+
+    It marks the regulated states, and the states that affect one of them at any knot. The other
+    states have no cost. Some of them do not decay, such as the base position and wheel angles, and
+    the errors of the doubling would grow with them.
+    """
+    solved = regulated.copy()
+    largest = np.abs(traj.A).max(axis=0)
+    while True:
+        inside = largest[solved]
+        affects = inside.max(axis=0) > _UNCOUPLED * inside[:, solved].max(initial=0.0)
+        if not (affects & ~solved).any():
+            return solved
+        solved |= affects
+
+
+def _part_of(matrices: Array, kept: Mask) -> Array:
+    """Return the rows and columns of the kept states of matrices (.., nx, nx)."""
+    part: Array = matrices[..., kept, :][..., kept]
+    return part
+
+
+def _stage_of(stage: tuple[Array, Array], kept: Mask) -> tuple[Array, Array]:
+    """Return the cost matrix and the transition matrix of a sample for the kept states."""
+    weights, whole = stage
+    inputs = np.ones(len(weights) - len(kept), dtype=bool)
+    columns = np.concatenate((kept, inputs))
+    return _part_of(weights, columns), whole[kept][:, columns]
+
+
+def _periodic_samples(
+    traj: LinearTrajectory, stages: Sequence[tuple[Array, Array]], regulated: Mask
+) -> tuple[Array, Array, float]:
+    """Return K and P at all samples of a period, and the largest relative residual."""
+    solved = _solved_states(traj, regulated)
+    parts = [_stage_of(stage, solved) for stage in stages]
+    K, P, residual = _samples_back(parts, periodic_end(traj, parts[::-1]))
+    selection = np.eye(len(solved))[solved]
+    return K @ selection, selection.T @ P @ selection, residual
+
+
+def _samples_back(
+    stages: Sequence[tuple[Array, Array]], at_end: Array
+) -> tuple[Array, Array, float]:
+    """Return K and P at all samples, the first sample first, and the largest relative residual."""
+    gains, costs, residual = riccati.samples_back(reversed(stages), at_end)
+    return np.concatenate((gains[::-1], gains[:1])), costs[::-1], residual
+
+
 def periodic_end(
     traj: LinearTrajectory, stages: Sequence[tuple[Array, Array]]
 ) -> Array:
@@ -709,9 +759,16 @@ def periodic_end(
     with stabilised(traj):
         maps = [periodic_riccati.sample_transition(*stage) for stage in stages]
         P = periodic_riccati.periodic_cost(periodic_riccati.over_period(maps))
-        return periodic_riccati.repeated(
-            lambda end: riccati.samples_back(stages, end)[1][-1], P, _UNSTABLE
-        )
+
+        def sweep(end: Array) -> tuple[Array, Array]:
+            gains, costs, _ = riccati.samples_back(stages, end)
+            loop = np.eye(len(end))
+            for K, (_, whole) in zip(gains, stages, strict=True):
+                A, B = np.split(whole, [len(end)], axis=1)
+                loop = loop @ (A - B @ K)
+            return costs[-1], loop
+
+        return periodic_riccati.repeated(sweep, P, _UNSTABLE)
 
 
 # Largest multiplier of a loop that counts as stable. States that are not regulated may have the
@@ -722,7 +779,8 @@ _LARGEST_MULTIPLIER = 1.001
 # least this. A loop of magnetorquers that is 80 times as fast as the orbit needs 512 intervals.
 _INTERVALS = 1024
 
-# Entries of transition matrices below this fraction of the largest one are rounding errors.
+# Entries of A and of transition matrices below this fraction of the largest one are rounding
+# errors.
 _UNCOUPLED = 1e-12
 
 _UNSTABLE = "give other inputs, or zero weights for states that the inputs cannot hold"
@@ -758,25 +816,42 @@ def stabilised(traj: LinearTrajectory) -> Iterator[None]:
 
 
 def _periodic_back(
-    traj: LinearTrajectory, at: Callable[[Array], Array]
+    traj: LinearTrajectory, at: Callable[[Array], Array], regulated: Mask
 ) -> tuple[Array, Array, Array]:
-    """Return times, P at these times, and T, G and W between them, for the periodic solution."""
+    """Return times, P at these times, and the closed-loop transition matrices between them.
+
+    The results contain all states. Those for which the Riccati equation is not solved have no cost,
+    and the transition matrices contain zeros for them.
+    """
+    solved = _solved_states(traj, regulated)
+
+    def coefficients(times: Array) -> Array:
+        return _part_of(at(times), solved)
+
     with stabilised(traj):
-        P = _rough_cost(traj.t, at)
+        P = _rough_cost(traj.t, coefficients)
         # This sweep finds the times at which the solution is accurate. The doubling is repeated
         # with the maps between these times, so that it agrees with a sweep to machine precision.
-        times, _ = riccati.solve_back(at, traj.t, P)
-        maps = periodic_riccati.interval_maps(at, times)
+        times, _ = riccati.solve_back(coefficients, traj.t, P)
+        maps = periodic_riccati.interval_maps(coefficients, times)
         P = periodic_riccati.periodic_cost(
             periodic_riccati.over_period(iter(maps[::-1]))
         )
 
-        def sweep(end: Array) -> Array:
-            start: Array = _swept(maps, end)[0]
-            return start
+        def sweep(end: Array) -> tuple[Array, Array]:
+            costs = _swept(maps, end)
+            factors = periodic_riccati.loop_factors(maps, costs)
+            return costs[0], monodromy(factors)
 
         P = periodic_riccati.repeated(sweep, P, _UNSTABLE)
-        return times, _swept(maps, P), maps
+        costs = _swept(maps, P)
+    factors = periodic_riccati.loop_factors(maps, costs)
+    selection = np.eye(len(solved))[solved]
+    return (
+        times,
+        selection.T @ costs @ selection,
+        selection.T @ factors @ selection,
+    )
 
 
 def _rough_cost(times: Array, at: Callable[[Array], Array]) -> Array:

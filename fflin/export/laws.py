@@ -18,8 +18,7 @@ from fflin.control.following import Following, ReferencePath
 from fflin.control.gain import Gain, model_of, sampled_for
 from fflin.control.loops import NOT_CORRECTED, Sample
 from fflin.control.multirate import MultirateCompensator
-from fflin.control.multirate_feedback import MultirateFeedback
-from fflin.control.policies import LinearLaw, StateFeedback
+from fflin.control.policies import PointLaw, StateFeedback
 from fflin.control.policy import (
     BDotForm,
     Command,
@@ -246,12 +245,9 @@ def _law_of_model(title: str, policy: Policy, dt: float, robot: Robot) -> Law | 
     if isinstance(form, OutputForm) and form.loop.measures_state:
         return _memory_law(title, policy, form.terms(0.0), robot)
     # The form also contains the sensors of the robot, which the code does not contain.
-    if isinstance(policy, MultirateFeedback):
-        terms = policy.terms()
-    elif isinstance(policy, LinearLaw):
-        terms = [policy.terms()]
-    else:
+    if not isinstance(policy, PointLaw):
         return None
+    terms = policy.terms_of_period()
     return _output_law(
         title,
         terms,
@@ -289,10 +285,11 @@ def _following_law(title: str, policy: Following, robot: Robot) -> Law:
     """Convert a law that follows a trajectory, with one row of the tables for each sample."""
     lin = policy.lin
     path = ReferencePath(policy, robot)
-    if len(path.about_point.A) > len(policy.terms.A):
+    if len(path.about_point[0].A) > len(policy.terms[0].A):
         raise InputError(
-            f"outputs of '{robot.name}' have a delay, which C code of a law that follows a "
-            "trajectory does not support; export the law without follow, or leave out the delay"
+            f"outputs of '{robot.name}' have their own sample or delay, which C code of a law that "
+            "follows a trajectory does not support; export the law without follow, or leave out "
+            "these fields of the outputs"
         )
     times = policy.sample_time * np.arange(policy.samples)
     rows = [path.terms(t) for t in times]

@@ -206,7 +206,7 @@ NOTHING, LINEAR, TRACK, B_DOT, DAMPING = range(5)
 class Law(
     namedtuple(
         "Law",
-        "kind turned origin near cyclic grid filter measured gyros gyro_axes x y added u path "
+        "kind turned origin near period grid filter measured gyros gyro_axes x y added u path "
         "allocation",
     )
 ):
@@ -230,7 +230,7 @@ class Law(
       pose of the base at which q_b and r_b are 0.
     - `near` (rows, n): joint positions for unwrapping. The unwrapped angle of a continuous joint
       differs from the position of the joint in `near` by at most pi.
-    - `origin` and `near` have one row per sample. If `cyclic` is true, the rows repeat. Otherwise,
+    - `origin` and `near` have one row per sample. The last `period` rows repeat. If `period` is 1,
       the last row also applies to all later samples.
     - `u`: the command. If `allocation.problem` has inputs, `allocate` distributes the command to
       the inputs of `allocation.giving`.
@@ -261,8 +261,7 @@ class Filter(namedtuple("Filter", "A B C D u0 y0 jump E z rates")):
 GRID = Struct(Grid, REALS, {INDICES: "joint first stride"}, at=LANED)
 FILTER = Struct(Filter, z=LANED, rates=LANED)
 _OF_LAW = {
-    WHOLE: "kind",
-    FLAG: "cyclic",
+    WHOLE: "kind period",
     FLAGS: "turned",
     INDICES: "measured gyros",
     LANED: "x y added u",
@@ -307,9 +306,9 @@ def read_state(robot, law, point, row):
 def row_at(law, count):
     """Return the row of the arrays with one row per sample at the sample `count`."""
     rows = len(law.origin) // 7
-    if law.cyclic:
-        return count % rows
-    return min(count, rows - 1)
+    if count < rows:
+        return count
+    return rows - law.period + (count - rows) % law.period
 
 
 def _times(matrix, row, x):

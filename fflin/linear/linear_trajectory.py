@@ -512,7 +512,8 @@ def transitions(traj: LinearTrajectory, dt: float) -> Iterator[tuple[Steps, Arra
         nearest = duration / max(1, round(duration / dt))
         raise InputError(
             f"dt is {dt:g} s, but the duration of the trajectory, {duration:g} s, is not a "
-            f"multiple of dt; give a dt that divides the duration, such as {nearest!r}"
+            "multiple of dt; give a dt (--sample) that divides the duration, such as "
+            f"{nearest!r}"
         )
     cuts = []
     for start, end in pairwise(times.tolist()):

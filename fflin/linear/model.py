@@ -858,7 +858,7 @@ def refuse_frozen(lin: LinearModel, what: str) -> None:
         raise InputError(
             f"{what} needs a model that does not depend on time, but the model of '{lin.robot}' "
             f"holds only at t = {lin.t:g} s, because of an elliptic orbit or of magnetorquers; use "
-            "linearize_orbit, then tvlqr or tvkalman with 'periodic', or --periodic N"
+            "linearize_orbit, then tvlqr or tvkalman with 'periodic', or fflin tvlqr --periodic N"
         )
 
 

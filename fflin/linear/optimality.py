@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 from fflin.base import html
+from fflin.base.tables import counted
 
 # Largest stationarity and complementarity, and largest violation [rad, m, s], of a plan that counts
 # as stationary. If the effort is a quadratic function of the inputs, at most STATIONARY**2 of the
@@ -56,8 +57,9 @@ class Optimality(html.Reported):
         return conditions <= STATIONARY and self.feasibility <= FEASIBLE
 
     def __str__(self) -> str:
+        iterations = counted(self.iterations, "iteration")
         return (
-            f"effort {self.effort:.4g}, KKT residuals after {self.iterations} iterations: "
+            f"effort {self.effort:.4g}, KKT residuals after {iterations}: "
             f"stationarity {self.stationarity:.1e}, feasibility {self.feasibility:.1e}, "
             f"complementarity {self.complementarity:.1e}"
         )

@@ -76,8 +76,10 @@ _DEGREES = math.degrees(2.0)
 _SMALL = 0.02
 _ARCSEC = 3600.0
 
-# Errors of at most this size are rounding errors, and shown as a dot.
+# Errors of at most this size, or this fraction of the largest error of the attitude, are rounding
+# errors, and shown as a dot.
 _ZERO = 1e-12
+_ROUNDING = 1e-10
 
 # Name of the part of the simulated errors that the other causes do not explain.
 _NOT_SUPERPOSED = "simulated minus superposed"
@@ -137,8 +139,10 @@ class ErrorBudget(FrozenArrays, html.Reported):
     factor : float
         Number of standard deviations in the total.
     simulated_mean, simulated_deviation : ndarray (3,) or (0,)
-        Mean and standard deviation [deg] of the attitude errors in the second half of the given
-        motion; empty without a motion.
+        Mean and standard deviation [deg] of the attitude errors of the given motion from `after`
+        on; empty without a motion.
+    after : float or None
+        Time [s] from which the errors of the motion are counted; None without a motion.
     dt, delay : float
         Sampling time of the loop, 0 in continuous time, and delay of its inputs [s].
     robot : str
@@ -164,6 +168,7 @@ class ErrorBudget(FrozenArrays, html.Reported):
     dt: float
     delay: float
     robot: str
+    after: float | None = None
 
     def error(self, name: str) -> dict[str, float]:
         """Return {cause: size} of one of the errors `names`, and its total.
@@ -193,10 +198,13 @@ class ErrorBudget(FrozenArrays, html.Reported):
         time = f"sampled at {self.dt:g} s" if self.dt else "continuous"
         if self.delay:
             time += f", delay {self.delay:g} s"
-        return [
+        lines = [
             f"{self.robot}: error budget of the attitude, {time}",
             f"total: sum of the constants plus {self.factor:g} standard deviations",
         ]
+        if self.after is not None:
+            lines.append(f"simulated: errors of the motion from {self.after:.4g} s on")
+        return lines
 
     def _rows(self) -> list[list[str]]:
         """Return the table of the attitude errors."""
@@ -209,23 +217,28 @@ class ErrorBudget(FrozenArrays, html.Reported):
             "periodic": "amplitude",
             "simulated": "standard deviation",
         }
+        largest = scale * float(self.total[:3].max())
+        zero = max(_ZERO, _ROUNDING * largest)
+
+        def row(cause: str, kind: str, errors: Array) -> list[str]:
+            return [cause, kind, *_cells(scale * errors[:3], zero)]
+
+        deviation = words["noise"]
         rows = [["cause", f"[{unit}]", "x", "y", "z"]]
         for part in self.contributions:
-            rows.append([part.cause, words[part.kind], *_cells(scale * part.size[:3])])
-        rows.append(["all constants", "sum", *_cells(scale * self.constant[:3])])
-        rows.append(
-            ["all others", "standard deviation", *_cells(scale * self.deviation[:3])]
-        )
-        rows.append(["total", "", *_cells(scale * self.total[:3])])
+            rows.append(row(part.cause, words[part.kind], part.size))
+        rows.append(row("all constants", "sum", self.constant))
+        rows.append(row("all others", deviation, self.deviation))
+        rows.append(row("total", "", self.total))
         if len(self.simulated_mean):
-            rows.append(["simulated", "mean", *_cells(scale * self.simulated_mean)])
-            deviation = _cells(scale * self.simulated_deviation)
-            rows.append(["", "standard deviation", *deviation])
+            rows.append(row("simulated", "mean", self.simulated_mean))
+            rows.append(row("", deviation, self.simulated_deviation))
         return rows
 
 
-def _cells(values: Array) -> list[str]:
-    return [f"{x:.3g}" if abs(x) > _ZERO else "." for x in values.tolist()]
+def _cells(values: Array, zero: float) -> list[str]:
+    """Format errors; errors of at most `zero` are a dot."""
+    return [f"{x:.3g}" if abs(x) > zero else "." for x in values.tolist()]
 
 
 # NumPy's warnings are not needed, because a loop that overflows is refused.
@@ -246,6 +259,7 @@ def error_budget(
     motion: Motion | None = None,
     robot: Robot | None = None,
     limit_cycle: bool = False,
+    after: float | None = None,
 ) -> ErrorBudget:
     r"""Return the errors of the loop of a linear policy and a model, for each cause.
 
@@ -308,6 +322,9 @@ def error_budget(
         size is the square root of the difference of the variances, if this is positive. The part is
         an estimate of the limit cycle of thruster pulses and deadbands, but it also contains all
         other effects that the linear loop lacks, such as limits and the rest of the initial error.
+    after : float, optional
+        Time [s] from which the errors of `motion` are counted, such as the settling time
+        ``motion.pointing(...).after``; half of the motion by default.
 
     Returns
     -------
@@ -367,7 +384,7 @@ def error_budget(
         causes.append(loop.force_noise(key, size))
     causes += acting
     if truth("limit_cycle", limit_cycle):
-        causes.append(_not_superposed(motion, loop.signals, causes))
+        causes.append(_not_superposed(motion, after, loop.signals, causes))
     if not causes:
         raise InputError(
             "no cause of errors is given; give noise, bias, disturbance, periodic, force_noise or "
@@ -381,7 +398,7 @@ def error_budget(
         else:
             variance = variance + _variance(part)
     deviation = np.sqrt(variance)
-    mean, spread = _simulated(motion)
+    mean, spread = _simulated(motion, after)
     return ErrorBudget(
         names=loop.signals,
         units=loop.signal_units,
@@ -395,6 +412,7 @@ def error_budget(
         dt=loop.dt,
         delay=loop.longest_delay,
         robot=lin.robot,
+        after=None if motion is None else _start(motion, after),
     )
 
 
@@ -563,7 +581,10 @@ def _variance(part: Contribution) -> Array:
 
 
 def _not_superposed(
-    motion: Motion | None, names: Sequence[str], causes: Sequence[Contribution]
+    motion: Motion | None,
+    after: float | None,
+    names: Sequence[str],
+    causes: Sequence[Contribution],
 ) -> Contribution:
     """Return the part of the errors of a motion that the causes do not explain."""
     if motion is None:
@@ -571,8 +592,8 @@ def _not_superposed(
             "limit_cycle needs a simulated motion, because the linear loop has no limit cycle; "
             "give motion="
         )
-    deviations = dict(zip(_AXES, _simulated(motion)[1].tolist(), strict=True))
-    late = _late(motion)
+    deviations = dict(zip(_AXES, _simulated(motion, after)[1].tolist(), strict=True))
+    late = _late(motion, after)
     for name, values in zip(motion.state_names, motion.x.T, strict=True):
         deviations.setdefault(name, float(values[late].std()))
     simulated = np.array([deviations[name] for name in names])
@@ -585,21 +606,41 @@ def _not_superposed(
     )
 
 
-def _late(motion: Motion) -> Mask:
+def _start(motion: Motion, after: float | None) -> float:
+    """Return the time [s] from which the errors of a motion are counted."""
+    first, last = float(motion.t[0]), float(motion.t[-1])
+    if after is None:
+        return first + _LATE * (last - first)
+    after = number("after", after)
+    if not after < last:
+        raise InputError(
+            f"after is {after:g} s, expected less than the end of the motion at {last:g} s"
+        )
+    return max(after, first)
+
+
+def _late(motion: Motion, after: float | None) -> Mask:
     """Return which rows of a motion are in the part from which its errors are counted."""
-    late: Mask = motion.t >= motion.t[0] + _LATE * (motion.t[-1] - motion.t[0])
+    start = _start(motion, after)
+    late: Mask = motion.t >= start - 1e-9 * max(1.0, abs(start))
     return late
 
 
-def _simulated(motion: Motion | None) -> tuple[Array, Array]:
+def _simulated(
+    motion: Motion | None, after: float | None = None
+) -> tuple[Array, Array]:
     """Return the mean and deviation [deg] of the attitude errors (3,); empty without a motion."""
     if motion is None:
+        if after is not None:
+            raise InputError(
+                "after= is the start of the errors of a motion; give motion="
+            )
         return np.zeros(0), np.zeros(0)
     instance("motion", motion, Motion, "a Motion, as fflin.simulate returns")
     if not motion.target.size:
         raise InputError("the motion has no target, so it has no attitude errors")
     errors = np.degrees(attitude_rotations(motion.x, motion.target))
-    late = errors[_late(motion)]
+    late = errors[_late(motion, after)]
     return late.mean(axis=0), late.std(axis=0)
 
 

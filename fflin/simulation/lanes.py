@@ -746,6 +746,7 @@ def no_law(state: StateMap, u: Array) -> policies.Law:
         turned=list(state.axes),
         origin=pin.SE3ToXYZQUAT(state.origin),
         near=np.zeros(state.robot.n),
+        period=1,
         x=np.zeros(state.nx),
         u=u,
         path=law.path._replace(
@@ -844,7 +845,7 @@ def _filtered(
     turns = [axes[f.joint - ROOT].T @ f.placement.rotation for f in frames]
     return law._replace(
         kind=policies.LINEAR,
-        cyclic=form.cyclic,
+        period=min(form.period, rows),
         origin=np.concatenate(
             [pin.SE3ToXYZQUAT(measure.state.origin) for measure in measures]
         ),

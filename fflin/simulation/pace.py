@@ -327,8 +327,11 @@ class Pace:
         poles = (limit for limit in self.limits if isinstance(limit, Poles))
         return next((limit for limit in poles if limit.system == CLOSED_LOOP), None)
 
-    def remarks(self, h: float) -> Iterator[str]:
-        """Yield remarks on a step of h [s] that is too long."""
+    def remarks(self, h: float, allowed: Callable[[float], float]) -> Iterator[str]:
+        """Yield remarks on a step of h [s] that is too long.
+
+        `allowed` returns the longest allowed step of at most a given length [s].
+        """
         for limit in self.limits:
             if isinstance(limit, Signal) and not limit.step:
                 yield (
@@ -337,10 +340,10 @@ class Pace:
                 )
         demand = self.demand(h)
         if demand.error > 1.0 + 1e-9:
-            accurate, _ = self.step(shorter(h))
+            accurate = allowed(self.step(shorter(h))[0])
             advice = "no step is accurate"
             if self.demand(accurate).error <= 1.0:
-                advice = f"dt={accurate:g} (--dt {accurate:g}) is accurate"
+                advice = f"dt={accurate:.9g} (--dt {accurate:.9g}) is accurate"
             yield (
                 f"the step of {h:.3g} s is too long for {demand.mode()}, so the motion is not "
                 f"accurate; {advice}"

@@ -586,7 +586,8 @@ def step_of(
     steps = max(1, round(duration / dt))
     if abs(steps * dt - duration) > 1e-6 * duration:
         if sample or longest:
-            _in_steps("duration", duration, dt)  # raises an error
+            advice = _advice_on_duration(duration, dt, sample or longest, delays)
+            _in_steps("duration", duration, dt, advice)  # raises an error
         steps = int(np.ceil(duration / dt))
         dt = duration / steps
     return dt, steps, mode
@@ -673,8 +674,14 @@ def times_of(
         )
     if mode:
         notes.append(f"the step is {dt:.3g} s, because {mode} requires it")
-    notes += pace.remarks(dt)
-    samples = _in_steps("sample", sample, dt)
+    in_steps = (duration, *delays)
+    samples = _samples_in_steps(sample, dt, in_steps)
+
+    def allowed(largest: float) -> float:
+        """Return the longest allowed step [s] of at most `largest` [s]."""
+        return _part_of(sample, largest, *in_steps) if sample else largest
+
+    notes += pace.remarks(dt, allowed)
     late = tuple(_late_steps(delay, delays, dt, sample, duration) for delay in delays)
     thinned = every is None and steps > _MANY_ROWS
     part = max(samples, 1)
@@ -729,18 +736,40 @@ _MOST_PARTS = 1000
 _COUNTABLE = 2**53  # a double represents every whole number up to this one
 
 
-def _in_steps(name: str, time: float, dt: float) -> int:
+def _in_steps(name: str, time: float, dt: float, advice: str) -> int:
     """Convert a time [s] to a number of steps; raise `InputError` unless it is a multiple of dt."""
     if time / dt > _COUNTABLE:
         raise InputError(
             f"{name} is {time:g} s, which is too many steps of dt = {dt:g} s"
         )
-    if abs(round(time / dt) * dt - time) > 1e-6 * dt:
+    if not _divides(dt, time):
         raise InputError(
-            f"{name} is {time:g} s, expected a multiple of the step dt = {dt:g} s; "
-            "choose dt accordingly"
+            f"{name} is {time:.9g} s, expected a multiple of the step dt = {dt:.9g} s; {advice}"
         )
     return round(time / dt)
+
+
+def _advice_on_duration(
+    duration: float, dt: float, sample: float, delays: Sequence[float]
+) -> str:
+    """Return the nearest step [s] that divides the duration [s], or the nearest durations."""
+    if nearest := _nearest_step(sample, dt, (duration, *delays)):
+        return f"the nearest step that divides it is {_option(nearest)}"
+    below = math.floor(duration / dt)
+    times = [f"{steps * dt:.9g} s" for steps in (below, below + 1) if steps]
+    return f"the nearest possible duration is {' or '.join(times)}"
+
+
+def _samples_in_steps(sample: float, dt: float, times: Sequence[float]) -> int:
+    """Return the sample time [s] as a number of steps of dt [s]; other times are multiples too.
+
+    If it is not a whole number, raise `InputError` with the nearest step for which it is.
+    """
+    if _divides(dt, sample):
+        return round(sample / dt)
+    nearest = _nearest_step(sample, dt, times) or sample / max(1, round(sample / dt))
+    advice = f"the nearest step that divides it is {_option(nearest)}"
+    return _in_steps("sample", sample, dt, advice)
 
 
 def _late_steps(
@@ -752,24 +781,27 @@ def _late_steps(
     """
     if _divides(dt, delay):
         return round(delay / dt)
-    advice = (
-        "no step divides the sample time and the delay; the nearest delay for this step is "
-        f"{round(delay / dt) * dt:g} s"
-    )
-    parts = range(1, math.ceil(sample / dt) + _MOST_PARTS)
-    fit = [
-        sample / count
-        for count in parts
-        if all(_divides(sample / count, time) for time in (duration, *delays))
-    ]
-    if fit:
-        nearest = min(fit, key=lambda step: abs(step - dt))
+    if nearest := _nearest_step(sample, dt, (duration, *delays)):
+        advice = f"the nearest step that divides it is {_option(nearest)}"
+    else:
         advice = (
-            f"the nearest step that divides it is dt={nearest:.9g} (--dt {nearest:.9g})"
+            "no step divides the sample time and the delay; the nearest delay for this step is "
+            f"{round(delay / dt) * dt:g} s"
         )
-    raise InputError(
-        f"delay is {delay:g} s, expected a multiple of the step dt = {dt:g} s; {advice}"
-    )
+    return _in_steps("delay", delay, dt, advice)
+
+
+def _nearest_step(sample: float, dt: float, times: Sequence[float]) -> float | None:
+    """Return the step nearest to dt [s] that divides the sample time and other times, or None."""
+    parts = range(1, math.ceil(sample / dt) + _MOST_PARTS)
+    steps = [sample / count for count in parts]
+    fit = [step for step in steps if all(_divides(step, time) for time in times)]
+    return min(fit, key=lambda step: abs(step - dt), default=None)
+
+
+def _option(dt: float) -> str:
+    """Return a step [s] as an argument and as an option of the command line."""
+    return f"dt={dt:.9g} (--dt {dt:.9g})"
 
 
 def _divides(dt: float, time: float) -> bool:

@@ -579,10 +579,11 @@ def _largest_forces(motion: Motion) -> list[str]:
         for kind in ("force", "torque"):
             parts = [columns[f"{title}.{kind}.{axis}"] for axis in "xyz"]
             sizes.append(float(np.linalg.norm(parts, axis=0).max()))
-        lines.append(
+        line = (
             f"largest force of constraint '{title}': {sizes[0]:.4g} N; largest torque: "
             f"{sizes[1]:.4g} N m"
         )
+        lines.append(folded([line]))
     return lines
 
 

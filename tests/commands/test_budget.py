@@ -54,6 +54,16 @@ def test_simulate_reports_the_errors_by_cause(satellite, capsys):
     assert budget["simulated_deviation"][2] > 0.2 * expected.deviation[2]
 
 
+def test_both_tables_count_the_errors_from_the_same_time_on(satellite, capsys):
+    options = [*map(str, LOOP), "--noise", "q_b=1e-6", "--rpy", "1", "0", "0"]
+    options += ["--pointing", "5", "--accuracy", "0.05", "--budget"]
+    assert main(["simulate", satellite, *options]) == 0
+    report = " ".join(capsys.readouterr().out.split())
+    start = report.split("pointing errors from ")[1].split(" s on")[0]
+    assert float(start) not in (0.0, 30.0)  # the time at which the motion has settled
+    assert f"simulated: errors of the motion from {start} s on" in report
+
+
 def test_what_has_no_budget_is_refused(satellite, tmp_path):
     for options in (("--free",), ("--mpc", "--sample", 0.5, "--horizon", 4)):
         message = refused(

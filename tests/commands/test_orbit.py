@@ -1,11 +1,14 @@
 """Commands for robots in orbit: models over one period, magnetorquers and the B-dot law."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import fflin
+from fflin.analysis.ranks import Decision, Margin
+from fflin.commands.models import _rank
 from tests.support.commands import refused, run
 
 SATELLITE = "cubesat_magnetic"
@@ -58,6 +61,16 @@ def test_controllability_and_observability_over_a_period():
     assert code == 0 and out.startswith("analyze: not controllable (6/12), observable")
     assert "--periodic N" in refused("analyze", SATELLITE)
     assert "without --periodic" in refused("analyze", "cubesat", "--motion", "free")
+
+
+@pytest.mark.exhaustive
+def test_the_first_line_does_not_state_an_undecided_rank():
+    robot = fflin.load(SATELLITE)
+    result = fflin.controllability(fflin.linearize_orbit(robot, steps=8))
+    assert _rank(result, "controllable") == "not controllable (6/12)"
+    doubt = Margin((Decision(9.0, np.ones(6)),))
+    unsure = replace(result, margin=doubt)
+    assert _rank(unsure, "controllable") == "controllability undecided"
 
 
 def test_linearize_at_a_time():

@@ -391,18 +391,3 @@ def test_a_delayed_sensor_is_compared_with_the_reference_of_its_measurement(tmp_
     assert motion.attitude_error.max() < 1e-6
     with pytest.raises(fflin.InputError, match="delay"):
         fflin.write_c(policy, tmp_path)
-
-
-def test_a_slow_sensor_cannot_follow_a_trajectory():
-    robot = fflin.load(
-        "cubesat",
-        inputs=[fflin.BaseTorque()],
-        outputs=[fflin.StarTracker(sample=2 * SAMPLE)],
-    )
-    plain = robot.replace(outputs=[fflin.StarTracker()])
-    lin = fflin.linearize(plain).discretize(SAMPLE)
-    gain = np.hstack((-1e-3 * np.eye(3),))
-    law = fflin.LinearController(gain, lin)
-    still = fflin.simulate(plain, duration=1.0, dt=0.5).trajectory()
-    with pytest.raises(fflin.InputError, match="sample other than"):
-        fflin.simulate(robot, law.follow(still), duration=1.0)

@@ -106,3 +106,16 @@ def test_a_controller_for_delayed_inputs_notes_that_its_model_has_no_delay(tmp_p
             robot, fflin.LinearController(given, late), duration=1.0
         )
         assert not any("delayed inputs" in note for note in motion.notes)
+
+
+def test_a_compensator_of_several_sample_times_names_its_policy():
+    sensors = [
+        fflin.StarTracker(sample=0.5, noise={"noise_equivalent_angle": 10.0}),
+        fflin.Gyroscope("base", noise={"angle_random_walk": 0.1}),
+    ]
+    robot = fflin.load("cubesat", inputs=[fflin.BaseTorque(max=1e-3)], outputs=sensors)
+    model = fflin.linearize(robot).discretize(0.25)
+    estimator = fflin.kalman(model, {"omega_b": 1e-10})
+    compensator = fflin.lqg(fflin.lqr(model), estimator)
+    with pytest.raises(fflin.InputError, match="MultirateFeedback"):
+        fflin.OutputFeedback(model, compensator)

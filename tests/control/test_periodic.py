@@ -8,7 +8,7 @@ import fflin
 from fflin.control.mean_field import mean_model
 from fflin.control.optimal import differential_riccati as riccati
 from fflin.control.optimal import periodic_riccati
-from fflin.control.tvlqr import held_stages, loop_multipliers
+from fflin.control.tvlqr import _solved_states, held_stages, loop_multipliers
 from fflin.robot.orbit import DIPOLES
 from tests.support.orbits import in_ellipse, in_orbit
 from tests.support.robots import free_body
@@ -186,6 +186,105 @@ def test_states_that_no_input_pushes_are_not_regulated():
     assert schedule.loop_multipliers[0] == pytest.approx(size[6], rel=1e-4)
     assert schedule.loop_multipliers[0] < 0.1
     assert "closed loop of the regulated states: largest" in str(schedule)
+
+
+def arm_with_wheels(orbit):
+    """Linear models of an arm on a base with wheels, whose momentum only gravity can change."""
+    wheels = [
+        fflin.ReactionWheel(axis, inertia=0.005, max=0.05, name=f"w{name}")
+        for axis, name in zip(np.eye(3), "xyz", strict=True)
+    ]
+    inputs = [*wheels, fflin.JointTorque("*")]
+    circle = fflin.CircularOrbit(altitude=1200e3)
+    arm = fflin.load("ets_vii", inputs=inputs, orbit=circle)
+    held = fflin.relative_equilibria(arm, arm.neutral())[0]
+    return fflin.linearize_orbit(arm.replace(orbit=orbit), held.q, steps=16)
+
+
+ARM_Q = {"q_b": 1.0, "q_m": 1.0, "omega_b": 1e4, "qdot_m": 1e-3}
+ARM_R = {"wheel": 1e4, "tau_m": 1e4}
+
+
+@pytest.mark.exhaustive
+@pytest.mark.filterwarnings("ignore:ets_vii. unphysical", "ignore:the phase margin")
+def test_a_circular_orbit_gives_the_gain_of_lqr_for_wheels_and_joints():
+    along = arm_with_wheels(fflin.CircularOrbit(altitude=1200e3))
+    h = along.period / 100
+    schedule = fflin.tvlqr(along, ARM_Q, ARM_R, "periodic", sample=h)
+    lin = along[0]
+    Qd, Rd, N = fflin.sampled_cost(lin, h, schedule.Q, schedule.R)
+    gain = fflin.lqr(lin.discretize(h), Qd, Rd, N)
+    assert (
+        len(gain.regulated) == 21
+    )  # without the base position and the angles of the wheels
+    for K in schedule.K[::25]:
+        assert apart(K, gain.K) < 1e-8
+
+
+@pytest.mark.exhaustive
+@pytest.mark.filterwarnings("ignore:ets_vii. unphysical")
+def test_an_elliptic_orbit_gives_the_cost_of_a_backward_sweep_for_wheels_and_joints():
+    along = arm_with_wheels(fflin.EllipticOrbit(perigee=500e3, eccentricity=0.2))
+    h = along.period / 100
+    schedule = fflin.tvlqr(along, ARM_Q, ARM_R, "periodic", sample=h)
+    not_swept = ("r_b", "v_b", "q_m.w")
+    kept = [
+        i for i, name in enumerate(along.state_names) if not name.startswith(not_swept)
+    ]
+    nx, nu = len(schedule.Q), len(schedule.R)
+    both = [*kept, *range(nx, nx + nu)]
+    stages = [
+        (weights[np.ix_(both, both)], whole[np.ix_(kept, both)])
+        for weights, whole in held_stages(along, h, schedule.Q, schedule.R)
+    ]
+    P = np.zeros((21, 21))
+    # The largest multiplier is 0.934, so an error of P shrinks by 0.872 per period.
+    for _ in range(250):
+        for weights, whole in reversed(stages):
+            total = weights + whole.T @ P @ whole
+            gain = np.linalg.solve(total[21:, 21:], total[21:, :21])
+            P = total[:21, :21] - total[:21, 21:] @ gain
+            P = 0.5 * (P + P.T)
+    assert apart(schedule.P[0][np.ix_(kept, kept)], P) < 1e-9
+    assert schedule.loop_multipliers[0] == pytest.approx(0.93369, abs=1e-5)
+    others = np.setdiff1d(np.arange(nx), kept)
+    assert not schedule.K[:, :, others].any()
+    assert not schedule.P[:, others].any()
+
+
+@pytest.mark.exhaustive
+@pytest.mark.filterwarnings("ignore:ets_vii. unphysical")
+def test_wheel_speeds_without_weight_may_keep_their_momentum():
+    """Momentum normal to the orbit costs nothing, so its rounding errors must not grow."""
+    along = arm_with_wheels(fflin.CircularOrbit(altitude=1200e3))
+    Q = ARM_Q | {f"qdot_m.w{axis}": 0.0 for axis in "xyz"}
+    schedule = fflin.tvlqr(along, Q, ARM_R, "periodic", sample=along.period / 100)
+    assert apart(schedule.P[0], schedule.P[-1]) < 1e-12
+    # The double multiplier 1 of the Hamiltonian moves by the root of the rounding error.
+    assert schedule.loop_multipliers[0] == pytest.approx(1.0, abs=1e-6)
+    assert schedule.loop_multipliers[1] < 0.999
+
+
+def test_states_that_affect_regulated_states_remain_in_the_riccati_equation():
+    class Models:
+        A = np.zeros((2, 4, 4))
+
+    Models.A[:, 0, 0] = 1.0
+    Models.A[1, 0, 2] = 1e-6  # state 2 affects state 0 at one knot
+    Models.A[0, 2, 3] = 1e-6  # and state 3 affects state 2
+    Models.A[0, 0, 1] = 1e-20  # a rounding error
+    regulated = np.array([True, False, False, False])
+    assert _solved_states(Models, regulated).tolist() == [True, False, True, True]
+
+
+def test_newton_steps_reduce_the_errors_of_a_slow_loop():
+    """The sweep of x1 = 0.99999 x0 with W = 1 contracts errors by 2e-5 only."""
+    a = 0.99999
+    exact = 1.0 / (1.0 - a**2)
+    P = periodic_riccati.repeated(
+        lambda end: (a**2 * end + 1.0, np.array([[a]])), np.array([[0.9 * exact]]), ""
+    )
+    assert P[0, 0] == pytest.approx(exact, rel=1e-10)
 
 
 def test_multipliers_of_states_on_which_the_regulated_states_depend_are_kept():

@@ -60,3 +60,14 @@ def test_the_report_of_a_gain_names_its_inputs_with_units():
     assert "\nu: tau_b [N m], F_b [N], tau_m [N m]\n" in report
     assert "\nx: q_b [1], r_b [m], q_m [rad], omega_b [rad/s], v_b [m/s], " in report
     assert "too large to show" in report
+
+
+def test_poles_of_delays_are_one_line():
+    robot = fflin.load("cubesat", inputs=[fflin.BaseTorque(max=1e-3)])
+    model = fflin.linearize(robot).discretize(0.25, delay=0.5)
+    report = str(fflin.lqr(model))
+    # Each of three inputs is two samples late.
+    assert "6 poles at zero (delay)" in report
+    assert "e-0" not in report.partition("slowest first")[2].partition("6 poles")[0]
+    plain = str(fflin.lqr(fflin.linearize(robot).discretize(0.25)))
+    assert "poles at zero" not in plain

@@ -137,6 +137,22 @@ def test_noise_of_the_inputs_is_noise_of_the_states_with_the_covariance_b_w_bt()
     assert of_inputs.L == near(of_states.L, 1e-12)
 
 
+def test_a_declared_bias_is_no_state_of_the_filter():
+    """The filter equals the filter without the bias, at each sample and after the end."""
+    schedules, gains = [], []
+    for bias in (None, 1e-6):
+        outputs = [fflin.BasePose(), fflin.Gyroscope("base", bias=bias)]
+        _, traj = resting("cubesat", 1.0, outputs, knots=3)
+        schedule = fflin.tvkalman(traj, 1e-6, 1e-8, sample=0.5)
+        regulator = fflin.tvlqr(traj, sample=0.5)
+        policy = fflin.TrajectoryOutputFeedback(traj, regulator, schedule)
+        schedules.append(schedule)
+        gains.append(policy.terms(5.0).B)
+    without, biased = schedules
+    assert (biased.L == without.L).all() and (biased.P == without.P).all()
+    assert (gains[0] == gains[1]).all() and gains[0].any()
+
+
 @pytest.mark.parametrize("ending", ["npz", *exhaustive("mat", "json")])
 def test_filters_are_kept(moving, tmp_path, ending):
     schedule = fflin.tvkalman(moving, 0.1, 0.1, P0=0.1, sample=0.2)

@@ -11,6 +11,7 @@ from scipy.special import jnp_zeros
 import fflin
 from fflin.base.errors import InputError
 from fflin.dynamics.state import StateMap
+from tests.support.robots import free_body
 
 # Roots of cos b cosh b = -1: b = beta L of the modes of a clamped beam.
 CLAMPED = (1.8751040687, 4.6940911330, 7.8547574382, 10.9955407349, 14.1371683910)
@@ -488,3 +489,21 @@ def test_any_axis_of_a_tank_is_a_direction():
     for length in (1e-200, 1e200):
         tank = fflin.Slosh("base", 1.0, (0, 0, 0), frequency=1.0, axis=(0, 0, length))
         assert tank.axes == pytest.approx(np.eye(3))
+
+
+def test_the_eigenvalue_of_a_refused_appendage_is_the_one_of_its_definition():
+    """Compare the message of a mode with too large a moment with its definition."""
+    hub = free_body((2.0, 3.0, 4.0))
+    body = hub.model.inertias[1]
+    turns = np.array([0.0, 0.0, 3.0])
+    array = fflin.FlexibleAppendage(
+        "base", [1.0], np.zeros((3, 1)), turns[:, None], name="array"
+    )
+    size = np.sqrt(np.trace(body.inertia) / (2.0 * body.mass))  # radius of gyration
+    M = np.diag((*[body.mass] * 3, *np.diag(body.inertia) / size**2))
+    L = np.concatenate((np.zeros(3), turns / size))
+    expected = np.linalg.eigvalsh(M - np.outer(L, L))[0] / np.linalg.eigvalsh(M)[-1]
+    with pytest.raises(fflin.InputError) as refusal:
+        hub.replace(appendages=[array])
+    assert f"has the eigenvalue {expected:.2g}, relative to" in str(refusal.value)
+    assert "about the centre of mass with the radius of gyration" in str(refusal.value)

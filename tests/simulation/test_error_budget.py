@@ -379,6 +379,45 @@ def test_the_limit_cycle_is_the_part_of_the_motion_that_is_not_superposed(satell
         fflin.error_budget(gain, lin, limit_cycle=True)
 
 
+def test_errors_of_a_motion_are_counted_from_the_given_time_on(satellite):
+    robot, lin, gain = satellite
+    motion = fflin.simulate(
+        robot,
+        fflin.StateFeedback(lin, gain.K),
+        duration=10.0,
+        disturbance=lambda t, q, v: {"tau_b.z": 1e-6},
+    )
+    given = {"motion": motion, "limit_cycle": True}
+    half = fflin.error_budget(gain, lin, **given)
+    budget = fflin.error_budget(gain, lin, **given, after=8.0)
+    assert (half.after, budget.after) == (5.0, 8.0)
+    assert "simulated: errors of the motion from 8 s on" in str(budget)
+    late = motion.t >= 8.0 - 1e-9
+    errors = np.degrees(attitude_rotations(motion.x, motion.target))[late]
+    np.testing.assert_allclose(budget.simulated_mean, errors.mean(axis=0), rtol=1e-12)
+    np.testing.assert_allclose(
+        budget.simulated_deviation, errors.std(axis=0), rtol=1e-12
+    )
+    np.testing.assert_allclose(
+        budget.contributions[0].size[:3], errors.std(axis=0), rtol=1e-12
+    )
+    with pytest.raises(InputError, match="after is 10 s, expected less than the end"):
+        fflin.error_budget(gain, lin, **given, after=10.0)
+    with pytest.raises(InputError, match="give motion="):
+        fflin.error_budget(gain, lin, bias={"q_b": 1e-6}, after=1.0)
+
+
+def test_rounding_errors_of_a_budget_are_dots(satellite):
+    _, lin, gain = satellite
+    budget = fflin.error_budget(gain, lin, disturbance={"tau_b": (1e-3, 1e-14, 1e-12)})
+    shown = [line.split()[-3:] for line in str(budget).splitlines() if "tau_b" in line]
+    assert [row[1] for row in shown] == ["."]  # 1e-11 of the largest
+    assert float(shown[0][0]) > 0.0 and float(shown[0][2]) > 0.0
+    # A small budget has no rounding errors.
+    small = fflin.error_budget(gain, lin, disturbance={"tau_b.y": 1e-14})
+    assert float(str(small).splitlines()[-1].split()[-2]) > 0.0
+
+
 def motion_deviation(motion):
     """Return the standard deviations [deg] of the attitude in the second half of a motion."""
     late = motion.t >= 0.5 * motion.t[-1]

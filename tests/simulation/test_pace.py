@@ -367,3 +367,56 @@ def test_a_spin_about_an_oblique_axis_counts_by_its_norm():
     v0 = np.r_[np.zeros(3), 30.0 * np.ones(3)]
     motion = fflin.simulate(robot, v0=v0, duration=0.5, dt=0.015)
     assert "52 rad/s" in motion.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("times", "message", "allowed"),
+    [
+        (
+            {"duration": 1.0, "sample": 0.125, "dt": 0.1},
+            "sample is 0.125 s, expected a multiple of the step dt = 0.1 s; the nearest step that "
+            "divides it is dt=0.125 (--dt 0.125)",
+            {"dt": 0.125},
+        ),
+        (
+            {"duration": 1.0, "sample": 0.1, "dt": 0.07},
+            "duration is 1 s, expected a multiple of the step dt = 0.07 s; the nearest step that "
+            "divides it is dt=0.05 (--dt 0.05)",
+            {"dt": 0.05},
+        ),
+        (
+            {"duration": 1.1478, "sample": 0.25, "dt": 0.25},
+            "duration is 1.1478 s, expected a multiple of the step dt = 0.25 s; the nearest "
+            "possible duration is 1 s or 1.25 s",
+            {"duration": 1.25},
+        ),
+        (
+            {"duration": 0.1478, "sample": 0.25, "dt": 0.25},
+            "duration is 0.1478 s, expected a multiple of the step dt = 0.25 s; the nearest "
+            "possible duration is 0.25 s",
+            {"duration": 0.25},
+        ),
+    ],
+)
+def test_a_refused_time_is_refused_with_an_allowed_one(times, message, allowed):
+    def simulated(**times):
+        return fflin.simulate(free_body(HUB), lambda t, q, v: np.zeros(6), **times)
+
+    with pytest.raises(fflin.InputError) as refusal:
+        simulated(**times)
+    assert str(refusal.value) == message
+    motion = simulated(**times | allowed)
+    assert motion.t[-1] == (times | allowed)["duration"]
+
+
+def test_the_proposed_step_divides_the_sample_time():
+    robot = hub_with_mode(1.1)
+    model = fflin.linearize(robot).discretize(0.125)
+    law = fflin.StateFeedback(model, fflin.lqr(model))
+    motion = fflin.simulate(robot, law, duration=1.0, dt=0.125)
+    # The longest accurate step of 1, 2 or 5 units is 0.05 s, which does not divide 0.125 s.
+    assert "dt=0.0416666667 (--dt 0.0416666667) is accurate" in " ".join(
+        str(motion).split()
+    )
+    finer = fflin.simulate(robot, law, duration=1.0, dt=0.0416666667)
+    assert "not accurate" not in str(finer)

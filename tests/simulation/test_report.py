@@ -2,12 +2,19 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import fflin
-from fflin.simulation.report import error_sizes, firings, motion_record, motion_report
+from fflin.simulation.report import (
+    _largest_forces,
+    error_sizes,
+    firings,
+    motion_record,
+    motion_report,
+)
 from tests.support.commands import run
 from tests.support.marks import exhaustive
 from tests.support.messages import says
@@ -420,3 +427,17 @@ def test_thrusters_without_pulses_saturate():
     assert says(
         motion_report(motion), "impulse 1 N s"
     ) and "pulses" not in motion_report(motion)
+
+
+def test_no_line_on_a_constraint_exceeds_80_characters():
+    motion = SimpleNamespace(
+        constraint_names=tuple(
+            f"gripper_of_the_left_arm/handle_of_target.{kind}.{axis}"
+            for kind in ("force", "torque")
+            for axis in "xyz"
+        ),
+        constraint_forces=np.tile(np.array([3.0, 0.0, 4.0, 0.0, 0.5, 0.0]), (2, 1)),
+    )
+    (line,) = _largest_forces(motion)
+    assert max(map(len, line.splitlines())) <= 80
+    assert "5 N; largest torque: 0.5 N m" in " ".join(line.split())

@@ -122,5 +122,5 @@ def test_both_engines_draw_the_same_errors(law):
         )
         for engine in ("python", "compiled")
     ]
-    ends = [campaign.x_end for campaign in campaigns]
+    ends = [campaign.x for campaign in campaigns]
     assert ends[1] == pytest.approx(ends[0], rel=1e-9, abs=1e-13)

@@ -186,6 +186,7 @@ def light(folder):
             "motion": None,
             "robot": robot,
             "limit_cycle": False,
+            "after": None,
         },
         "gramians": {"lin": filtered_model, "duration": 1.0},
         "grid": {"robot": robot, "axes": {joint: [0.0, 1.0]}, "base": None},

@@ -15,11 +15,16 @@ from fflin.dynamics.integrators import GAUSS
 # 2^60 periods, a cost that still grows belongs to a mode that the inputs cannot stabilise.
 _STANDS, _MOST_DOUBLINGS = 1e-15, 60
 
+# If the change is below this and no longer decreases, it is rounding error. A mode that neither
+# decays nor costs anything doubles this error with every doubling.
+_ROUNDED = 1e-11
+
 # Largest accepted relative difference between P at both ends of a period.
 _CLOSED = 1e-9
 
-# Largest number of sweeps that reduce rounding errors after the doubling.
-_SWEEPS = 4
+# Largest number of Newton steps that reduce rounding errors after the doubling, and the binary
+# logarithm of the number of periods over which each of them sums errors.
+_NEWTON_STEPS, _PERIODS = 4, 20
 
 
 def sample_transition(weights: Array, whole: Array) -> Array:
@@ -63,17 +68,27 @@ def periodic_cost(period: Array) -> Array:
             W * np.outer(scale, scale),
         )
     )
+    last_change = np.inf
     with np.errstate(over="ignore", invalid="ignore"):
         for _ in range(_MOST_DOUBLINGS):
             before = maps[2]
             maps = riccati.joined(maps, maps)
-            change = np.linalg.norm(maps[2] - before)
+            size = max(float(np.linalg.norm(maps[2])), 1e-300)
+            change = float(np.linalg.norm(maps[2] - before)) / size
             if not np.isfinite(change):
                 break
-            if change <= _STANDS * np.linalg.norm(maps[2]):
-                P: Array = maps[2] / np.outer(scale, scale)
-                return P
+            if last_change <= _ROUNDED and change >= last_change:
+                return _in_units(before, scale)
+            if change <= _STANDS:
+                return _in_units(maps[2], scale)
+            last_change = change
     raise np.linalg.LinAlgError("the cost grows from period to period")
+
+
+def _in_units(W: Array, scale: Array) -> Array:
+    """Return the cost (nx, nx) in the original units of the states."""
+    P: Array = W / np.outer(scale, scale)
+    return P
 
 
 def _balance(period: Array) -> Array:
@@ -85,28 +100,56 @@ def _balance(period: Array) -> Array:
     return np.where(known, np.sqrt(reach / costs), 1.0)
 
 
-def repeated(sweep: Callable[[Array], Array], P: Array, remedy: str) -> Array:
-    """Return P at the end of a period, after sweeps over the period that reduce its errors.
+def repeated(
+    sweep: Callable[[Array], tuple[Array, Array]], P: Array, remedy: str
+) -> Array:
+    """Return P at the end of a period, after steps that reduce its errors.
 
-    `sweep` returns P at the start of the period for P at its end. A sweep of a stable loop
-    contracts errors. The sweeps end if P repeats after the period to machine precision.
+    For P at the end of the period, `sweep` returns P at its start, and the transition matrix of the
+    closed loop over the period. Newton steps end if they no longer reduce the difference.
     """
-    apart = np.inf
-    for _ in range(_SWEEPS):
-        start = sweep(P)
-        size = max(float(np.linalg.norm(P)), 1e-300)
-        distance = float(np.linalg.norm(start - P)) / size
-        if distance >= apart:
-            break
-        apart = distance
-        P = start
+    start, loop = sweep(P)
+    apart = _difference(start, P)
+    for _ in range(_NEWTON_STEPS):
         if apart <= _STANDS:
             break
+        corrected: Array = P + _summed(loop, start - P)
+        if not np.isfinite(corrected).all():
+            corrected = start
+        start_after, loop_after = sweep(corrected)
+        apart_after = _difference(start_after, corrected)
+        if not apart_after < apart:
+            break
+        P, start, loop, apart = corrected, start_after, loop_after, apart_after
     if not apart <= _CLOSED:
         raise StabilizabilityError(
             f"P differs by {apart:.1e} after one period, expected at most {_CLOSED:g}; {remedy}"
         )
     return P
+
+
+def _difference(start: Array, P: Array) -> float:
+    """Return the difference between P at both ends of a period, relative to the norm of P."""
+    size = max(float(np.linalg.norm(P)), 1e-300)
+    return float(np.linalg.norm(start - P)) / size
+
+
+def _summed(loop: Array, defect: Array) -> Array:
+    """Return the correction X = loop' X loop + defect (nx, nx) of a Newton step, by doubling.
+
+    The doubling ends if X no longer changes. It also ends after 2^_PERIODS periods, because a mode
+    that does not decay adds its rounding errors in every period.
+    """
+    total = defect
+    with np.errstate(over="ignore", invalid="ignore"):
+        for _ in range(_PERIODS):
+            added = loop.T @ total @ loop
+            total = total + added
+            loop = loop @ loop
+            if np.linalg.norm(added) <= _STANDS * np.linalg.norm(total):
+                break
+    X: Array = 0.5 * (total + total.T)
+    return X
 
 
 def interval_maps(at: Callable[[Array], Array], times: Array) -> Array:

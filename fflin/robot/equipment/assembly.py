@@ -262,8 +262,9 @@ def mounted_modes(
                 raise InputError(
                     f"the effective masses of the modes up to '{mode}' exceed the inertia of "
                     f"{_carrier_name(model, joint)} ({body.mass:.4g} kg): M_rr - L L^T has "
-                    f"the eigenvalue {least:.2g}, relative to the largest eigenvalue of M_rr; the "
-                    "inertia in the URDF must include the appendage as if it were rigid"
+                    f"the eigenvalue {least:.2g}, relative to the largest eigenvalue of M_rr, "
+                    "both about the centre of mass with the radius of gyration as unit of length; "
+                    "the inertia in the URDF must include the appendage as if it were rigid"
                 )
         columns = list[Column]()
         for item, placement, _ in items:
@@ -346,6 +347,7 @@ def _radius_of_gyration(body: pin.Inertia) -> float:
 def _least_eigenvalue(mass: Array, center: Array, inertia: Array, L: Array) -> Array:
     """Return the least eigenvalue (N,) of M_rr - L L^T, divided by the largest eigenvalue of M_rr.
 
+    Both matrices are about the centre of mass, and their unit of length is the radius of gyration.
     M_rr is computed for N variants of a body from the masses (N,), the centres of mass (N, 3), and
     the inertias (N, 3, 3) about these centres. L (6, k) is about the origin of the joint. The
     result is -inf for a variant with values that are not finite.
