@@ -129,7 +129,7 @@ def lqg(
     pace = f"the default weights of the gain: {change}"
     if change.disk < LEAST_DISK:
         smaller = " or a smaller disturbance_noise" if estimator.disturbances else ""
-        pace += f"; a larger W{smaller} of kalman raises it"
+        pace += f"; a larger W{smaller} of kalman may raise it"
     return replace(compensator, pace=pace)
 
 

@@ -146,7 +146,7 @@ def test_a_filter_that_limits_the_margin_is_named():
     disk = fflin.margins(fflin.OutputFeedback(model, compensator), model).disk
     assert disk < LEAST_DISK
     assert f"the disk margin {disk:.3g} (gain" in compensator.pace
-    assert compensator.pace.endswith("smaller disturbance_noise of kalman raises it")
+    assert compensator.pace.endswith("smaller disturbance_noise of kalman may raise it")
     columns = [
         model.state_names.index(name)
         for name in gain.regulated
