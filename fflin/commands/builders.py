@@ -126,7 +126,12 @@ def load_robot(arguments: Namespace) -> fflin.Robot:
                 item for item in robot.inputs if isinstance(item, fflin.ReactionWheel)
             ),
         }
-        new_inputs = bundled.get(inputs) or fflin.load_inputs(inputs)
+        try:
+            new_inputs = bundled.get(inputs) or fflin.load_inputs(inputs)
+        except UnknownNameError as error:
+            raise UnknownNameError(
+                f"{error}; --inputs also accepts {', '.join(bundled)}"
+            ) from None
         with located(inputs):  # errors about a name or an inertia show the file
             robot = robot.replace(inputs=new_inputs)
     if outputs := getattr(arguments, "output", None):

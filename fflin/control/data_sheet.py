@@ -15,50 +15,11 @@ from fflin.control.sensors import sensors_of_model
 from fflin.control.weights import Weight
 from fflin.linear.model import LinearModel
 from fflin.robot.outputs import Output, SensorError
+from fflin.robot.sensor_figures import BIAS_FIGURES, NOISE_FIGURES, Figure
 
 # An intensity or a covariance, or one figure of a data sheet such as {"angle_random_walk": 0.1}.
 Sheet: TypeAlias = "float | Mapping[str, float]"
 Noises: TypeAlias = "Weight | Mapping[str, Sheet]"
-
-_DEGREE = math.pi / 180.0
-_HOUR = 3600.0
-_ARC_SECOND = _DEGREE / _HOUR
-
-
-class Figure(NamedTuple):
-    """One figure of a data sheet.
-
-    Attributes
-    ----------
-    unit : str
-        Unit of the figure.
-    factors : mapping
-        Factor from the figure to the standard deviation in SI units, by the unit of the output. An
-        output with another unit cannot have this figure.
-    sampled : bool
-        Whether the figure is the standard deviation of a sample. If False, it is a density, whose
-        square is divided by the sample time.
-    """
-
-    unit: str
-    factors: Mapping[str, float]
-    sampled: bool = False
-
-
-# The unit "1" is the unit of the vector part of a quaternion, which is half of a small rotation.
-_OF_NOISE = {
-    "angle_random_walk": Figure("deg/sqrt(h)", {"rad/s": _DEGREE / _HOUR**0.5}),
-    "velocity_random_walk": Figure("m/s/sqrt(h)", {"m/s^2": 1.0 / _HOUR**0.5}),
-    "noise_equivalent_angle": Figure(
-        "arc seconds", {"1": 0.5 * _ARC_SECOND, "rad": _ARC_SECOND}, sampled=True
-    ),
-}
-
-# Bias instability counts as the standard deviation of the change of the bias within one hour.
-_OF_BIAS = {
-    "bias_instability": Figure("deg/h", {"rad/s": _DEGREE / _HOUR**1.5}),
-    "rate_random_walk": Figure("deg/h/sqrt(h)", {"rad/s": _DEGREE / _HOUR**1.5}),
-}
 
 
 def measurement_noise(lin: LinearModel, V: Noises | None) -> Weight:
@@ -83,7 +44,7 @@ def measurement_noise(lin: LinearModel, V: Noises | None) -> Weight:
     def intensity(key: str, value: Sheet, unit: str) -> float:
         if not isinstance(value, Mapping):
             return value
-        figure, square = _squared(f"V of '{key}'", value, unit, _OF_NOISE)
+        figure, square = _squared(f"V of '{key}'", value, unit, NOISE_FIGURES)
         if not figure.sampled:
             return square / (lin.dt or 1.0)
         return _of_samples(f"V of '{key}'", lin, square)
@@ -92,7 +53,7 @@ def measurement_noise(lin: LinearModel, V: Noises | None) -> Weight:
         what = f"noise of output '{name}'"
         if not isinstance(value, Mapping):
             return _of_samples(what, lin, quantity(what, value) ** 2)
-        figure, square = _squared(what, value, unit, _OF_NOISE)
+        figure, square = _squared(what, value, unit, NOISE_FIGURES)
         if not figure.sampled:
             return square / (sensors[name].sample or lin.dt or 1.0)
         return _of_samples(what, lin, square)
@@ -131,7 +92,7 @@ def bias_intensities(
     def intensity(key: str, value: Sheet, unit: str) -> float:
         what = f"bias_noise of '{key}'"
         if isinstance(value, Mapping):
-            return _squared(what, value, unit, _OF_BIAS)[1]
+            return _squared(what, value, unit, BIAS_FIGURES)[1]
         return quantity(what, value)
 
     known = {
@@ -143,7 +104,7 @@ def bias_intensities(
     def default(name: str, value: SensorError, unit: str) -> float:
         what = f"bias of output '{name}'"
         if isinstance(value, Mapping):
-            return _squared(what, value, unit, _OF_BIAS)[1]
+            return _squared(what, value, unit, BIAS_FIGURES)[1]
         return quantity(what, value) ** 2
 
     values = _by_output(lin, known, {name: name for name in known}, default)
@@ -192,7 +153,7 @@ def _of_sample(what: str, given: SensorError, unit: str, sample: float) -> float
     """Return the standard deviation of a measurement with a sample time [s]."""
     if not isinstance(given, Mapping):
         return quantity(what, given)
-    figure, square = _squared(what, given, unit, _OF_NOISE)
+    figure, square = _squared(what, given, unit, NOISE_FIGURES)
     return math.sqrt(square if figure.sampled else square / sample)
 
 
@@ -200,7 +161,7 @@ def _within_second(what: str, given: SensorError, unit: str) -> float:
     """Return the standard deviation of the change of a bias within 1 s."""
     if not isinstance(given, Mapping):
         return quantity(what, given)
-    return math.sqrt(_squared(what, given, unit, _OF_BIAS)[1])
+    return math.sqrt(_squared(what, given, unit, BIAS_FIGURES)[1])
 
 
 def output_keys(given: Iterable[str], names: Sequence[str]) -> dict[str, str]:

@@ -476,7 +476,7 @@ def capture(
         else checked_placement("placement", placement)
     )
     q, v = state_before(robot, q, v)
-    holding = checked_constraints(hold)
+    holding = checked_constraints(hold, "hold")
     joint, on = find_frame(robot.model, frame)
     data = robot.create_data()
     pin.forwardKinematics(robot.model, data, q)

@@ -175,8 +175,8 @@ def law_of(given: object, robot: object, limits: object) -> Law:
 def _not_written(given: object) -> InputError:
     return InputError(
         f"law has type {type(given).__name__}, expected a Gain, StateFeedback, OutputFeedback, "
-        "LinearController, Compensator, GainSchedule, TrajectoryFeedback, ScheduledFeedback, BDot "
-        "or RateDamping"
+        "MultirateFeedback, LinearController, Compensator, GainSchedule, TrajectoryFeedback, "
+        "ScheduledFeedback, BDot or RateDamping"
     )
 
 

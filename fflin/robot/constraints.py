@@ -203,8 +203,10 @@ CONSTRAINTS: dict[str, type[Constraint]] = {
 }
 
 
-def checked_constraints(value: object) -> tuple[Constraint, ...]:
-    """Return copies of the given constraints, whose names must differ."""
+def checked_constraints(
+    value: object, name: str = "constraints"
+) -> tuple[Constraint, ...]:
+    """Return copies of the constraints of an argument `name`; their own names must differ."""
     given = [value] if isinstance(value, Constraint) else value
     if given is None:
         given = []
@@ -212,7 +214,7 @@ def checked_constraints(value: object) -> tuple[Constraint, ...]:
         isinstance(item, Constraint) for item in given
     ):
         raise InputError(
-            f"constraints is {value!r}, expected a list of Weld, Hinge and Spherical"
+            f"{name} is {value!r}, expected a list of Weld, Hinge and Spherical"
         )
     titles = [item.title for item in given]
     for title in titles:

@@ -11,6 +11,7 @@ from typing import ClassVar, TypeAlias
 from fflin.base.errors import InputError, require_known
 from fflin.base.shown import shown_fields
 from fflin.base.validation import number, positive
+from fflin.robot.sensor_figures import BIAS_FIGURES, NOISE_FIGURES
 
 # Standard deviation, or one figure of a data sheet such as {"angle_random_walk": 0.1}.
 SensorError: TypeAlias = float | Mapping[str, float]
@@ -67,11 +68,12 @@ class Output:
                 f"delay of {self.WORD} is {delay:g} s, expected at least 0"
             )
         object.__setattr__(self, "delay", delay)
-        for name in ("noise", "bias"):
+        for name, figures in (("noise", NOISE_FIGURES), ("bias", BIAS_FIGURES)):
             value = getattr(self, name)
             if value is None:
                 continue
             if isinstance(value, Mapping):
+                require_known(f"part of {name} of {self.WORD}", value, figures)
                 object.__setattr__(self, name, dict(value))
             else:
                 given = positive(f"{name} of {self.WORD}", value)

@@ -196,6 +196,8 @@ def test_wrong_or_missing_data_are_refused_in_one_line(write):
     late = write(TORQUE, TRACKER, LATE, GYROSCOPE, name="late.toml")
     assert "disturbance_noise" in refused("lqg", late, *TIMES, "--integral", "q_b")
     assert "no reaction wheels" in refused("lqg", late, *TIMES, "--inputs", "wheels")
+    words = "--inputs also accepts joints, base, wheels"
+    assert words in refused("lqg", late, *TIMES, "--inputs", "wheel")
     run("lqg", satellite, *TIMES, "-o", "law.npz")
     negative = ("--controller", "law.npz", "--negative-feedback")
     assert "sign of its feedback" in refused("simulate", satellite, *negative)

@@ -217,3 +217,5 @@ def test_what_a_capture_cannot_hold_is_refused():
     same = fflin.Weld("payload", "tool_left")
     with pytest.raises(fflin.InputError, match="same body"):
         fflin.capture(robot, "tool_left", BOX, q=q, v=v, hold=same)
+    with pytest.raises(fflin.InputError, match="hold is 'tool_right', expected a list"):
+        fflin.capture(robot, "tool_left", BOX, q=q, v=v, hold="tool_right")

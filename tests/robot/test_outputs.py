@@ -202,3 +202,15 @@ def test_reports_of_a_robot_show_the_pulses_of_thrusters():
     assert f"inputs ({given}): main inputs" in text
     assert "inputs (isp 60 s): thruster_2, thruster_3" in text
     assert "plain" not in text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"noise": {"noise_equivalent_angel": 8.0}}, "part of noise of star_tracker"),
+        ({"bias": {"angle_random_walk": 0.1}}, "part of bias of star_tracker"),
+    ],
+)
+def test_unknown_figures_of_a_data_sheet_are_refused(arguments, message):
+    with pytest.raises(fflin.UnknownNameError, match=message):
+        fflin.StarTracker(**arguments)
