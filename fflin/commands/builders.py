@@ -129,6 +129,8 @@ def load_robot(arguments: Namespace) -> fflin.Robot:
         try:
             new_inputs = bundled.get(inputs) or fflin.load_inputs(inputs)
         except UnknownNameError as error:
+            if Path(inputs).is_file():
+                raise
             raise UnknownNameError(
                 f"{error}; --inputs also accepts {', '.join(bundled)}"
             ) from None
