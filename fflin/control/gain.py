@@ -561,9 +561,10 @@ def _require_closed(made: str, state: StateMap, q: Array) -> None:
     distance, off = closure.distance(q)
     if distance > NEAR:
         raise InputError(
-            f"{made} at a posture where the given robot is off {off}, because this constraint "
-            "closed in another posture; design the gain where the constraint closes, by fflin.lqr "
-            "at that q or by `fflin lqr --after FILE` with the motion before it"
+            f"{made} at a posture where the given robot is off {off}; this constraint closed in "
+            "another posture, or is not one of the constraints of the gain; design the gain where "
+            "the constraint closes, by fflin.lqr at that q or by `fflin lqr --after FILE` with the "
+            "motion before it"
         )
 
 

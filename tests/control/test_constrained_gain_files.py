@@ -68,8 +68,6 @@ def test_gains_with_and_without_constraints_are_told_apart(tmp_path):
         model_of(loose, robot, "the gain was made", pin.SE3.Identity())
 
 
-@needs_compiler
-@pytest.mark.exhaustive
 @pytest.mark.parametrize(
     "other", [fflin.Hinge("tool_left", "tool_right"), fflin.Weld("base")]
 )
