@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from argparse import Namespace
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial, reduce
 from pathlib import Path
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from fflin.base.validation import Array
     from fflin.commands.phases import PhaseStart
     from fflin.dynamics.coordinates import Frame
+    from fflin.robot.inputs import Input
 
 T = TypeVar("T")
 
@@ -112,28 +113,8 @@ def load_robot(arguments: Namespace) -> fflin.Robot:
         given[name] = for_all[0] if for_all else once(f"--{name}", given[name])
     given |= _orbit_of(arguments, robot)
     inputs = getattr(arguments, "inputs", None)
-    if inputs == "joints" and not robot.n:
-        raise InputError(f"--inputs joints: '{robot.name}' has no joints")
-    if inputs == "wheels" and not robot.wheels:
-        raise InputError(
-            f"--inputs wheels: '{robot.name}' has no reaction wheels among its inputs"
-        )
     if inputs is not None:
-        bundled = {
-            "joints": (fflin.JointTorque("*"),),
-            "base": (fflin.BaseTorque(), fflin.BaseForce()),
-            "wheels": tuple(
-                item for item in robot.inputs if isinstance(item, fflin.ReactionWheel)
-            ),
-        }
-        try:
-            new_inputs = bundled.get(inputs) or fflin.load_inputs(inputs)
-        except UnknownNameError as error:
-            if Path(inputs).is_file():
-                raise
-            raise UnknownNameError(
-                f"{error}; --inputs also accepts {', '.join(bundled)}"
-            ) from None
+        new_inputs = _inputs_of(robot, inputs)
         with located(inputs):  # errors about a name or an inertia show the file
             robot = robot.replace(inputs=new_inputs)
     if outputs := getattr(arguments, "output", None):
@@ -154,6 +135,33 @@ def load_robot(arguments: Namespace) -> fflin.Robot:
     }
     arguments.joint_colors = colors_of(joint_styles(units))
     return robot
+
+
+def _inputs_of(robot: fflin.Robot, inputs: str) -> Sequence[Input]:
+    """Return the inputs that a word or a file of --inputs stands for."""
+    if inputs == "joints" and not robot.n:
+        raise InputError(f"--inputs joints: '{robot.name}' has no joints")
+    if inputs == "wheels" and not robot.wheels:
+        raise InputError(
+            f"--inputs wheels: '{robot.name}' has no reaction wheels among its inputs"
+        )
+    bundled: dict[str, Sequence[Input]] = {
+        "joints": (fflin.JointTorque("*"),),
+        "base": (fflin.BaseTorque(), fflin.BaseForce()),
+        "wheels": tuple(
+            item for item in robot.inputs if isinstance(item, fflin.ReactionWheel)
+        ),
+    }
+    if inputs in bundled:
+        return bundled[inputs]
+    try:
+        return fflin.load_inputs(inputs)
+    except UnknownNameError as error:
+        if Path(inputs).is_file():
+            raise
+        raise UnknownNameError(
+            f"{error}; --inputs also accepts {', '.join(bundled)}"
+        ) from None
 
 
 def colors_of(styles: Mapping[str, CurveStyle]) -> dict[str, str]:
