@@ -111,7 +111,8 @@ def lqg(arguments: Namespace) -> Report:
     example: fflin lqg satellite.toml --sample 0.25 --delay 0.25 --inputs wheels -o law.npz
     """
     from fflin.base.record import record_of
-    from fflin.commands.filtering import deviations, deviations_table, filter_of
+    from fflin.commands.filtering import deviations_table, filter_of
+    from fflin.control.filter_deviations import deviations
     from fflin.control.margins import margins_at_once
     from fflin.control.saved_compensators import policy_of
 

@@ -1,13 +1,10 @@
-"""Kalman filter of the command lqg: its noise, disturbances and standard deviations."""
+"""Kalman filter of the command lqg: its noise and disturbances from files and options."""
 
 from __future__ import annotations
 
-import math
 from argparse import Namespace
 from functools import partial
 from typing import NamedTuple
-
-import numpy as np
 
 import fflin
 from fflin.base.errors import InputError, listed
@@ -16,15 +13,11 @@ from fflin.base.tables import cut, grid
 from fflin.base.validation import Array
 from fflin.commands.builders import once, refuse
 from fflin.control.data_sheet import output_keys
-from fflin.control.estimator import BIAS, DISTURBANCE
+from fflin.control.declared_disturbances import declared_disturbances
 from fflin.control.recovery import Filter, recovering_filter
 from fflin.control.sensors import sensors_of_model
 from fflin.linear.model import LinearModel
-from fflin.robot.disturbance import UNITS, terms_of
 from fflin.robot.outputs import FullState
-
-# Time [s] within which the random walk of a default disturbance reaches its size in robot.toml.
-_WALK = 100.0
 
 _NONE = "none"
 
@@ -114,7 +107,8 @@ def _disturbances(lin: LinearModel, gain: fflin.Gain, arguments: Namespace) -> S
     if arguments.disturbance == [(_NONE, None)]:
         refuse(arguments, ("disturbance_frequency",), "no disturbance is estimated")
         return Slow({}, {})
-    sizes, frequencies = _of_robot(lin)
+    assert lin._robot is not None  # since the command linearised it
+    intensities, frequencies = declared_disturbances(lin._robot)
     frequencies |= once("--disturbance-frequency", arguments.disturbance_frequency)
     given = once("--disturbance", arguments.disturbance)
     if not given and gain.integrals:
@@ -123,14 +117,14 @@ def _disturbances(lin: LinearModel, gain: fflin.Gain, arguments: Namespace) -> S
     if not given:
         pushed = {"tau_b": "q_b", "F_b": "r_b"}
         regulated = {group_of(name) for name in gain.regulated or gain.state_names}
-        given = {name: None for name in sizes if pushed[name] in regulated}
+        given = {name: None for name in intensities if pushed[name] in regulated}
     noise = {}
     for name, intensity in given.items():
         force = _force(name)
         if intensity is not None:
             noise[name] = intensity
-        elif force in sizes:
-            noise[name] = sizes[force] ** 2 / _WALK
+        elif force in intensities:
+            noise[name] = intensities[force]
         else:
             raise InputError(
                 f"--disturbance {name}: [disturbance] of the robot file has no {force}; give the "
@@ -144,48 +138,6 @@ def _disturbances(lin: LinearModel, gain: fflin.Gain, arguments: Namespace) -> S
 def _force(name: str) -> str:
     """Return the group of a disturbance, such as tau_b for tau_b and for tau_b.x."""
     return name.partition(".")[0]
-
-
-def _of_robot(lin: LinearModel) -> tuple[dict[str, float], dict[str, float]]:
-    """Return the largest component and the frequency [Hz] of the disturbances of a robot."""
-    assert lin._robot is not None
-    sizes, frequencies = dict[str, float](), dict[str, float]()
-    for name, term in terms_of(lin._robot.disturbance):
-        size = float(np.abs((term.constant, term.amplitude)).max())
-        if size:
-            sizes[name] = max(size, sizes.get(name, 0.0))
-        if term.periodic:
-            frequencies[name] = term.frequency
-    return sizes, frequencies
-
-
-def deviations(estimator: Filter, lin: LinearModel) -> dict[str, tuple[float, str]]:
-    """Return {signal: (standard deviation, unit)} of the error of a steady-state filter.
-
-    The errors are those of the prediction, before the measurements of a sample. For a periodic
-    filter, they are the largest of a period. Attitudes are in deg. Earlier values of outputs and of
-    commands are left out.
-    """
-    P = np.atleast_3d(estimator.P.T).T
-    sigma = np.sqrt(np.diagonal(P, axis1=1, axis2=2).max(axis=0))
-    units = dict(zip(lin.state_names, lin.state_units, strict=True))
-    sensed = dict(zip(lin.output_names, lin.output_units, strict=True))
-    estimated = estimator.estimated or estimator.state_names
-    result = dict[str, tuple[float, str]]()
-    for name, value in zip(estimator.state_names, sigma.tolist(), strict=True):
-        if name not in estimated or name in lin.added:
-            continue
-        if name.startswith(DISTURBANCE):
-            force = group_of(name.removeprefix(DISTURBANCE))
-            result[name] = value, UNITS.get(force, "SI")
-        elif name.startswith(BIAS):
-            result[name] = value, sensed[name.removeprefix(BIAS)]
-        elif group_of(name) == "q_b":
-            # q_b is half of a small rotation.
-            result[name] = math.degrees(2.0 * value), "deg"
-        elif name in units:
-            result[name] = value, units[name]
-    return result
 
 
 def deviations_table(values: dict[str, tuple[float, str]]) -> str:

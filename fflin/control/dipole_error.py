@@ -10,6 +10,7 @@ from scipy.linalg import expm
 from fflin.base.names import group_of
 from fflin.base.rotation import rotation_matrix
 from fflin.base.validation import Array
+from fflin.control.optimal.periodic_loops import monodromy, steady_states
 from fflin.dynamics.orbital import OrbitField
 from fflin.linear.model import LinearModel
 from fflin.robot.disturbance import RESIDUAL_DIPOLE, magnetic_values
@@ -76,17 +77,11 @@ def steady_error(
         loop[:6, :6] = A - B @ realised @ gain
         loop[:6, 6] = B @ np.cross(dipole, b)
     steps = expm(h * loops)
-    whole = np.eye(7)
-    for step in steps:
-        whole = step @ whole
-    transition = whole[:6, :6]
-    if np.abs(np.linalg.eigvals(transition)).max() >= 1.0:
+    F = steps[:, :6, :6]
+    if np.abs(np.linalg.eigvals(monodromy(F))).max() >= 1.0:
         return None
-    state = np.append(np.linalg.solve(np.eye(6) - transition, whole[:6, 6]), 1.0)
-    largest = 0.0
-    for step in steps:
-        state = step @ state
-        largest = max(largest, float(np.linalg.norm(state[:3])))
+    errors = steady_states(F, steps[:, :6, 6:])[:, :3, 0]
+    largest = float(np.linalg.norm(errors, axis=1).max())
     return math.degrees(2.0 * math.asin(min(largest, 1.0)))
 
 

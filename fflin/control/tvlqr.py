@@ -759,14 +759,12 @@ def periodic_end(
     with stabilised(traj):
         maps = [periodic_riccati.sample_transition(*stage) for stage in stages]
         P = periodic_riccati.periodic_cost(periodic_riccati.over_period(maps))
+        transitions = np.array([whole for _, whole in stages])
+        A, B = np.split(transitions, [len(P)], axis=2)
 
         def sweep(end: Array) -> tuple[Array, Array]:
             gains, costs, _ = riccati.samples_back(stages, end)
-            loop = np.eye(len(end))
-            for K, (_, whole) in zip(gains, stages, strict=True):
-                A, B = np.split(whole, [len(end)], axis=1)
-                loop = loop @ (A - B @ K)
-            return costs[-1], loop
+            return costs[-1], monodromy((A - B @ np.array(gains))[::-1])
 
         return periodic_riccati.repeated(sweep, P, _UNSTABLE)
 

@@ -49,10 +49,10 @@ class Conditioning(NamedTuple):
     is not zero, the extrapolated error is the fourth power of the ratio of mu to this eigenvalue.
     """
 
-    least: float  # smallest eigenvalue of J M^-1 J^T that is not zero
-    condition: (
-        float  # ratio of the largest to the smallest singular value of J M^(-1/2)
-    )
+    # smallest eigenvalue of J M^-1 J^T that is not zero
+    least: float
+    # ratio of the largest to the smallest singular value of J M^(-1/2)
+    condition: float
 
     @property
     def regularisation(self) -> float:

@@ -28,7 +28,7 @@ from fflin.tuning.robust import UncertainLoop
 from fflin.tuning.search import Minimum, Term, minimise
 from fflin.tuning.starts import searched, stabilised, step_texts
 from fflin.tuning.structures import Structure, Structured
-from fflin.tuning.tuned import GoalValue, Tuned, is_active
+from fflin.tuning.tuned import GoalValue, Tuned, is_active, with_check
 from fflin.tuning.verification import peak_above, second_value
 
 # Steps of the search for the least factor by which all goals would hold.
@@ -177,9 +177,7 @@ class _Worst:
     @property
     def larger(self) -> float:
         """The larger of the value and its check."""
-        if math.isnan(self.check):
-            return self.value
-        return max(self.value, self.check)
+        return with_check(self.value, self.check)
 
 
 class _Task:

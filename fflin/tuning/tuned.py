@@ -76,14 +76,17 @@ class GoalValue:
     @property
     def worst(self) -> float:
         """The larger of both values."""
-        if math.isnan(self.check):
-            return self.value
-        return max(self.value, self.check)
+        return with_check(self.value, self.check)
 
     @property
     def met(self) -> bool:
         """Whether both values are at most 1."""
         return self.worst <= 1.0
+
+
+def with_check(value: float, check: float) -> float:
+    """Return the larger of a value and its check, which is NaN if there is none."""
+    return value if math.isnan(check) else max(value, check)
 
 
 class Tuned(LinearController):

@@ -13,9 +13,9 @@ TORQUE, NOISE = 0.01, 1e-4
 FREQUENCIES = np.geomspace(1e-3, 1e3, 2000)
 
 
-def random_plant(rng):
-    """A satellite with flexible panels, and its uncertain parameters."""
-    robot = fflin.load(
+def random_satellite(rng):
+    """A satellite with flexible panels."""
+    return fflin.load(
         "servicer_7dof",
         lock=["joint_*"],
         inputs=[fflin.BaseTorque()],
@@ -23,6 +23,11 @@ def random_plant(rng):
         stiffness={"panel_*": 10.0 ** rng.uniform(1.0, 3.0)},
         damping={"panel_*": 10.0 ** rng.uniform(-1.5, 0.7)},
     )
+
+
+def random_plant(rng):
+    """A satellite with flexible panels, and its uncertain parameters."""
+    robot = random_satellite(rng)
     ranges = {
         "base.density": rng.uniform(0.05, 0.4),
         "panel_left.density": rng.uniform(0.05, 0.3),
@@ -96,14 +101,7 @@ def test_a_goal_that_is_called_met_is_met_by_other_robots_of_the_ranges(seed):
 @pytest.mark.parametrize("seed", [1])
 def test_a_hard_step_that_limits_the_other_goals_holds_by_both_methods(seed):
     rng = np.random.default_rng(seed)
-    robot = fflin.load(
-        "servicer_7dof",
-        lock=["joint_*"],
-        inputs=[fflin.BaseTorque()],
-        outputs=[fflin.BasePose()],
-        stiffness={"panel_*": 10.0 ** rng.uniform(1.0, 3.0)},
-        damping={"panel_*": 10.0 ** rng.uniform(-1.5, 0.7)},
-    )
+    robot = random_satellite(rng)
     law = random_law(rng)
     axis = rng.choice(list("xyz"))
     settling = 10.0 ** rng.uniform(0.7, 1.8)
