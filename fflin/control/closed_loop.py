@@ -28,7 +28,7 @@ from fflin.control.optimal.disk import (
     largest_structured_gain,
 )
 from fflin.control.optimal.largest_gain import largest_gain
-from fflin.control.policy import System
+from fflin.control.policy import System, loop_matrix
 from fflin.dynamics.delays import HeldSystem, split
 from fflin.linear.model import LinearModel
 
@@ -143,13 +143,8 @@ class ClosedLoop:
         self, law: System, plant: System
     ) -> tuple[Array, Array, Array, Array]:
         """Return F, G, H and J of `closed` for one of the laws."""
-        A, B, C, D, *_ = plant
-        F = np.block(
-            [
-                [A + B @ law.D @ C, B @ law.C],
-                [law.B @ (C + D @ law.D @ C), law.A + law.B @ D @ law.C],
-            ]
-        )
+        _, B, C, D, *_ = plant
+        F = loop_matrix(law, plant)
         if self.at == "inputs":
             G = np.vstack((B, law.B @ D))
             H = np.hstack((law.D @ C, law.C))

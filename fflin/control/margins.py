@@ -24,7 +24,7 @@ from fflin.control.lags import (
 from fflin.control.loop_margins import Margins, Place
 from fflin.control.optimal.disk import disk_gain, disk_phase
 from fflin.control.periodic_closed_loop import PeriodicClosedLoop
-from fflin.control.policy import Policy, System, as_policy
+from fflin.control.policy import Policy, System, as_policy, loop_matrix
 from fflin.control.sensed_laws import sensed_systems
 from fflin.control.sensors import sensors_of_model, timing_of
 from fflin.linear.model import LinearModel, refuse_frozen
@@ -134,11 +134,13 @@ def closed_loop(
 def matrices_of_period(policy: Policy, lin: LinearModel) -> tuple[Array, float]:
     """Return the matrices (N, nx, nx) of a loop for each sample of its period, and its dt [s].
 
-    The states of the loop are the states of the model, then the states of the law.
+    The policy measures outputs of the sampled model `lin`. The states of the loop are the states of
+    the model, then the states of the law.
     """
-    loop = closed_loop(policy, lin, None, None)
-    assert isinstance(loop, PeriodicClosedLoop)
-    return loop.nominal().F, loop.dt
+    laws = laws_in_loop(policy, lin, None)
+    rows = [lin.output_names.index(name) for name in laws[0].inputs]
+    plant = System(lin.A, lin.B, lin.C[rows], lin.D[rows], lin.dt)
+    return np.array([loop_matrix(law, plant) for law in laws]), lin.dt
 
 
 def delayed_model(

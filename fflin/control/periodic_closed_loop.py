@@ -42,8 +42,7 @@ class PeriodicClosedLoop(ClosedLoop):
             *(np.array(matrices) for matrices in zip(*loops, strict=True))
         )
 
-    def nominal(self) -> PeriodicLoop:
-        """Return the loop with the delays of its inputs."""
+    def _nominal(self) -> PeriodicLoop:
         loop = self.periodic(self.with_delays(self.delays))
         if not all(np.isfinite(matrices).all() for matrices in loop):
             raise InputError(
@@ -55,7 +54,7 @@ class PeriodicClosedLoop(ClosedLoop):
     @property
     def states(self) -> int:
         """Number of states of the loop."""
-        return len(self.nominal().F[0])
+        return len(self._nominal().F[0])
 
     @property
     def harmonics(self) -> int:
@@ -64,7 +63,7 @@ class PeriodicClosedLoop(ClosedLoop):
 
     def disk_margin(self) -> float:
         """Return the disk margin for changes of all channels at once."""
-        loop = self.nominal()
+        loop = self._nominal()
         if not _is_stable(loop):
             return 0.0
         return disk_margin(Harmonics(loop).peak()[0])
@@ -76,7 +75,7 @@ class PeriodicClosedLoop(ClosedLoop):
 
     def margins(self) -> Margins:
         """Return the margins of all channels."""
-        loop = self.nominal()
+        loop = self._nominal()
         if not _is_stable(loop):
             return self.no_margins()
         harmonics = Harmonics(loop)

@@ -40,6 +40,7 @@ from fflin.control.policy import (
     as_policy,
     block_of_feedback,
     bound,
+    loop_matrix,
     states_of_gain,
     unstable_note,
 )
@@ -385,15 +386,8 @@ class LinearLaw(PointLaw):
 
     def loop_with(self, lin: LinearModel) -> Array:
         """Return the closed-loop matrix of the law and another model with its signals."""
-        A, B, C, D, *_ = self.system
         measured, through, _ = self._measured(lin)
-        loop: Array = np.block(
-            [
-                [lin.A + lin.B @ D @ measured, lin.B @ C],
-                [B @ (measured + through @ D @ measured), A + B @ through @ C],
-            ]
-        )
-        return loop
+        return loop_matrix(self.system, System(lin.A, lin.B, measured, through))
 
     def sampled(self, dt: float) -> Self:
         """Return the law sampled at dt [s]; a sampled law is unchanged."""

@@ -122,6 +122,18 @@ class System(NamedTuple):
     outputs: tuple[str, ...] = ()
 
 
+def loop_matrix(law: System, plant: System) -> Array:
+    """Return the matrix of the closed loop, whose first states are the states of the plant."""
+    A, B, C, D, *_ = plant
+    F: Array = np.block(
+        [
+            [A + B @ law.D @ C, B @ law.C],
+            [law.B @ (C + D @ law.D @ C), law.A + law.B @ D @ law.C],
+        ]
+    )
+    return F
+
+
 def proportional(
     K: Array, dt: float, states: tuple[str, ...], inputs: tuple[str, ...]
 ) -> System:

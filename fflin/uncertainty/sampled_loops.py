@@ -20,7 +20,7 @@ from fflin.control.optimal.periodic_loops import (
     lifted,
     monodromy,
 )
-from fflin.control.policy import Policy, System
+from fflin.control.policy import Policy, System, loop_matrix
 from fflin.dynamics.delays import HeldSystem
 from fflin.uncertainty.lft import LFT
 
@@ -155,12 +155,8 @@ class SampledLoops:
         past = len(plant) - len(self.lft.A)
         measured = np.hstack((self._measured, np.zeros((len(self._measured), past))))
         seen = np.hstack((self.lft.C2, np.zeros((len(self.lft.C2), past))))
-        F = np.block(
-            [
-                [plant + inputs @ law.D @ measured, inputs @ law.C],
-                [law.B @ measured, law.A],
-            ]
-        )
+        through = np.zeros((len(measured), inputs.shape[1]))
+        F = loop_matrix(law, System(plant, inputs, measured, through))
         G = np.vstack((inputs, np.zeros((len(law.A), inputs.shape[1]))))
         command = np.hstack((law.D @ measured, law.C))
         outputs = np.hstack((seen, np.zeros((len(seen), len(law.A)))))

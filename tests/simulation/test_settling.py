@@ -5,6 +5,7 @@ import pytest
 
 import fflin
 from fflin.control.authority import thrusters_give_every_wrench
+from fflin.control.margins import matrices_of_period
 from fflin.simulation.plan import time_to_settle
 
 
@@ -112,3 +113,22 @@ def test_a_loop_of_sensors_with_different_sample_times_settles_as_it_is_simulate
     assert 60.0 < time < 600.0
     assert error[motion.t > time].max() < 0.01
     assert error[motion.t > time - 10.0].max() > 0.01
+
+
+def test_the_matrices_of_a_period_predict_the_motion():
+    """The order of three different matrices matters."""
+    sensors = [fflin.StarTracker(sample=0.75, delay=0.25), fflin.Gyroscope("base")]
+    robot = fflin.load("cubesat", inputs=[fflin.BaseTorque()], outputs=sensors)
+    lin = fflin.linearize(robot).discretize(0.25)
+    law = fflin.lqg(fflin.lqr(lin), fflin.kalman(lin, 1e-10, 1e-8))
+    policy = fflin.MultirateFeedback(lin, law)
+    matrices, dt = matrices_of_period(policy, lin)
+    assert matrices.shape[0] == 3 and dt == 0.25
+    q = fflin.configuration(robot)
+    q[3:7] = [np.sin(1e-4), 0.0, 0.0, np.cos(1e-4)]
+    motion = fflin.simulate(robot, policy, q0=q, duration=10.0, dt=0.05, every=5)
+    state = np.zeros(matrices.shape[1])
+    state[:12] = motion.x[0]
+    for k, x in enumerate(motion.x[1:]):
+        state = matrices[k % 3] @ state
+        np.testing.assert_allclose(state[:12], x, rtol=0.0, atol=1e-9, err_msg=str(k))
