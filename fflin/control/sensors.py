@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fflin.base.errors import InputError
-from fflin.base.validation import Array, Mask
+from fflin.base.validation import Array, Indices, Mask
 from fflin.dynamics.outputs import sensors_by_signal
 from fflin.dynamics.state import StateMap
 from fflin.linear.model import LinearModel
@@ -55,6 +55,21 @@ class SensorTiming(NamedTuple):
         since = sample - np.array(self.delays)
         arrives: Mask = since % np.array(self.periods) == 0
         return arrives
+
+    @property
+    def oldest(self) -> int:
+        """Largest number of samples from a measurement to a sample at which it is received."""
+        ages = zip(self.periods, self.delays, strict=True)
+        return max(period - 1 + delay for period, delay in ages)
+
+    def measured(self, sample: int) -> Indices:
+        """Return the samples (ny,) at which the values that are received at a sample were measured.
+
+        They are 0 before the first measurement arrives.
+        """
+        since = sample - np.array(self.delays)
+        latest = since - since % np.array(self.periods)
+        return np.maximum(latest, 0)
 
 
 def timing_of(

@@ -27,6 +27,7 @@ from fflin.base.writing import as_path, failing, read_file, write_atomically
 from fflin.control.bdot import measured_field
 from fflin.control.loops import Loop, Measure, Step, next_sample
 from fflin.control.policy import BoundLaw, Command, Policy
+from fflin.control.sensors import SensorTiming, lags_of_robot, timing_of_robot
 from fflin.dynamics.coordinates import Frame, frame_of
 from fflin.dynamics.outputs import Measuring
 from fflin.dynamics.state import StateMap
@@ -84,7 +85,9 @@ def write_c(
     - For gains along a trajectory, for a law that follows one, and for outputs that are measured at
       different rates, the sample number is an additional argument. The gains of a periodic
       trajectory repeat. The attitudes and positions in the outputs y of a law that follows a
-      trajectory are relative to the base poses of the trajectory, which ``NAME.json`` lists.
+      trajectory are relative to the base poses of the trajectory, which ``NAME.json`` lists, at the
+      sample of the measurement. The code is for the sample times and delays of the sensors of
+      `robot`.
 
     Parameters
     ----------
@@ -372,6 +375,8 @@ class CLaw(Policy):
     def _output_loop(self, state: StateMap) -> Loop:
         """Return the command of an output law, which measures relative to its reference."""
         sizes = (self._about["memory"], 0)
+        self._require_timing(state)
+        start = np.array(self._about["y0"]) if "y0" in self._about else None
 
         def at_point(t: float) -> tuple[Step, Measuring, Array]:
             return partial(self._output_step, t), measuring, x
@@ -384,12 +389,28 @@ class CLaw(Policy):
 
         if "points" in self._about:
             q, v = (np.array(self._about["points"][key]) for key in "qv")
-            return Loop(state, self.dt, sizes, along)
+            # `Loop` refuses sensors with a lag, and late sensors for code of earlier versions,
+            # which compares all outputs with the plan at the same time.
+            if lags_of_robot(state).any() or "timing" not in self._about:
+                start = None
+            return Loop(state, self.dt, sizes, along, start=start)
         q, v = map(np.array, self._about["point"])
         measuring = Measuring(state, q)
         x = state.read(q, v)
-        start = np.array(self._about["y0"]) if "y0" in self._about else None
         return Loop(state, self.dt, sizes, at_point, start=start)
+
+    def _require_timing(self, state: StateMap) -> None:
+        """Raise `InputError` if a robot has sensors with other times than the code."""
+        timing = self._about.get("timing")
+        if timing is None:
+            return
+        written = SensorTiming(tuple(timing["periods"]), tuple(timing["delays"]))
+        if timing_of_robot(state, self.dt) != written:
+            raise InputError(
+                f"the outputs of '{state.robot.name}' have other sample times or delays than the "
+                f"outputs for which the C code '{self.name}' was written; write it with "
+                "robot= for this robot"
+            )
 
     def _sample(self, t: float) -> tuple[object, ...]:
         """Return the number of the sample at time t [s], if the code needs it."""
@@ -544,12 +565,8 @@ def _texts(law: Law, name: str, real: str) -> tuple[str, dict[str, str]]:
         nz = law.memory
         outputs = tables["y0"].shape[1]
         words |= {"states": nz, "states_max": max(nz, 1), "outputs": outputs}
-        if law.points:
-            words["sample_comment"] = (
-                f"\n *{words['sample_comment']}\n * Attitudes and positions in y are relative to "
-                "the base pose of the trajectory at\n * this sample, which "
-                f"{name}.json lists."
-            )
+        comment = _sample_comment(law, name, str(words["sample_comment"]))
+        words["sample_comment"] = comment
     words["interface"] = _filled(f"{kind}_interface.h", words)
     words["limiting"] = _filled("limiting.c", words).rstrip()
     words["run"] = _filled(f"{kind}_run.c", words)
@@ -633,6 +650,8 @@ def _about(law: Law, title: str, real: str, frame: str) -> dict[str, object]:
     if law.points:
         q, v = law.points
         about["points"] = {"q": q.tolist(), "v": v.tolist()}
+    if law.timing is not None:
+        about["timing"] = law.timing._asdict()
     return about
 
 
@@ -645,13 +664,31 @@ def _period_words(period: int) -> dict[str, object]:
         words |= {
             "sample_argument": "unsigned long sample, ",
             "sample_given": "given->sample, ",
-            "sample_comment": f"\n * sample counts from 0. A and B repeat after {period} samples.",
             "tables": f"[{period}]",
             "table": "[table]",
             "table_row": f"    const unsigned long table = sample % {period}UL;\n",
             "table_comment": "One table for each sample of a period. ",
         }
     return words
+
+
+def _sample_comment(law: Law, name: str, rows: str) -> str:
+    """Return the comment on the samples of an output law; `rows` is the comment on its rows."""
+    lines = [rows.strip()]
+    if law.points:
+        lines += [
+            "Attitudes and positions in y are relative to the base pose of the trajectory at",
+            f"the sample at which they were measured; {name}.json lists the base poses.",
+        ]
+    if law.period > 1:
+        counts = "" if rows else "sample counts from 0. "
+        lines.append(f"{counts}A and B repeat after {law.period} samples.")
+    if law.timing is not None and not law.timing.is_plain:
+        lines += [
+            "y contains the latest value of each output that arrived, and before the first one",
+            "y0 of the first sample.",
+        ]
+    return "".join(f"\n * {line}" for line in lines if line)
 
 
 def _vector(case: Case, law: Law, error: float, array: Callable[[Array], str]) -> str:

@@ -28,6 +28,7 @@ from fflin.control.policy import (
     StateForm,
     bound,
 )
+from fflin.control.sensors import SensorTiming, timing_of_robot
 from fflin.control.tracking import TrajectoryFeedback, TrajectoryOutputFeedback
 from fflin.control.tvlqr import GainSchedule
 from fflin.dynamics.state import StateMap
@@ -90,6 +91,8 @@ class Law:
     # q (N, nq) and v (N, nv) at all samples of an output law that follows a trajectory. Its
     # attitudes and positions are relative to the base poses in q.
     points: tuple[Array, Array] | None = None
+    # sample times and delays that the sensors must have, or None if they may have any
+    timing: SensorTiming | None = None
     delay: tuple[float, ...] = ()  # delay [s] of each input; empty without delays
     # inputs (nu,) until the first command arrives, if they are not the first row of u0
     initial: Array | None = None
@@ -142,6 +145,8 @@ def law_of(given: object, robot: object, limits: object) -> Law:
     elif isinstance(given, Policy):
         lin = given.model
         trajectory = given.followed_trajectory
+    if robot is None and isinstance(given, Following):
+        robot = given.lin._robot
     if robot is None and lin:
         robot = lin._robot
     if robot is None and trajectory:
@@ -248,7 +253,7 @@ def _law_of_model(title: str, policy: Policy, dt: float, robot: Robot) -> Law | 
     if not isinstance(policy, PointLaw):
         return None
     terms = policy.terms_of_period()
-    return _output_law(
+    law = _output_law(
         title,
         terms,
         inputs=(lin.input_names, lin.input_units),
@@ -257,6 +262,7 @@ def _law_of_model(title: str, policy: Policy, dt: float, robot: Robot) -> Law | 
         robot=robot,
         lin=lin,
     )
+    return replace(law, timing=policy.designed_timing)
 
 
 def _state_law(
@@ -285,35 +291,44 @@ def _following_law(title: str, policy: Following, robot: Robot) -> Law:
     """Convert a law that follows a trajectory, with one row of the tables for each sample."""
     lin = policy.lin
     path = ReferencePath(policy, robot)
-    if len(path.about_point[0].A) > len(policy.terms[0].A):
-        raise InputError(
-            f"outputs of '{robot.name}' have their own sample or delay, which C code of a law that "
-            "follows a trajectory does not support; export the law without follow, or leave out "
-            "these fields of the outputs"
-        )
-    times = policy.sample_time * np.arange(policy.samples)
-    rows = [path.terms(t) for t in times]
-    u0 = np.array([row.u0 for row in rows])
-    q, v, _ = map(np.array, zip(*map(policy.reference, times), strict=True))
+    dt = policy.sample_time
     if policy.senses_outputs:
+        timing = timing_of_robot(path.state, dt)
+        times = dt * np.arange(policy.samples + timing.oldest)
+        rows = [path.terms(t) for t in times]
+        planned = np.array([row.y0 for row in rows])
+        received = [timing.measured(k) for k in range(len(times))]
+        # Each received value is compared with the plan at the time of its measurement.
+        y0 = np.take_along_axis(planned, np.array(received), axis=0)
         law = _output_law(
             title,
-            [rows[0]],
+            list(policy.terms),
             inputs=(lin.input_names, lin.input_units),
             signals=(lin.output_names, lin.output_units),
-            dt=policy.sample_time,
+            dt=dt,
             robot=robot,
             lin=None,
-            rows=(u0, np.array([row.y0 for row in rows])),
+            rows=(np.array([row.u0 for row in rows]), y0),
         )
-        law = replace(law, points=(q, v))
+        law = replace(law, points=_points(policy, times), timing=timing)
     else:
-        tables = _references(path.state, q, v) | {"u0": u0, "K": -rows[0].D[None]}
+        times = dt * np.arange(policy.samples)
+        rows = [path.terms(t) for t in times]
+        tables = _references(path.state, *_points(policy, times)) | {
+            "u0": np.array([row.u0 for row in rows]),
+            "K": -rows[0].D[None],
+        }
         law = _law_of_states(
             title, policy, path.state, tables, {}, robot, terms=rows[0]
         )
     delay = tuple(policy.input_delays.values())
     return replace(law, delay=delay, initial=policy.reference(0.0)[2])
+
+
+def _points(policy: Following, times: Array) -> tuple[Array, Array]:
+    """Return q (N, nq) and v (N, nv) of the trajectory of a law at times (N,) [s] of the run."""
+    q, v, _ = map(np.array, zip(*map(policy.reference, times), strict=True))
+    return q, v
 
 
 def _law_about_point(
@@ -693,7 +708,7 @@ def _output_cases(
     samples = max(len(terms), len(inputs))
     for number in range(CASES):
         index = number % samples
-        row = index % len(inputs)
+        row = min(index, len(inputs) - 1)
         sample = terms[index % len(terms)]._replace(u0=inputs[row], y0=outputs[row])
         size = 10.0 ** random.uniform(-4, 0)
         z, dy = random.normal(scale=size, size=nz), random.normal(scale=size, size=ny)

@@ -180,7 +180,8 @@ def test_other_sensors_than_those_of_the_design_are_refused():
         fflin.simulate(satellite(delay=0.1), policy, duration=1.0)
 
 
-def test_a_law_that_unloads_follows_a_slew():
+def unloading():
+    """Return the robot with an external torque, and a law that unloads its wheels."""
     outputs = [*satellite().outputs, fflin.JointVelocities(("wheel_*",))]
     robot = satellite().replace(outputs=outputs)
     lin = fflin.linearize(robot).discretize(SAMPLE)
@@ -188,8 +189,12 @@ def test_a_law_that_unloads_follows_a_slew():
     estimator = fflin.kalman(lin, PROCESS, noise)
     law = fflin.MultirateFeedback(lin, fflin.lqg(gain_of(lin), estimator))
     design = robot.replace(inputs=[fflin.BaseTorque(), *robot.inputs])
-    unloading = fflin.unload_wheels(law, design, 0.04)
-    policy = unloading.follow(slew(robot))
+    return design, fflin.unload_wheels(law, design, 0.04)
+
+
+def test_a_law_that_unloads_follows_a_slew():
+    design, law = unloading()
+    policy = law.follow(slew(satellite()))
     # The momentum is parallel to the axis of the slew.
     v0 = fflin.velocity(design, {"wheel_z": 50.0})
     motion = fflin.simulate(design, policy, v0=v0, duration=4.0, dt=SAMPLE, noise=0.0)

@@ -1,9 +1,13 @@
 """C code of laws that follow a trajectory: the test program, and simulations against Python."""
 
+import json
+
 import numpy as np
+import pinocchio as pin
 import pytest
 
 import fflin
+from tests.control import test_multirate_following as multirate
 from tests.control.test_following import LAWS, SAMPLE, satellite, slew
 from tests.support.c_code import COMPILERS, needs_compiler, outcome
 
@@ -56,6 +60,98 @@ def test_the_header_states_the_reference_of_the_outputs(tmp_path):
     header = (tmp_path / "controller.h").read_text()
     assert "unsigned long sample" in header
     assert "base pose of the trajectory" in header
+
+
+def with_star_tracker(delay=0.0):
+    """Return a law of a late, slow star tracker and a gyroscope, which follows a slew."""
+    robot = multirate.satellite(noise=False)
+    return robot, multirate.multirate(robot, delay).follow(slew(robot))
+
+
+def with_held_values():
+    """Return an ordinary law of the same sensors, which receives the latest value of each."""
+    plain = multirate.satellite(sample=None, delay=0.0, noise=False)
+    law, _ = multirate.equal_rates(plain)
+    return multirate.satellite(noise=False), law.follow(slew(plain))
+
+
+def that_unloads():
+    """Return a law of late sensors that also feeds back the latest wheel speeds."""
+    design, law = multirate.unloading()
+    return design, law.follow(slew(multirate.satellite()))
+
+
+LATE = {
+    "star tracker": with_star_tracker,
+    "star tracker, delayed inputs": lambda: with_star_tracker(0.12),
+    "held values": with_held_values,
+    "unloading": that_unloads,
+}
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("kind", LATE)
+def test_the_code_compares_late_values_with_the_plan_at_their_measurement(
+    tmp_path, kind
+):
+    """Over thousands of samples, at random errors from the slew and from its end."""
+    robot, law = LATE[kind]()
+    policy = fflin.CLaw(fflin.write_c(law, tmp_path, robot=robot))
+    python, in_c = law.bind(robot), policy.bind(robot)
+    random = np.random.default_rng(2)
+    difference = largest = 0.0
+    for sample in range(2500):
+        t = sample * law.sample_time
+        q, v, _ = law.reference(t)
+        q = pin.integrate(robot.model, q, 0.02 * random.normal(size=robot.nv))
+        v = v + 1e-3 * random.normal(size=robot.nv)
+        one, other = python(t, q, v), in_c(t, q, v)
+        difference = max(difference, np.abs(one - other).max())
+        largest = max(largest, np.abs(one).max())
+    assert largest > 1e-5
+    assert difference < 1e-12 * largest
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("compiler", COMPILERS)
+@pytest.mark.parametrize("real", ["double", "float"])
+@pytest.mark.parametrize("kind", LATE)
+def test_the_test_program_of_late_sensors_agrees(tmp_path, kind, real, compiler):
+    robot, law = LATE[kind]()
+    fflin.write_c(law, tmp_path, robot=robot, real=real, limits={"wheel": 1e-4})
+    code, text = outcome(tmp_path, compiler)
+    assert code == 0, text
+
+
+def test_the_code_of_late_sensors_follows_as_python_does(tmp_path):
+    robot, law = with_star_tracker(0.1)
+    limits = {"wheel": 2e-5}
+    folder = fflin.write_c(law, tmp_path, limits=limits)
+    header = (folder / "controller.h").read_text()
+    assert "A and B repeat after 5 samples." in header
+    assert "latest value of each output" in header
+    options = {
+        "q0": fflin.configuration(robot, rpy=(2, -1, 3)),
+        "duration": 20.0,
+        "dt": 0.05,
+        "limits": limits,
+    }
+    python, in_c = (
+        fflin.simulate(robot, policy, **options) for policy in (law, fflin.CLaw(folder))
+    )
+    assert np.abs(python.u).max() == pytest.approx(2e-5)
+    assert in_c.q == pytest.approx(python.q, abs=1e-12)
+    assert in_c.u == pytest.approx(python.u, abs=1e-12)
+
+
+def test_a_robot_with_other_sensors_than_the_code_is_refused(tmp_path):
+    _, law = with_star_tracker()
+    policy = fflin.CLaw(fflin.write_c(law, tmp_path))
+    message = "other sample times or delays than the outputs for which the C code"
+    with pytest.raises(fflin.InputError, match=message):
+        policy.bind(multirate.satellite(delay=0.1))
+    about = json.loads((tmp_path / "controller.json").read_text())
+    assert about["timing"]["delays"] == [4, 4, 4, 0, 0, 0]
 
 
 @pytest.mark.exhaustive
