@@ -264,15 +264,10 @@ def test_a_quantity_that_cannot_be_dispersed_is_refused(robots, given, words):
         CampaignJob(robot, policy, given, 0, "python", {"duration": 1.0})
 
 
-@pytest.mark.process
-def test_dask_flies_the_same(robots):
+@pytest.fixture(scope="module")
+def dask():
+    """A client of a local cluster of two processes."""
     distributed = pytest.importorskip("distributed")
-    robot = robots["planar_detumble"]
-    lin = fflin.linearize(robot)
-    policy = fflin.StateFeedback(lin, fflin.lqr(lin).K)
-    given = {"q_b": 0.05, "*.mass": 0.1, "q_b.noise": 1e-3, "delay": [0.0, 0.02]}
-    case = {"runs": 20, "duration": 0.2, "dt": 0.02, "sample": 0.04, "engine": "python"}
-    campaign = fflin.monte_carlo(robot, policy, given, **case)
     with (
         distributed.LocalCluster(
             n_workers=2,
@@ -282,9 +277,20 @@ def test_dask_flies_the_same(robots):
         ) as cluster,
         distributed.Client(cluster) as client,
     ):
-        expected_value = fflin.monte_carlo(
-            robot, policy, given, executor=client.get_executor(), chunk=8, **case
-        )
+        yield client
+
+
+@pytest.mark.process
+def test_dask_flies_the_same(robots, dask):
+    robot = robots["planar_detumble"]
+    lin = fflin.linearize(robot)
+    policy = fflin.StateFeedback(lin, fflin.lqr(lin).K)
+    given = {"q_b": 0.05, "*.mass": 0.1, "q_b.noise": 1e-3, "delay": [0.0, 0.02]}
+    case = {"runs": 20, "duration": 0.2, "dt": 0.02, "sample": 0.04, "engine": "python"}
+    campaign = fflin.monte_carlo(robot, policy, given, **case)
+    expected_value = fflin.monte_carlo(
+        robot, policy, given, executor=dask.get_executor(), chunk=8, **case
+    )
     assert all(
         np.array_equal(getattr(campaign, name), getattr(expected_value, name))
         for name in ARRAYS
@@ -293,34 +299,24 @@ def test_dask_flies_the_same(robots):
 
 
 @pytest.mark.process
-def test_a_lost_worker_of_dask_is_reported(robots):
-    distributed = pytest.importorskip("distributed")
+def test_a_lost_worker_of_dask_is_reported(robots, dask):
     robot = robots["planar_detumble"]
     case = {"runs": 64, "duration": 0.2, "dt": 0.02, "engine": "python", "chunk": 8}
     campaign = fflin.monte_carlo(robot, None, {"q_b": 0.05}, **case)
-    with (
-        distributed.LocalCluster(
-            n_workers=2,
-            threads_per_worker=1,
-            processes=True,
-            dashboard_address="127.0.0.1:0",
-        ) as cluster,
-        distributed.Client(cluster) as client,
-    ):
-        processes = list(client.run(os.getpid).values())
+    processes = list(dask.run(os.getpid).values())
 
-        def kill(done, total):
-            if processes:
-                os.kill(processes.pop(), signal.SIGKILL)
-                processes.clear()
+    def kill(done, total):
+        if processes:
+            os.kill(processes.pop(), signal.SIGKILL)
+            processes.clear()
 
-        with pytest.warns(fflin.FflinWarning, match="1 worker of the executor ended"):
-            expected_value = fflin.monte_carlo(
-                robot,
-                None,
-                {"q_b": 0.05},
-                executor=client.get_executor(),
-                progress=kill,
-                **case,
-            )
+    with pytest.warns(fflin.FflinWarning, match="1 worker of the executor ended"):
+        expected_value = fflin.monte_carlo(
+            robot,
+            None,
+            {"q_b": 0.05},
+            executor=dask.get_executor(),
+            progress=kill,
+            **case,
+        )
     assert np.array_equal(campaign.q, expected_value.q)
