@@ -294,7 +294,11 @@ def unknown(kind: str, name: str, known: Iterable[str]) -> UnknownNameError:
     import difflib
 
     names = list(known)
-    near = difflib.get_close_matches(str(name), names, n=5, cutoff=0.5)
+    near = [
+        known_name for known_name in names if known_name.lower() == str(name).lower()
+    ]
+    if not near:
+        near = difflib.get_close_matches(str(name), names, n=5, cutoff=0.5)
     if near:
         hint = f"did you mean {', '.join(near)}?"
     elif not names:

@@ -2,8 +2,9 @@
 
 import math
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from difflib import get_close_matches
 from functools import cached_property, partial
 from itertools import combinations
 from operator import attrgetter
@@ -18,7 +19,7 @@ from fflin.base.errors import (
     InputError,
     UnknownNameError,
 )
-from fflin.base.names import by_name, group_of, input_keys
+from fflin.base.names import by_name, group_of, input_keys, stands_for_any
 from fflin.base.rotation import row_products
 from fflin.base.validation import Array, Indices, untied
 from fflin.base.validation import by_name as mapping
@@ -173,7 +174,7 @@ class Dispersions:
         if self._kinds & {*_RANDOM_ERRORS}:
             self.columns.append(Column(SEED, "seed", [0], 0, SEEDS))
         for kind, spreads in by_kind.items():
-            self._add(kind, spreads, " | ".join(kinds))
+            self._add(kind, spreads, kinds)
         self._warn_of_degrees()
         # Names of the dispersed values.
         self.names = tuple(map(attrgetter("name"), self.columns))
@@ -195,13 +196,13 @@ class Dispersions:
                 )
 
     def _add(
-        self, kind: str, spreads: Mapping[str, tuple[Inverse, str]], kinds: str
+        self, kind: str, spreads: Mapping[str, tuple[Inverse, str]], kinds: list[str]
     ) -> None:
         """Add the columns of one kind of dispersion.
 
         `spreads` is {name, group or pattern: (inverse distribution function, common name)}. If the
         common name is not empty, all quantities that match the key share the column with this name,
-        or one such column for each axis. `kinds` is the text that lists all kinds in messages.
+        or one such column for each axis. `kinds` lists all kinds for messages.
         """
         robot = self._plant.robot
         names = self._known[kind]
@@ -212,6 +213,7 @@ class Dispersions:
                 f"{kind} is dispersed, but the policy is continuous, and {kind} applies only to "
                 "a sampled policy; give sample=, a multiple of dt (--sample on the command line)"
             )
+        _require_kinds(kind, spreads, names, kinds)
         written = dict[str, str]()
         try:
             if kind in _OF_BODIES:
@@ -219,8 +221,8 @@ class Dispersions:
             spread_of_index = by_name(f"{kind} to disperse", spreads, names)
         except UnknownNameError as error:
             message = str(error)
-            if kind == "state":
-                message += f"; or NAME.({kinds})"
+            if kind == "state" and not message.endswith("?"):
+                message += f"; or NAME.({' | '.join(kinds)})"
             raise UnknownNameError(message) from None
         nominal = robot.springs._asdict()
         of_modes = robot.springs.stiffness[self._modes]
@@ -692,6 +694,28 @@ class _Bound(Policy):
     def bind(self, robot: Robot) -> Command:
         """Return the command of the policy for its own robot."""
         return bound(self.policy, self.robot)
+
+
+def _require_kinds(
+    kind: str, keys: Iterable[str], names: Sequence[str], kinds: Sequence[str]
+) -> None:
+    """Raise `UnknownNameError` for a key that names no state, and ends in a misspelt kind.
+
+    A kind without the name of a quantity before it, such as "mass", is also refused.
+    """
+    if kind != "state":
+        return
+    for key in keys:
+        head, _, end = key.rpartition(".")
+        near = get_close_matches(end.lower(), (*kinds, "delay"), n=1)
+        if stands_for_any(key, names) or not near:
+            continue
+        meant = f"{head or '*'}.{near[0]}"
+        if near == ["delay"]:
+            meant = "delay"
+        raise UnknownNameError(
+            f"no state to disperse named '{key}'; did you mean {meant}?"
+        )
 
 
 def _periodic(robot: Robot) -> tuple[str, ...]:

@@ -612,14 +612,24 @@ def tuning_of(
     check_signals(structure, goals, lin)
     plant: object = lin
     if given.get("vary"):
-        if lin.v.any() or arguments.effort:
-            raise InputError(
-                "velocities and --effort have no effect on uncertain models; remove them, or "
-                "remove the ranges (--vary, [tune.vary])"
-            )
-        plant = fflin.uncertain(design, given["vary"])
+        plant = uncertain_plants(design, lin, arguments, given["vary"])
         settings["q"] = lin.q
     return design, plant, structure, goals, settings, design is not robot
+
+
+def uncertain_plants(
+    robot: fflin.Robot,
+    lin: fflin.LinearModel,
+    arguments: Namespace,
+    ranges: dict[str, object],
+) -> fflin.Uncertain:
+    """Return the robots with parameters in ranges, for a law about the point of a model."""
+    if lin.v.any() or arguments.effort:
+        raise InputError(
+            "velocities and --effort have no effect on uncertain models; remove them, or "
+            "remove the ranges (--vary, [tune.vary])"
+        )
+    return fflin.uncertain(robot, ranges)
 
 
 def tuned_law(
@@ -926,6 +936,22 @@ def start_of(
         about = reference or attitude(robot, q, number, arguments.frame)[1]
         q[:7] = pin.SE3ToXYZQUAT(about * pin.XYZQUATToSE3(q[:7]))
     return q, v
+
+
+def start_notes(robot: fflin.Robot, arguments: Namespace) -> tuple[str, ...]:
+    """Return a note on a start that [start] of the robot file defines."""
+    if not robot.start or arguments.phase is not None:
+        return ()
+    options = [
+        f"--{name}"
+        for name in ("joint", "rpy", "position", "velocity")
+        if getattr(arguments, name)
+    ]
+    changed = f"; {listed(options)} replace entries of it" if options else ""
+    note = (
+        "start: [start] of the robot file, to which the dispersions of states are added"
+    )
+    return (note + changed,)
 
 
 def about_point(

@@ -35,9 +35,11 @@ from fflin.commands.builders import (
     refuse,
     robot_of_design,
     robot_of_law,
+    start_notes,
     state_of,
     tuned_law,
     tuning_of,
+    uncertain_plants,
     weights_of,
     with_errors,
     with_welds,
@@ -122,6 +124,10 @@ def lqg(arguments: Namespace) -> Report:
     robot, design, _, gain = designed(arguments)
     model = gain._lin
     assert model is not None  # since it was designed here
+    plants = None
+    if arguments.vary:
+        ranges = once("--vary", arguments.vary)
+        plants = uncertain_plants(design, model, arguments, ranges)
     try:
         estimator, note = filter_of(model, gain, arguments)
     except DetectabilityError as error:
@@ -139,17 +145,14 @@ def lqg(arguments: Namespace) -> Report:
     notes += [x for x in policy.notes if x != compensator.slow_bias]
     if design is not robot:
         notes.append(_TORQUE_OF_OTHERS)
-    text = "\n\n".join(
-        (
-            str(compensator),
-            folded([_margins_line(margins)]),
-            deviations_table(errors),
-            folded(notes),
-        )
-    )
-    result = {
-        **record_of(compensator),
-        "margins": margins,
+    parts = [str(compensator), folded([_margins_line(margins)])]
+    result = {**record_of(compensator), "margins": margins}
+    if plants is not None:
+        worst = plants.worst(policy, model.q)
+        parts.append(f"over the ranges of --vary:\n{worst}")
+        result["worst"] = worst
+    parts += [deviations_table(errors), folded(notes)]
+    result |= {
         "standard_deviations": {name: value for name, (value, _) in errors.items()},
         "units": {name: unit for name, (_, unit) in errors.items()},
         "notes": notes,
@@ -159,7 +162,7 @@ def lqg(arguments: Namespace) -> Report:
         arguments.output_file: compensator.save,
         arguments.plot: lambda path: fflin.plot_loops(policy, path),
     }
-    return Report(robot.name, result, text, files)
+    return Report(robot.name, result, "\n\n".join(parts), files)
 
 
 def tune(arguments: Namespace) -> Report:
@@ -452,6 +455,8 @@ def montecarlo(arguments: Namespace) -> Report:
     }
     command = bound(policy, robot) if policy else None
     notes = command.notes if isinstance(command, BoundLaw) else ()
+    if "q0" in settings and not arguments.offset:
+        notes += start_notes(robot, arguments)
     shown = [str(campaign), *(folded([note]) for note in notes)]
     text = "\n".join([*shown, *worst_runs(campaign, arguments.worst)])
     result = {**campaign_record(campaign, arguments.worst), "notes": notes}

@@ -15,7 +15,7 @@ from fflin.commands.builders import once, refuse
 from fflin.control.data_sheet import output_keys
 from fflin.control.declared_disturbances import declared_disturbances
 from fflin.control.recovery import Filter, recovering_filter
-from fflin.control.sensors import sensors_of_model
+from fflin.control.sensors import sensors_of_model, timing_of_model
 from fflin.linear.model import LinearModel
 from fflin.robot.outputs import FullState
 
@@ -47,6 +47,7 @@ def filter_of(lin: LinearModel, gain: fflin.Gain, arguments: Namespace) -> Filte
     Without --process-noise, the noise acts at the inputs, as `recovering_filter` chooses it.
     """
     slow = _disturbances(lin, gain, arguments)
+    _require_possible_integrals(lin, gain, slow, arguments)
     design = partial(
         fflin.kalman,
         lin,
@@ -133,6 +134,28 @@ def _disturbances(lin: LinearModel, gain: fflin.Gain, arguments: Namespace) -> S
     forces = {_force(name) for name in noise}
     kept = {name: x for name, x in frequencies.items() if _force(name) in forces}
     return Slow(noise, kept)
+
+
+def _require_possible_integrals(
+    lin: LinearModel, gain: fflin.Gain, slow: Slow, arguments: Namespace
+) -> None:
+    """Raise `InputError` if a law cannot integrate beside its filter."""
+    if not gain.integrals:
+        return
+    integrals = "the entry integral of [weights] in the robot file"
+    if arguments.integral:
+        integrals = f"--integral {' '.join(arguments.integral)}"
+    if slow.noise:
+        raise InputError(
+            f"{integrals} and --disturbance {listed(slow.noise)} make two integrators for one "
+            "channel, of which only the sum is determined; remove one of them"
+        )
+    if not timing_of_model(lin).is_plain:
+        raise InputError(
+            f"{integrals} has no effect on a law of outputs with their own sample or delay; remove "
+            "it, and let the filter estimate the disturbance: [disturbance] in the robot file, or "
+            "--disturbance NAME=W"
+        )
 
 
 def _force(name: str) -> str:

@@ -94,7 +94,7 @@ OPTIONS: dict[str, dict[str, str]] = {
     },
     "lqg": {
         **_AT_POINT,
-        CONTROLLER: "weights q r bryson sample delay wheel-speeds integral allocate",
+        CONTROLLER: "weights q r bryson sample delay wheel-speeds integral vary allocate",
         "filter": "process-noise noise bias-noise disturbance disturbance-frequency",
         OUTPUT: "output-file plot",
     },
@@ -173,7 +173,7 @@ COMMON = {
     "lqr": "joint velocity equilibrium inputs frame weights q r bryson sample reduce wheel-speeds "
     "output-file plot",
     "lqg": "sample delay weights q r bryson integral process-noise noise bias-noise disturbance "
-    "inputs output output-file plot",
+    "vary inputs output output-file plot",
     "tvlqr": "trajectory periodic hold strict weights q r bryson sample qf inputs frame "
     "output-file",
     "tune": "law goal vary sample delay starts seed joint inputs output output-file plot",
@@ -464,12 +464,13 @@ ABOUT: dict[str, str] = {
     "disturbance-frequency": "frequency [Hz] of a sinusoid that the disturbance NAME contains; the "
     "default is the frequency in [disturbance] of robot.toml",
     "lqg noise": "standard deviation of the noise in each sample of an output. NAME is an output, "
-    "a group or a quantity such as gyroscope. The default is the noise of the [[output]] in "
-    "robot.toml",
+    "a group, or a sensor such as gyroscope or star_tracker. The default is the noise of the "
+    "[[output]] in robot.toml",
+    "lqg vary": "range of an uncertain parameter. RANGE is as in `fflin uncertain`. The report "
+    "states the worst margins of the law in the ranges",
     "lqg delay": "delay [s] between a sample and the application of its command. Without "
     "--sample, the sample time is T",
-    "lqg output-file": "save the law, for --controller of `fflin simulate` and `montecarlo` and "
-    "for `fflin export`, to FILE",
+    "lqg output-file": "save the law, for --controller and `fflin export`, to FILE",
     "lqg plot": "plot the loops and their margins to FILE",
     "tvlqr dt": "former name of --sample",
     "tvlqr output-file": "save the gains to FILE",

@@ -357,7 +357,7 @@ FORMS: dict[str, Form] = {
     "disturbance": many(lock, "NAME[=W]"),
     "disturbance-frequency": many(assignment, "NAME=HZ"),
     "lqg noise": many(assignment, "NAME=SIGMA"),
-    "tune vary": many(parameter_range, "NAME=RANGE"),
+    **dict.fromkeys(("tune vary", "lqg vary"), many(parameter_range, "NAME=RANGE")),
     "tune seed": one(whole, "S"),
     **dict.fromkeys(("starts", "steps"), _COUNT),
     "plan duration": one(number, "T", required=True),

@@ -14,7 +14,7 @@ from fflin.base.validation import Array, instance, quantity
 from fflin.control.sensors import sensors_of_model
 from fflin.control.weights import Weight
 from fflin.linear.model import LinearModel
-from fflin.robot.outputs import Output, SensorError
+from fflin.robot.outputs import Output, SensorError, StarTracker
 from fflin.robot.sensor_figures import BIAS_FIGURES, NOISE_FIGURES, Figure
 
 # An intensity or a covariance, or one figure of a data sheet such as {"angle_random_walk": 0.1}.
@@ -165,14 +165,16 @@ def _within_second(what: str, given: SensorError, unit: str) -> float:
 
 
 def output_keys(given: Iterable[str], names: Sequence[str]) -> dict[str, str]:
-    """Return the key that `by_name` understands for each key, such as "*.gyroscope.*"."""
+    """Return the key that `by_name` understands for each key, such as "*.gyroscope.*".
+
+    The key "star_tracker" names the attitude q_b.
+    """
     keys = {}
     for key in given:
-        pattern = f"*.{key}.*"
-        quantity_alone = not stands_for_any(key, names) and stands_for_any(
-            pattern, names
-        )
-        keys[key] = pattern if quantity_alone else key
+        keys[key] = key
+        pattern = "q_b" if key == StarTracker.WORD else f"*.{key}.*"
+        if not stands_for_any(key, names) and stands_for_any(pattern, names):
+            keys[key] = pattern
     return keys
 
 

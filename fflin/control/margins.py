@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from fflin.base.errors import InputError
-from fflin.base.names import input_keys
+from fflin.base.errors import InputError, listed
+from fflin.base.names import group_of, input_keys
 from fflin.base.process import in_one_thread
 from fflin.base.validation import Array, instance, number, positive
 from fflin.control.closed_loop import ClosedLoop
@@ -16,6 +16,7 @@ from fflin.control.gain import Gain
 from fflin.control.gain import Margins as GainMargins
 from fflin.control.lags import (
     designed_lags,
+    lags_of_its_robot,
     lags_of_model,
     model_of_loop,
     robot_lags,
@@ -75,7 +76,9 @@ def margins(
         default, the delay of `lin` is used. If `lin` has none, it is the delay of the policy's
         model, as in `simulate`. Likewise, if `lin` has no lags, the loop has the lags of its
         robot, and a warning states lags for which the law was not designed. If the robot has no
-        lags either, the loop has the lags of the policy's model.
+        lags either, the loop has the lags of the policy's model. For an `Allocation`, give the
+        model of its design, with the lag of the thrusters, such as
+        ``lin.with_lags({"tau_b": 0.05})``.
     sample : float, optional
         Sample time [s] with which a continuous law is executed.
     at : {"inputs", "outputs"}, optional
@@ -270,6 +273,8 @@ def laws_in_loop(
             what = f"the law measures {missing[0]}, which the model does not contain"
         else:
             what = "the law and the model have different inputs"
+        if isinstance(policy, Policy) and policy.commanded_robot is not None:
+            raise InputError(f"{what}; {_model_of_design(law, lin)}")
         raise InputError(
             f"{what}; give the model of the robot for which the law was designed, with the same "
             "inputs and outputs"
@@ -277,6 +282,16 @@ def laws_in_loop(
     if not outputs:
         return laws
     return with_sensors(laws, lin)
+
+
+def _model_of_design(law: System, lin: LinearModel) -> str:
+    """Return what to give for the model of a law whose commands other inputs realise."""
+    text = f"an Allocation commands {listed(law.outputs)}: give the model of its design"
+    lag = max(lags_of_its_robot(lin, outputs=False).inputs.values(), default=0.0)
+    if lag:
+        lags = {group_of(name) or name: lag for name in law.outputs}
+        text += f", and the lag of the inputs of '{lin.robot}' by lin.with_lags({lags})"
+    return text
 
 
 def with_sensors(laws: list[System], lin: LinearModel) -> list[System]:

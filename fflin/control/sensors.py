@@ -69,7 +69,8 @@ class SensorTiming(NamedTuple):
         """
         since = sample - np.array(self.delays)
         latest = since - since % np.array(self.periods)
-        return np.maximum(latest, 0)
+        measured: Indices = np.maximum(latest, 0)
+        return measured
 
 
 def timing_of(

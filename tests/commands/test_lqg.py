@@ -134,6 +134,43 @@ def test_a_small_disk_margin_is_a_warning(write):
     assert not warned("lqg", satellite, "--sample", 0.25)
 
 
+RANGES = ("--vary", "base.density=0.2", "--vary", "base.inertia.xx=0.1")
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("times", ["", LATE])
+def test_vary_states_the_worst_margins_of_the_law_over_the_ranges(write, times):
+    satellite = write(TORQUE, TRACKER, times, GYROSCOPE)
+    noise = ("--process-noise", "omega_b=1e-10")
+    command = ("lqg", satellite, *TIMES, *noise, *RANGES)
+    code, out, err = run(*command, "-o", "law.npz", "--json")
+    assert (code, err) == (0, "")
+    robot = fflin.load(satellite)
+    model = fflin.linearize(robot).discretize(0.25, delay=0.25)
+    law = fflin.MultirateFeedback if times else fflin.OutputFeedback
+    compensator = fflin.MultirateCompensator if times else fflin.Compensator
+    ranges = {"base.density": 0.2, "base.inertia.xx": 0.1}
+    policy = law(model, compensator.load("law.npz"))
+    worst = fflin.uncertain(robot, ranges).worst(policy)
+    shown = json.loads(out)["worst"]
+    assert shown["margin"]["value"] == pytest.approx(worst.margin.value, rel=1e-9)
+    assert shown["margin"]["parameters"] == dict(worst.margin.parameters)
+    assert shown["damping"]["value"] == pytest.approx(worst.damping.value, rel=1e-9)
+    assert (shown["unstable"], shown["safe"]) == (0, None)
+    assert json.loads(out)["margins"]["disk"] > shown["margin"]["value"]
+    text = " ".join(run(*command)[1].split())
+    assert f"least disk margin {worst.margin.value:.4g} at base.density" in text
+    assert "stability in the whole set is not guaranteed" in text
+
+
+def test_vary_refuses_unknown_parameters_and_a_moving_operating_point(write):
+    satellite = write(WHEELS, TRACKER, GYROSCOPE)
+    message = refused("lqg", satellite, *TIMES, "--vary", "base.mas=0.1")
+    assert "did you mean" in message and "base.mass" in message
+    spinning = ("--velocity", "wheel_1=10", "--vary", "base.mass=0.1")
+    assert "remove the ranges" in refused("lqg", satellite, *TIMES, *spinning)
+
+
 @pytest.mark.exhaustive
 def test_sensors_with_their_own_times_are_flown_with_all_inputs(write):
     satellite = write(WHEELS, THRUSTER, TRACKER, LATE, GYROSCOPE)
@@ -194,7 +231,14 @@ def test_wrong_or_missing_data_are_refused_in_one_line(write):
     options = (*TIMES, "--disturbance", "F_b")
     assert "--disturbance F_b=INTENSITY" in refused("lqg", satellite, *options)
     late = write(TORQUE, TRACKER, LATE, GYROSCOPE, name="late.toml")
-    assert "disturbance_noise" in refused("lqg", late, *TIMES, "--integral", "q_b")
+    integral = ("--integral", "q_b")
+    message = refused("lqg", late, *TIMES, *integral)
+    assert message.startswith("fflin: error: --integral q_b has no effect")
+    both = refused("lqg", satellite, *TIMES, *integral, "--disturbance", "tau_b")
+    assert "--integral q_b and --disturbance tau_b make two integrators" in both
+    weighted = write(TORQUE, "[weights]\nintegral = ['q_b']\n", TRACKER, GYROSCOPE)
+    message = refused("lqg", weighted, *TIMES, "--disturbance", "tau_b")
+    assert "integral of [weights] in the robot file and --disturbance" in message
     assert "no reaction wheels" in refused("lqg", late, *TIMES, "--inputs", "wheels")
     words = "--inputs also accepts joints, base, wheels"
     assert words in refused("lqg", late, *TIMES, "--inputs", "wheel")
@@ -204,6 +248,19 @@ def test_wrong_or_missing_data_are_refused_in_one_line(write):
     wheels = write(WHEELS, TRACKER, GYROSCOPE, name="wheels.toml")
     other = refused("simulate", wheels, "--controller", "law.npz")
     assert "tau_b.x" in other and "--inputs of the design" in other
+
+
+def test_the_noise_of_a_star_tracker_is_given_by_its_name(write):
+    satellite = write(TORQUE, TRACKER, GYROSCOPE)
+    process = ("--process-noise", "omega_b=1e-10", "--json")
+    by_sensor, by_state, other = (
+        json.loads(run("lqg", satellite, *TIMES, *process, "--noise", noise)[1])
+        for noise in ("star_tracker=1e-4", "q_b=1e-4", "star_tracker=1e-3")
+    )
+    assert by_sensor["A"] == by_state["A"]
+    assert by_sensor["A"] != other["A"]
+    message = refused("lqg", satellite, *TIMES, "--noise", "tracker=1e-4")
+    assert "no output named 'tracker'" in message and "q_b" in message
 
 
 def test_an_output_that_shows_the_missing_states_is_named(write):

@@ -74,6 +74,21 @@ def test_the_command_simulates_the_motion_of_python_and_reports_it_as_text_and_j
     assert message["quantiles"]["attitude"]["0.99"][2] is None
 
 
+def test_the_report_states_that_the_robot_file_defines_the_start(folder):
+    (folder / "r.toml").write_text(
+        'urdf = "planar_detumble"\n[start]\nrpy = [0, 0, 5]\n'
+    )
+    command = ("montecarlo", "r.toml", *SHORT, "--runs", 2)
+    note = "start: [start] of the robot file"
+    code, out, _ = run(*command, cwd=folder)
+    assert code == 0 and note in out and "replace" not in out
+    _, out, _ = run(*command, "--rpy", 0, 0, 1, "--json", cwd=folder)
+    [shown] = [text for text in json.loads(out)["notes"] if note in text]
+    assert shown.endswith("--rpy replace entries of it")
+    _, out, _ = run("montecarlo", "planar_detumble", *SHORT, "--runs", 2, cwd=folder)
+    assert note not in out
+
+
 def test_tables_match_the_campaign(folder):
     command = ("montecarlo", "planar_detumble", *SHORT, "--runs", 6)
     assert run(*command, "-o", "runs.npz", cwd=folder)[0] == 0
@@ -141,10 +156,16 @@ def test_noise_has_a_report_and_another_campaign_is_replaced_by_force(
     [
         ("none.toml", "none.toml"),
         ("bad.toml", "bad.toml:2.*'nosuch'"),
+        ("kind.toml", r"kind.toml:2.*'base\.mas'; did you mean base\.mass\?$"),
+        ("single.toml", r"single.toml:2.*'mas'; did you mean \*\.mass\?$"),
+        ("case.toml", r"case.toml:2.*'Q_b'; did you mean q_b\?$"),
     ],
 )
 def test_a_bad_file_is_one_line(file, message, tmp_path):
-    (tmp_path / "bad.toml").write_text("[dispersions]\nnosuch = 1\n")
+    names = {"bad": "nosuch", "kind": '"base.mas"', "single": "mas", "case": "Q_b"}
+    for stem, name in names.items():
+        text = f"[dispersions]\n{name} = 1\n"
+        (tmp_path / f"{stem}.toml").write_text(text)
     error = refused("montecarlo", "planar_detumble", file, "--runs", "3", cwd=tmp_path)
     assert re.search(message, error), error
 

@@ -556,6 +556,17 @@ def test_the_margins_of_an_allocation_are_those_of_its_inner_policy():
             assert found.disk == pytest.approx(expected.disk, rel=1e-9)
 
 
+def test_the_margins_of_an_allocation_need_the_model_of_its_design():
+    thruster = fflin.Thruster("base", (0.1, 0, 0), (0, 1, 0), max=0.1, lag=0.05)
+    robot = fflin.load("cubesat", inputs=[thruster])
+    design = robot.replace(inputs=[fflin.BaseTorque()])
+    model = fflin.linearize(design).discretize(0.25)
+    law = fflin.Allocation(fflin.StateFeedback(model, fflin.lqr(model)), design)
+    message = r"model of its design, and the lag .* lin\.with_lags\({'tau_b': 0.05}\)"
+    with pytest.raises(fflin.InputError, match=message):
+        fflin.margins(law, fflin.linearize(robot))
+
+
 @pytest.mark.parametrize("sample", [None, *exhaustive(0.5)])
 def test_a_model_may_have_more_outputs_than_the_law_measures(sample):
     wheels = [fflin.ReactionWheel(axis, inertia=1e-5) for axis in np.eye(3)]
