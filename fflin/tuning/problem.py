@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from fflin.base.errors import InputError
 from fflin.base.validation import Array
+from fflin.base.validation import number as checked_number
 from fflin.tuning.channels import Channel, Ends, channel_of
 from fflin.tuning.closed_loop import ClosedLoop
 from fflin.tuning.criteria import Piece, abscissa_pieces, pieces_of
 from fflin.tuning.goals import Goal, Margin
 from fflin.tuning.law import Law
+from fflin.tuning.parameters import Parameter
 from fflin.tuning.plant import Plant
 from fflin.tuning.search import Term
 from fflin.tuning.structures import Structured
@@ -26,6 +29,9 @@ _TIGHT = 1e-6
 
 # Peaks below this fraction of the level of the goals are not refined.
 _ROUGH = 0.5
+
+# Relative rounding error of a given value of a parameter.
+_ROUNDING = 1e-9
 
 # Bound of the logarithm of the scaling of a channel.
 _SCALING = math.log(1e6)
@@ -69,6 +75,10 @@ class Problem:
     The vector x contains the coordinates of the free parameters, and then the logarithms of the
     scalings of the channels of each margin, without the first channel. `tight` contains logarithms
     by which hard goals are tighter.
+
+    By default, the soft goals are the objective, and the hard goals are constraints. If all goals
+    are hard, they are the objective. If `objective` is given, it contains the indices of the goals
+    that are the objective, and the other goals are left out.
     """
 
     def __init__(
@@ -77,11 +87,20 @@ class Problem:
         measures: Sequence[Measure],
         cases: list[Case],
         tight: Array | None = None,
+        objective: Sequence[int] | None = None,
     ) -> None:
         self.tight: Array = np.zeros(len(measures)) if tight is None else tight
         self.structured = structured
         self.measures = measures
         self.cases = cases
+        hard = [measure.goal.hard for measure in measures]
+        self.is_constraint = [False] * len(measures)
+        self.is_counted = [True] * len(measures)
+        if objective is not None:
+            self.is_counted = [index in objective for index in range(len(measures))]
+        elif not all(hard):
+            self.is_constraint = hard
+        self._objective = objective
         parameters = structured.parameters
         self.free = [i for i, is_free in enumerate(structured.free) if is_free]
         self.scalings: list[slice | None] = []
@@ -121,7 +140,9 @@ class Problem:
         structured = self.structured.simpler
         if structured is None:
             return None
-        return Problem(structured, self.measures, self.cases, self.tight)
+        return Problem(
+            structured, self.measures, self.cases, self.tight, self._objective
+        )
 
     def extended(self, simple: Problem, x: Array) -> Array:
         """Return the point of the law of a simpler problem at x."""
@@ -131,6 +152,22 @@ class Problem:
         point = self._point([known.get(p.name, p.value) for p in parameters])
         point[len(self.free) :] = x[len(simple.free) :]
         return point
+
+    def given(self, values: Mapping[str, float]) -> Array:
+        """Return the point of given values of parameters, and the start values of the others."""
+        parameters = self.structured.parameters
+        names = [parameter.name for parameter in parameters]
+        start = [parameter.value for parameter in parameters]
+        for name, value in values.items():
+            if name not in names:
+                raise InputError(
+                    f"start has the parameter {name!r}, which the structure does not have; give "
+                    f"values of {', '.join(names)}"
+                )
+            index = names.index(name)
+            start[index] = checked_number(name, value)
+            _require_allowed(parameters[index], start[index])
+        return self._point(start)
 
     def _point(self, values: Sequence[float]) -> Array:
         """Return the point of the values of all parameters."""
@@ -165,13 +202,16 @@ class Problem:
     ) -> list[list[Piece]] | None:
         """Return the pieces of each goal for a plant, or None if the loop is unstable.
 
-        Peaks of gains below `floors` are not refined.
+        Goals that are left out have no pieces. Peaks of gains below `floors` are not refined.
         """
         loops = case.loops(self.law(x))
         if loops is None:
             return None
-        pieces = []
+        pieces: list[list[Piece]] = []
         for index, measure in enumerate(self.measures):
+            if not self.is_counted[index]:
+                pieces.append([])
+                continue
             floor = floors[index] if floors is not None else 0.0
             ends, channel, loop = measure.ends, case.channels[index], loops[index]
             scaling = self.scaling(x, index)
@@ -179,23 +219,19 @@ class Problem:
         return pieces
 
     def evaluate(self, x: Array) -> list[Term] | None:
-        """Return the logarithms of the values of all goals, or None if a loop is unstable.
-
-        If all goals are hard, they are treated as objectives.
-        """
+        """Return the logarithms of the values of all goals, or None if a loop is unstable."""
         rates = self.values(x)[1]
-        all_hard = all(measure.goal.hard for measure in self.measures)
         terms: list[Term] = []
         floors = [
-            _ROUGH * (1.0 if measure.goal.hard and not all_hard else self._level)
-            for measure in self.measures
+            _ROUGH * (1.0 if is_constraint else self._level)
+            for is_constraint in self.is_constraint
         ]
         for number, case in enumerate(self.cases):
             pieces = self.pieces(x, case, floors)
             if pieces is None:
                 return None
             for index, of_goal in enumerate(pieces):
-                hard = self.measures[index].goal.hard and not all_hard
+                hard = self.is_constraint[index]
                 for piece in of_goal:
                     if not math.isfinite(piece.value):
                         return None
@@ -204,7 +240,12 @@ class Problem:
                         terms.append(self._term(piece, hard, key, rates))
         level = max((t.value for t in terms if not t.is_constraint), default=0.0)
         self._level = min(self._level, math.exp(min(level, 100.0)))
-        return terms or None
+        return terms or [self._nothing()]
+
+    def _nothing(self) -> Term:
+        """Return the term of goals whose values are all smaller than the least value."""
+        size = self.size
+        return Term(math.log(_LEAST), False, None, math.nan, lambda: np.zeros(size))
 
     def _term(
         self, piece: Piece, hard: bool, key: tuple[int, int], rates: Array
@@ -250,3 +291,18 @@ class Problem:
         """Return whether the loops of all plants are stable."""
         law = self.law(x)
         return all(case.loops(law) is not None for case in self.cases)
+
+
+def _require_allowed(parameter: Parameter, value: float) -> None:
+    """Raise `InputError` if a start value is outside the bounds, or its parameter is fixed."""
+    room = _ROUNDING * max(abs(value), abs(parameter.value))
+    if parameter.fixed and abs(value - parameter.value) > room:
+        raise InputError(
+            f"start has {parameter.name} = {value:g}, but the structure fixes it at "
+            f"{parameter.value:g}; leave it out, or give the structure no value"
+        )
+    low, high = parameter.least, parameter.largest
+    if not parameter.fixed and not low - room <= value <= high + room:
+        raise InputError(
+            f"start has {parameter.name} = {value:g}, expected {low:g} to {high:g}"
+        )

@@ -128,12 +128,14 @@ def minimise(
     bounds: tuple[Array, Array],
     *,
     steps: int,
+    target: float = -math.inf,
     is_done: Callable[[list[Term]], bool] | None = None,
     on_step: OnStep | None = None,
 ) -> Minimum:
     """Minimise the largest objective subject to constraints, from a point where all are defined.
 
-    `on_step` is called in each step with its number and the largest of all values.
+    The search ends if all values are at most `target`. `on_step` is called in each step with its
+    number and the largest of all values.
     """
     x: Array = np.clip(start, *bounds)
     terms = evaluate(x)
@@ -149,6 +151,8 @@ def minimise(
         path.append(x)
         if on_step is not None:
             on_step(len(history), max(objective, constraint))
+        if max(objective, constraint) <= target:
+            break
         if is_done is not None and is_done(terms):
             break
         if is_done is None and _stagnates(history):

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from itertools import chain
 
 import numpy as np
 
@@ -20,6 +21,9 @@ _SCREENING = 60
 # Decades by which the weight of the commands of a regulator is larger or smaller, at random.
 _DECADES = 2.0
 
+# Decades by which a random gain is larger than the gain of a regulator.
+_SIZES = -0.5, 1.5
+
 # Weights that make the equations of a regulator solvable, relative to the others.
 _SMALL = 1e-6
 
@@ -30,31 +34,53 @@ def searched(
     steps: int,
     seed: int,
     say: Callable[[str], object] | None = None,
+    *,
+    first: Array | None = None,
+    others: Sequence[Array] = (),
+    target: float = -math.inf,
 ) -> tuple[Minimum | None, tuple[float, ...]]:
     """Search from several starts, and return the best result and the values of all.
 
     The first start of a law with states is the best law with one state less, so that a law of a
-    higher order is never worse. `say` is called in each step with a text about the progress.
+    higher order is never worse. `first` is another point for the first start. `others` are further
+    starts, before all others. The search ends if all values are at most `target`. `say` is called
+    in each step with a text about the progress.
     """
-    screening = min(steps, _SCREENING) if starts > 1 else steps
+    total = starts + len(others)
+    screening = min(steps, _SCREENING) if total > 1 else steps
     best: Minimum | None = None
     values = []
-    for number, start in enumerate(_starts(problem, starts, steps, seed, say)):
+    every = chain(others, _starts(problem, starts, steps, seed, say, first))
+    for number, start in enumerate(every):
         x = None if start is None else stabilised(problem, start)
-        on_step = step_texts(say, f"start {number + 1} of {starts}")
+        on_step = step_texts(say, f"start {number + 1} of {total}")
         value = math.inf
         if x is not None:
             minimum = minimise(
-                problem.evaluate, x, problem.bounds, steps=screening, on_step=on_step
+                problem.evaluate,
+                x,
+                problem.bounds,
+                steps=screening,
+                target=target,
+                on_step=on_step,
             )
-            value = math.exp(max(minimum.objective, minimum.violation))
+            value = math.exp(minimum.objective)
+            if minimum.violation > 0.0:
+                value = max(value, math.exp(minimum.violation))
             if best is None or _is_better(minimum, best):
                 best = minimum
         values.append(value)
+        if value <= math.exp(target):
+            return best, tuple(values)
     if best is not None and best.steps == _SCREENING and steps > _SCREENING:
         on_step = step_texts(say, "best start")
         more = minimise(
-            problem.evaluate, best.x, problem.bounds, steps=steps, on_step=on_step
+            problem.evaluate,
+            best.x,
+            problem.bounds,
+            steps=steps,
+            target=target,
+            on_step=on_step,
         )
         best = more.after(best)
     return best, tuple(values)
@@ -96,22 +122,29 @@ def _starts(
     steps: int,
     seed: int,
     say: Callable[[str], object] | None,
+    given: Array | None,
 ) -> Iterator[Array | None]:
     """Yield the starts of a search.
 
-    The first one has the values of the structure. If the law can be a static gain, the starts 0, 1,
-    3, 5 and so on are projected regulators. The remaining starts are random.
+    The first one is `given`, or has the values of the structure. If the law can be a static gain,
+    the first one is a projected regulator. It is followed in turn by a regulator with a random
+    weight, a random gain of the size of the regulator, and random parameters. For other laws, all
+    other starts have random parameters.
     """
     has_gain = problem.structured.has_gain
     for number in range(starts):
         rng = np.random.default_rng([seed, number])
-        if number == 0:
+        if number == 0 and given is not None:
+            yield given
+        elif number == 0:
             first = _simpler(problem, starts, steps, seed, say)
             if first is None and has_gain:
                 first = _regulator(problem, None)
             yield problem.start() if first is None else first
-        elif has_gain and number % 2:
+        elif has_gain and number % 3 == 1:
             yield _regulator(problem, rng)
+        elif has_gain and number % 3 == 2:
+            yield _random_gain(problem, rng)
         else:
             yield problem.start(rng)
 
@@ -133,8 +166,26 @@ def _simpler(
     return None if best is None else problem.extended(simple, best.x)
 
 
+def _random_gain(problem: Problem, rng: np.random.Generator) -> Array | None:
+    """Return the point of a random gain, whose rows and columns have sizes as of a regulator."""
+    regulator = _regulator_gain(problem, None)
+    if regulator is None:
+        return None
+    rows = np.linalg.norm(regulator, axis=1)
+    columns = np.linalg.norm(regulator, axis=0)
+    size = 10.0 ** rng.uniform(*_SIZES) / max(float(np.linalg.norm(rows)), 1e-300)
+    random = rng.standard_normal(regulator.shape)
+    return problem.of_gain(size * np.outer(rows, columns) * random)
+
+
 def _regulator(problem: Problem, rng: np.random.Generator | None) -> Array | None:
-    """Return the point of a regulator of all states, projected to the measured outputs.
+    """Return the point of a projected regulator."""
+    gain = _regulator_gain(problem, rng)
+    return None if gain is None else problem.of_gain(gain)
+
+
+def _regulator_gain(problem: Problem, rng: np.random.Generator | None) -> Array | None:
+    """Return the gain of a regulator of all states, projected to the measured outputs.
 
     The regulator minimises the outputs of all goals. Its gain F becomes ``K = F P C' (C P C')^-1``
     with the covariance P of its loop under the inputs of all goals, so that K y is the best linear
@@ -171,7 +222,8 @@ def _regulator(problem: Problem, rng: np.random.Generator | None) -> Array | Non
         return None
     if not np.isfinite(gain).all():
         return None
-    return problem.of_gain(gain)
+    projected: Array = gain
+    return projected
 
 
 def _is_better(minimum: Minimum, other: Minimum) -> bool:

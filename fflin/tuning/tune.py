@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,14 +27,18 @@ from fflin.tuning.plant import Plant, Signals, plant_of, signals_of
 from fflin.tuning.points import Point, Points, points_of
 from fflin.tuning.problem import Case, Measure, Problem
 from fflin.tuning.robust import UncertainLoop
-from fflin.tuning.search import Minimum, Term, minimise
+from fflin.tuning.search import Minimum, minimise
 from fflin.tuning.starts import searched, stabilised, step_texts
 from fflin.tuning.structures import Structure, Structured
 from fflin.tuning.tuned import GoalValue, Tuned, is_active, with_check
 from fflin.tuning.verification import peak_above, second_value
 
-# Steps of the search for the least factor by which all goals would hold.
-_RELAXING = 150
+# Goals limit the least factor if their value is nearer to the largest one than this fraction, or
+# if their weight in the combination of gradients is larger than this number.
+_LIMITING, _WEIGHT = 1e-2, 1e-3
+
+# Steps of each search for a law that meets a few goals.
+_FEW_GOALS = 60
 
 # Rounds in which worst models are added.
 _ROUNDS = 12
@@ -69,6 +75,7 @@ def tune(
     starts: int = 3,
     steps: int = 300,
     seed: int = 0,
+    start: Mapping[str, float] | None = None,
     progress: Callable[[str], object] | None = None,
 ) -> Tuned:
     """Tune the parameters of a law of a given structure to goals.
@@ -99,12 +106,16 @@ def tune(
     starts : int
         Number of starts. The first one begins at the values of the structure, or for a
         `StateSpaceLaw` at the best law with one state less. If a `StaticGain` has no given values,
-        the first and every other start is a regulator of all states, projected to the outputs. The
-        other starts are random.
+        the first start is a regulator of all states, projected to the outputs. It is followed in
+        turn by a regulator with a random weight, a random gain of similar size, and random values.
+        The other starts of other laws are random.
     steps : int
         Largest number of steps of each search.
     seed : int
         The same seed gives the same law, bit for bit.
+    start : mapping, optional
+        Values of parameters for the first start, {name: value}, such as `parameters` or `relaxed`
+        of another result. The other parameters have the values of the structure.
     progress : callable, optional
         Function that is called with a text about the progress, often several times per second. By
         default, a line on stderr shows the text if stderr is a terminal.
@@ -120,6 +131,7 @@ def tune(
         If one of these conditions is true:
 
         - a signal of a goal or of the structure does not exist;
+        - `start` has a parameter that the structure does not have, or a value outside its bounds;
         - a measured output has a `sample` other than `dt`, or a `delay` that is not a multiple of
           `dt`;
         - a model holds only at one time, as in an elliptic orbit;
@@ -152,16 +164,27 @@ def tune(
     starts = count("starts", starts, largest=1000)
     steps = count("steps", steps, largest=100_000)
     seed = whole("seed", seed, 0)
+    instance("start", start or {}, Mapping, "{name: value}")
     with closing(Progress()) as line:
         say = line.say if progress is None else progress
         say("models of the plant")
         points = points_of(plant, dt, delay, seed, q)
         task = _Task(structure, every, points, say)
-        problem, minimum, values = task.first(starts, steps, seed)
+        search = _Search(starts, steps, seed)
+        problem, minimum, values = task.first(search, start)
         problem, minimum = task.with_worst(problem, minimum, steps)
         problem, minimum, figures = task.checked(problem, minimum, steps)
+        solution = task.relaxed(problem, minimum, figures, search)
         seconds = time.process_time() - started
-        return task.result(problem, minimum, figures, values, seconds)
+        return task.result(solution, values, seconds)
+
+
+class _Search(NamedTuple):
+    """Number of starts, number of steps of each start, and seed."""
+
+    starts: int
+    steps: int
+    seed: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,6 +201,17 @@ class _Worst:
     def larger(self) -> float:
         """The larger of the value and its check."""
         return with_check(self.value, self.check)
+
+
+class _Solution(NamedTuple):
+    """Law with its figures, the least factor by which all goals would hold, and its law."""
+
+    problem: Problem
+    minimum: Minimum
+    figures: list[_Worst]
+    factor: float
+    relaxed: Array
+    conflict: tuple[str, ...] = ()
 
 
 class _Task:
@@ -235,25 +269,37 @@ class _Task:
         used = np.append(used, np.zeros(max(more, 0), bool))
         return plant_of(matrices, self.lin.dt, used)
 
-    def problem(self) -> Problem:
-        """Return the problem of the models that are chosen."""
+    def problem(self, objective: Sequence[int] | None = None) -> Problem:
+        """Return the problem of the models that are chosen, and maybe of a few goals."""
         cases = [self.case(point) for point in self.chosen]
-        return Problem(self.structured, self.measures, cases, self.tight.copy())
+        tight = self.tight.copy()
+        return Problem(self.structured, self.measures, cases, tight, objective)
 
     def first(
-        self, starts: int, steps: int, seed: int
+        self, search: _Search, start: Mapping[str, float] | None
     ) -> tuple[Problem, Minimum, tuple[float, ...]]:
         """Search from several starts, and return the best result and the values of all."""
         problem = self.problem()
-        best, values = searched(problem, starts, steps, seed, self.say)
+        given = None if start is None else problem.given(start)
+        best, values = searched(problem, *search, self.say, first=given)
         if best is None:
-            raise InputError(self._why_unstable(problem))
+            raise InputError(self._why_unstable(problem, search.starts))
         return problem, best, values
 
     def with_worst(
-        self, problem: Problem, minimum: Minimum, steps: int
+        self,
+        problem: Problem,
+        minimum: Minimum,
+        steps: int,
+        *,
+        objective: Sequence[int] | None = None,
+        stable: Array | None = None,
+        target: float = -math.inf,
     ) -> tuple[Problem, Minimum]:
-        """Add the worst models until none is worse, and return the last problem and result."""
+        """Add the worst models until none is worse, and return the last problem and result.
+
+        If no stable loop is found from the result, the search continues from `stable`.
+        """
         candidates = self.points.candidates
         few = candidates[: self.points.corners + _FEW]
         for _ in range(_ROUNDS):
@@ -263,8 +309,10 @@ class _Task:
             if not added and not self._watch_missed(problem, minimum.x, values):
                 break
             self.chosen += added
-            problem = self.problem()
+            problem = self.problem(objective)
             start = stabilised(problem, minimum.x)
+            if start is None and stable is not None:
+                start = stabilised(problem, stable)
             if start is None:
                 raise InputError(
                     "no law of this structure was found that stabilises all models; give narrower "
@@ -272,7 +320,12 @@ class _Task:
                 )
             on_step = step_texts(self.say, f"search with {len(self.chosen)} models")
             more = minimise(
-                problem.evaluate, start, problem.bounds, steps=steps, on_step=on_step
+                problem.evaluate,
+                start,
+                problem.bounds,
+                steps=steps,
+                target=target,
+                on_step=on_step,
             )
             minimum = more.after(minimum)
         return problem, minimum
@@ -283,7 +336,7 @@ class _Task:
         The frequencies of such gains are then watched, and the worst models are added to the
         search.
         """
-        soft = self._soft_level(known)
+        soft = _objective_level(problem, known)
         levels = []
         for value, measure in zip(known, self.measures, strict=True):
             limit = 1.0 if measure.goal.hard else min(soft, 1.0)
@@ -295,6 +348,8 @@ class _Task:
             self.say(f"gains of model {number} of {len(points)} at all frequencies")
             case = self.case(point)
             for index, loop in enumerate(case.loops(law) or []):
+                if not problem.is_counted[index]:
+                    continue
                 measure, scaling = self.measures[index], problem.scaling(x, index)
                 goal, ends, channel = measure.goal, measure.ends, case.channels[index]
                 peak = peak_above(goal, ends, channel, loop, scaling, levels[index])
@@ -309,15 +364,6 @@ class _Task:
                 self.chosen.append(point)
         return bool(missed)
 
-    def _soft_level(self, values: Sequence[float]) -> float:
-        """Return the largest value of the soft goals, or of all goals if all are hard."""
-        soft = [
-            value
-            for value, measure in zip(values, self.measures, strict=True)
-            if not measure.goal.hard
-        ]
-        return max(soft, default=max(values))
-
     def _worse(
         self, problem: Problem, x: Array, candidates: Sequence[Point]
     ) -> tuple[list[Point], list[float]]:
@@ -326,12 +372,12 @@ class _Task:
         The second result contains the largest values of the goals over all of these models.
         """
         known = [worst.value for worst in self.worst(problem, x, self.chosen)]
-        level = self._soft_level(known)
+        level = _objective_level(problem, known)
         added: list[Point] = []
         others = [point for point in candidates if point not in self.chosen]
         largest = list(known)
         for index, worst in enumerate(self.worst(problem, x, others)):
-            limit = 1.0 if self.measures[index].goal.hard else level
+            limit = 1.0 if problem.is_constraint[index] else level
             if worst.value > limit * _WORSE and worst.point not in added:
                 added.append(worst.point)
             largest[index] = max(largest[index], worst.value)
@@ -351,7 +397,9 @@ class _Task:
             pieces = problem.pieces(x, case, floors)
             for index in range(len(self.measures)):
                 value, piece = math.inf, None
-                if pieces is not None:
+                if not problem.is_counted[index]:
+                    value = 0.0
+                elif pieces is not None:
                     piece = pieces[index][0]
                     value = piece.value
                 known = results[index]
@@ -413,31 +461,69 @@ class _Task:
                 for measure, worst in zip(self.measures, figures, strict=True)
             ]
         )
-        excess = np.log([worst.larger / _BELOW for worst in figures])
+        excess = np.log([max(worst.larger, 1.0) / _BELOW for worst in figures])
         self.tight = np.where(nearly, self.tight + excess, self.tight)
         return bool(nearly.any())
 
-    def result(
+    def relaxed(
         self,
         problem: Problem,
         minimum: Minimum,
-        worst: list[_Worst],
-        starts: tuple[float, ...],
-        seconds: float,
+        figures: list[_Worst],
+        search: _Search,
+    ) -> _Solution:
+        """Return the law, the least factor by which all goals would hold, and why it is above 1.
+
+        If the search for this factor finds a law that meets all goals, the search for the best law
+        continues from it.
+        """
+        factor = _largest(figures)
+        if factor <= 1.0:
+            return _Solution(problem, minimum, figures, factor, minimum.x)
+        every = range(len(self.measures))
+        loose, easiest, loose_figures = problem, minimum, figures
+        if any(problem.is_constraint):
+            loose = self.problem(every)
+            self.say("search for the least factor")
+            found, _ = searched(loose, *search, self.say, others=[minimum.x])
+            assert found is not None
+            loose, easiest = self.with_worst(
+                loose, found, search.steps, objective=every, stable=minimum.x
+            )
+            loose_figures = self.figures(loose, easiest.x)
+        least = _largest(loose_figures)
+        if least <= 1.0:
+            return self._continued(easiest, loose_figures, search.steps)
+        if least > factor:
+            easiest, least = minimum, factor
+        conflict = self._conflict(easiest, loose_figures, minimum.x, search)
+        return _Solution(problem, minimum, figures, least, easiest.x, conflict)
+
+    def _continued(
+        self, start: Minimum, figures: list[_Worst], steps: int
+    ) -> _Solution:
+        """Return the best law that is found from a law that meets all goals."""
+        problem = self.problem()
+        on_step = step_texts(self.say, "search from a law that meets all goals")
+        more = minimise(
+            problem.evaluate, start.x, problem.bounds, steps=steps, on_step=on_step
+        )
+        problem, better = self.with_worst(
+            problem, more.after(start), steps, stable=start.x
+        )
+        problem, better, better_figures = self.checked(problem, better, steps)
+        factor = _largest(better_figures)
+        if factor <= 1.0:
+            return _Solution(problem, better, better_figures, factor, better.x)
+        return _Solution(problem, start, figures, _largest(figures), start.x)
+
+    def result(
+        self, solution: _Solution, starts: tuple[float, ...], seconds: float
     ) -> Tuned:
         """Return the tuned law with its report."""
-        factor = max(figure.larger for figure in worst)
-        conflict: tuple[str, ...] = ()
-        if factor > 1.0:
-            relaxed, figures = self._relaxed(problem, minimum)
-            largest = max(figure.larger for figure in figures)
-            if largest <= 1.0:
-                minimum, worst = relaxed.after(minimum), figures
-            else:
-                conflict = self._conflict(relaxed)
-            factor = min(factor, largest)
+        problem, minimum, worst = solution[:3]
         law = problem.law(minimum.x)
-        level = self._soft_level([found.value for found in worst])
+        level = _objective_level(problem, [found.value for found in worst])
         uncertain = None
         if self.points.lft is not None:
             uncertain = UncertainLoop(self.points.lft, law, self.used)
@@ -463,16 +549,16 @@ class _Task:
                     bound,
                 )
             )
-        values = problem.values(minimum.x)[0].tolist()
         parameters = self.structured.parameters
         return Tuned(
             law,
             self.lin,
-            parameters={p.name: v for p, v in zip(parameters, values, strict=True)},
+            parameters=self._named(problem, minimum.x),
             units={p.name: p.unit for p in parameters},
             goals=tuple(goals),
-            factor=factor,
-            conflict=conflict,
+            factor=solution.factor,
+            relaxed=self._named(problem, solution.relaxed),
+            conflict=solution.conflict,
             stationarity=minimum.stationarity,
             points=tuple(dict(point.parameters) for point in self.chosen),
             examined=len(self.examined),
@@ -484,6 +570,11 @@ class _Task:
             ).reshape(-1, len(parameters)),
             loops=self.loops(problem, minimum.x, law),
         )
+
+    def _named(self, problem: Problem, x: Array) -> dict[str, float]:
+        """Return the values of all parameters at a point."""
+        names = [parameter.name for parameter in self.structured.parameters]
+        return dict(zip(names, problem.values(x)[0].tolist(), strict=True))
 
     def loops(self, problem: Problem, x: Array, law: Law) -> tuple[GoalLoops, ...]:
         """Return the loops of each goal in the models of the search."""
@@ -512,44 +603,67 @@ class _Task:
         except (InputError, MissingPackageError):
             return math.nan
 
-    def _relaxed(
-        self, problem: Problem, minimum: Minimum
-    ) -> tuple[Minimum, list[_Worst]]:
-        """Return the law with the least factor by which all goals would hold, and its figures."""
-        relaxed = minimum
-        loose = Problem(self.structured, self.measures, problem.cases)
-        if any(measure.goal.hard for measure in self.measures):
+    def _conflict(
+        self,
+        easiest: Minimum,
+        figures: list[_Worst],
+        other: Array,
+        search: _Search,
+    ) -> tuple[str, ...]:
+        """Return the fewest goals that were not met together, among those that limit the factor.
 
-            def evaluate(x: Array) -> list[Term] | None:
-                terms = loose.evaluate(x)
-                if terms is None:
-                    return None
-                return [term._replace(is_constraint=False) for term in terms]
-
-            relaxed = minimise(
-                evaluate,
-                minimum.x,
-                problem.bounds,
-                steps=_RELAXING,
-                on_step=step_texts(self.say, "search for the least factor"),
-            )
-        return relaxed, self.figures(problem, relaxed.x)
-
-    def _conflict(self, relaxed: Minimum) -> tuple[str, ...]:
-        """Return the goals that limit the least factor."""
+        The result is one goal, two goals that contradict each other, or goals that are met two at a
+        time but not together. `figures` belong to the law `easiest` of the least factor, and
+        `other` is the best law with the hard goals as constraints.
+        """
         weights: dict[int, float] = {}
-        for key, weight in (relaxed.weights or {}).items():
-            index = key[1] if isinstance(key, tuple) else 0
+        for key, weight in (easiest.weights or {}).items():
+            if not isinstance(key, tuple):
+                continue
+            index = key[1]
             weights[index] = weights.get(index, 0.0) + weight
-        largest = sorted(weights, key=lambda index: -weights[index])[:2]
-        labels = tuple(
-            self.measures[index].goal.label
-            for index in largest
-            if weights[index] > 1e-3
+        near = (1.0 - _LIMITING) * _largest(figures)
+        limiting = [
+            index
+            for index, figure in enumerate(figures)
+            if weights.get(index, 0.0) > _WEIGHT or figure.larger >= near
+        ]
+        limiting.sort(key=lambda index: -weights.get(index, 0.0))
+        groups = [*combinations(limiting, 1), *combinations(limiting, 2)]
+        unmet = next(
+            (
+                group
+                for group in groups
+                if len(group) < len(limiting)
+                and not self._is_met(group, [easiest.x, other], search)
+            ),
+            tuple(limiting),
         )
-        return labels
+        return tuple(self.measures[index].goal.label for index in unmet)
 
-    def _why_unstable(self, problem: Problem) -> str:
+    def _is_met(
+        self, group: tuple[int, ...], points: list[Array], search: _Search
+    ) -> bool:
+        """Return whether a search finds a law that meets a few goals at all models.
+
+        The searches begin at points, and at the other starts. Laws that are found are appended to
+        the points.
+        """
+        labels = " and ".join(self.measures[index].goal.label for index in group)
+        self.say(f"search for a law that meets {labels}")
+        problem = self.problem(group)
+        few = search._replace(steps=min(search.steps, _FEW_GOALS))
+        target = math.log(_BELOW)
+        best, _ = searched(problem, *few, self.say, others=points, target=target)
+        if best is None or best.objective > 0.0:
+            return False
+        problem, best = self.with_worst(
+            problem, best, few.steps, objective=group, stable=points[0], target=target
+        )
+        points.append(best.x)
+        return _largest(self.figures(problem, best.x)) <= 1.0
+
+    def _why_unstable(self, problem: Problem, starts: int) -> str:
         """Return why no start was stable."""
         plant = problem.cases[0].plant
         poles = np.linalg.eigvals(plant.A)
@@ -574,10 +688,28 @@ class _Task:
                         "plant; give other inputs or outputs, or goals without the states of this "
                         "pole"
                     )
-        return (
-            "no start reached a stable loop; give start values (fflin.Tunable), more starts, or "
-            "another structure"
+        models = len(problem.cases)
+        loop = (
+            "a stable loop" if models == 1 else f"stable loops of all {models} models"
         )
+        return (
+            f"none of {starts} starts reached {loop}; give start values (start= or "
+            "fflin.Tunable), more starts, or another structure"
+        )
+
+
+def _largest(figures: Sequence[_Worst]) -> float:
+    """Return the largest value of all goals."""
+    return max(figure.larger for figure in figures)
+
+
+def _objective_level(problem: Problem, values: Sequence[float]) -> float:
+    """Return the largest value of the goals that are the objective."""
+    return max(
+        value
+        for value, is_constraint in zip(values, problem.is_constraint, strict=True)
+        if not is_constraint
+    )
 
 
 def _require_slow(measure: Measure, dt: float) -> None:

@@ -84,6 +84,14 @@ class GoalValue:
         return self.worst <= 1.0
 
 
+def rounded_up(value: float) -> str:
+    """Return a number with four digits that is not smaller."""
+    if not math.isfinite(value):
+        return f"{value:g}"
+    size = 10.0 ** (math.floor(math.log10(value)) - 3)
+    return f"{math.ceil(value / size) * size:.4g}"
+
+
 def with_check(value: float, check: float) -> float:
     """Return the larger of a value and its check, which is NaN if there is none."""
     return value if math.isnan(check) else max(value, check)
@@ -104,10 +112,16 @@ class Tuned(LinearController):
     goals : tuple of GoalValue
         Values of the goals in the order in which they were given.
     factor : float
-        Largest value of all goals. If some goals do not hold, all would hold if their limits were
-        larger by this factor.
+        Largest value of all goals. If some goals do not hold, it is the least factor that was found
+        by which their limits must be relaxed. The law of `relaxed` meets all goals with these
+        limits at all examined models. A search is local, so a smaller factor may exist.
+    relaxed : mapping
+        Values of the parameters of the law with this factor, {name: value}. They are equal to
+        `parameters` if all goals hold.
     conflict : tuple of str
-        The two goals that limit each other most if some goals do not hold; empty otherwise.
+        Goals that no law was found to meet together, if some goals do not hold; empty otherwise.
+        One goal was not met by any law. Two goals contradict each other. For more goals, laws were
+        found that meet each two of them.
     stationarity : float
         Norm of the convex combination of the gradients of the active goals in the logarithms of the
         parameters; near 0 at a local minimum.
@@ -116,7 +130,8 @@ class Tuned(LinearController):
     examined : int
         Number of models at which the goals were evaluated at the end.
     starts : tuple of float
-        Largest value of the goals at the end of each start; infinite if no stable loop was found.
+        Largest value of the soft goals at the end of each start, or of the hard goals if one of
+        them does not hold; infinite if no stable loop was found.
     seconds : float
         CPU time of the search [s].
     history : ndarray (k, 2)
@@ -138,6 +153,7 @@ class Tuned(LinearController):
     units: Mapping[str, str]
     goals: tuple[GoalValue, ...]
     factor: float
+    relaxed: Mapping[str, float]
     conflict: tuple[str, ...]
     stationarity: float
     points: tuple[Mapping[str, float], ...]
@@ -186,12 +202,20 @@ class Tuned(LinearController):
             )
         names = [goal.label for goal in self.goals if not goal.met]
         text = (
-            f"{self.lin.robot}: {', '.join(names)} not met; all goals would hold if their limits "
-            f"were larger by the factor {self.factor:.4g}"
+            f"{self.lin.robot}: {', '.join(names)} not met; the least factor that was found by "
+            f"which all limits must be relaxed is {rounded_up(self.factor)}"
         )
-        if len(self.conflict) == 2:
-            text += f". {self.conflict[0]} and {self.conflict[1]} contradict each other"
-        return text
+        return f"{text}. {self._reason()}"
+
+    def _reason(self) -> str:
+        """Return which goals do not hold together."""
+        *others, last = self.conflict
+        if not others:
+            return f"No law was found that meets {last}, even without the other goals"
+        text = f"{', '.join(others)} and {last}"
+        if len(others) == 1:
+            return f"{text} contradict each other: no law was found that meets both"
+        return f"Laws were found that meet two of {text}, but no law that meets all"
 
     def _goal_rows(self) -> list[list[str]]:
         """Return the table of the goals."""
@@ -309,7 +333,8 @@ class Tuned(LinearController):
         record = record_of_law(self) | {
             name: getattr(self, name)
             for name in (
-                *("parameters", "units", "met", "factor", "conflict", "stationarity"),
+                *("parameters", "units", "met", "factor", "relaxed", "conflict"),
+                "stationarity",
                 *("points", "examined", "starts", "seconds"),
             )
         }
