@@ -1,12 +1,15 @@
 """Problems of COMPleib: matrices (A, B1, B2, C1, C2, D11, D12, D21).
 
 The matrices are those of F. Leibfritz, COMPleib 1.1 (2005), COMPleib.m, which names the paper of
-each plant. Values of static output feedback are compared with those of three sources:
+each plant. Values of static output feedback are compared with those of four sources:
 
 - P. Apkarian and D. Noll, Nonsmooth H-infinity synthesis, IEEE Transactions on Automatic Control
   51(1), 2006;
 - S. Gumussoy and M. L. Overton, Fixed-order H-infinity controller design via HIFOO, American
   Control Conference, 2008;
+- X. Guo, D. Keivan, G. Dullerud, P. Seiler and B. Hu, Complexity of derivative-free policy
+  optimization for structured H-infinity control, NeurIPS, 2023, with code that states the values of
+  HIFOO and hinfstruct;
 - D. Arzelier, E. N. Gryazina, D. Peaucelle and B. T. Polyak, Mixed LMI/randomized methods for
   static output feedback control design, American Control Conference, 2010.
 """
@@ -59,6 +62,55 @@ HE2 = plain(
     ],
     [[-0.9454, 0.5313], [-8.6476, -10.769], [19.0824, -2.8959], [0.0, 0.0]],
     [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]],
+)
+
+_A4, _B4 = np.zeros((8, 8)), np.zeros((8, 4))
+_A4[:, 3] = [
+    *(0.99857378005981, -0.0031822193414, -2.54463768005371, -1.99818229675293),
+    *(-0.4589991569519, 2.29785919189453, -0.50361156463623, -0.05741119384766),
+]
+_A4[:2, 4] = 0.05338427424431, 0.0595246553421
+_A4[1, 2] = 1.0
+_A4[2:, 2] = [
+    *(-11.5704956054688, 0.43935656547546, -2.04089546203613),
+    *(-0.50335502624512, -2.34721755981445, -0.00400543212891),
+]
+_A4[5:, 0] = -32.1036071777344, 0.10216116905212, -1.91097259521484
+_A4[6:, 1] = 32.0578308105469, 1.71382904052734
+_A4[2:, 4:] = [
+    [-0.0636026263237, 0.10678052902222, -0.09491866827011, 0.00710757449269],
+    [0.0, 0.01665188372135, 0.01846204698086, -0.00118747074157],
+    [-0.73502779006958, 0.01925575733185, -0.00459562242031, 0.00212036073208],
+    [0.0, -0.0212158113718, -0.02116791903973, 0.01581159234047],
+    [0.83494758605957, 0.02122657001019, -0.0378797352314, 0.00035400385968],
+    [0.0, 0.01398963481188, -0.00090675335377, -0.29051351547241],
+]
+_B4[2:] = [
+    [0.12433505058289, 0.08278584480286, -2.75247764587402, -0.01788876950741],
+    [-0.03635892271996, 0.47509527206421, 0.01429074257612, 0.0],
+    [0.30449151992798, 0.01495801657438, -0.49651837348938, -0.20674192905426],
+    [0.28773546218872, -0.54450607299805, -0.01637935638428, 0.0],
+    [-0.01907348632812, 0.01636743545532, -0.54453611373901, 0.23484230041504],
+    [-4.82063293457031, -0.00038146972656, 0.0, 0.0],
+]
+
+# Helicopter with eight states (Skogestad and Postlethwaite, 1996, section 12.2).
+HE4 = (
+    _A4,
+    np.eye(8),
+    _B4,
+    np.eye(12, 8),
+    [
+        [0.0, 0.0, 0.0, 0.0, 0.0, 0.0595, 0.05329, -0.9968],
+        [1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+        [0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+        [0.0, 0.0, 0.0, -0.05348, 1.0, 0.0, 0.0, 0.0],
+        [0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+        [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0],
+    ],
+    np.zeros((12, 8)),
+    np.eye(12)[:, 8:],
+    np.zeros((6, 8)),
 )
 
 # Aircraft with five states (Hung and MacFarlane, 1982).

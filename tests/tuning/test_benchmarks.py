@@ -12,16 +12,22 @@ from tests.support.tuning import least_gain
 GAIN = fflin.StaticGain("*", "*", largest=1e6)
 
 # Published values of static output feedback, rounded to four digits. Apkarian and Noll state 1.192
-# for REA2. No search of 40 random starts ended below 1.1813.
+# for REA2; most searches end at 1.1813, but the gain of a law of large gains tends to 1.149.
+# The values of AC15 and HE4 are those of hinfstruct, rounded to three digits, and of HIFOO.
 PUBLISHED = {
     "HE1": 0.1538,
     "AC7": 0.0651,
     "AC8": 2.005,
     "AC4": 0.9355,
-    "REA2": 1.1813,
+    "REA2": 1.149,
     "HE2": 4.249,
     "AC6": 4.114,
+    "AC15": 15.2,
+    "HE4": 22.8382,
 }
+
+# Numbers of starts other than three.
+STARTS = {"HE1": 1, "AC7": 1, "REA2": 9}
 
 # Problems whose static value is that of full order within 2 %, so that no law is better.
 AS_GOOD_AS_FULL_ORDER = ("AC17", "AC2", "AC16", "DIS1", "DIS4")
@@ -47,13 +53,25 @@ def with_noise(matrices, size):
 
 
 @pytest.mark.parametrize(
-    "name", ["HE1", "AC7", *exhaustive("AC8", "AC4", "REA2", "HE2", "AC6")]
+    "name",
+    ["HE1", "AC7", *exhaustive("AC8", "AC4", "REA2", "HE2", "AC6", "AC15", "HE4")],
 )
 def test_a_static_gain_reaches_the_best_published_value(name):
-    starts = 1 if name in ("HE1", "AC7") else 3
-    value, _ = least_gain(matrices_of(name), GAIN, starts=starts)
+    value, _ = least_gain(matrices_of(name), GAIN, starts=STARTS.get(name, 3))
     assert value <= PUBLISHED[name] * 1.002
-    assert value >= PUBLISHED[name] * 0.999
+    assert value >= PUBLISHED[name] * (0.997 if name == "AC15" else 0.999)
+
+
+def test_the_law_of_rea2_that_few_searches_find_has_the_gain_of_a_sweep():
+    # A published search ends at 1.192, and most searches at 1.1813.
+    A, B1, B2, C1, C2, _, D12, _ = matrices_of("REA2")
+    K = np.array([[-24.17149056, -20.68875818], [-20.63156641, -23.86448085]])
+    loop, read = A + B2 @ K @ C2, C1 + D12 @ K @ C2
+    assert np.linalg.eigvals(loop).real.max() < 0.0
+    rates = np.concatenate(([0.0], np.geomspace(1e-3, 1e4, 4000)))
+    inner = np.linalg.inv(1j * rates[:, None, None] * np.eye(4) - loop)
+    gains = np.linalg.norm(read @ inner @ B1, 2, axis=(1, 2))
+    assert gains.max() == pytest.approx(PUBLISHED["REA2"], rel=1e-3)
 
 
 @pytest.mark.parametrize("name", ["AC17", *exhaustive("AC2", "AC16", "DIS1", "DIS4")])
