@@ -160,11 +160,12 @@ class ClassicalConstraints:
         R = data.oMi[frame.joint].rotation
         lever = R @ frame.placement.translation
         omega = velocity.angular.copy()
-        swing = np.cross(omega, np.cross(omega, lever))
+        rotating = skew(omega)
         return _Body(
             linear=jacobian[:3] - skew(lever) @ jacobian[3:],
             angular=jacobian[3:],
-            acceleration=rate.linear + np.cross(rate.angular, lever) + swing,
+            acceleration=rate.linear
+            + (skew(rate.angular) + rotating @ rotating) @ lever,
             turning=rate.angular.copy(),
             omega=omega,
             rotation=R @ frame.placement.rotation,

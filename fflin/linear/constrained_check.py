@@ -152,12 +152,12 @@ class ConstrainedReferences:
         z, u = np.split(point, [len(self._kept)], axis=1)
         x = self._manifold.states(z)
         whole = np.hstack((x, u))
-        rates = self._nonlinear.rates(whole)[:, self._kept]
-        return np.hstack((rates, self._outputs(whole)))
+        motion = self._nonlinear.accelerations(whole)
+        rates = self._nonlinear.rates_of(whole, motion)[:, self._kept]
+        return np.hstack((rates, self._outputs(whole, *motion[1:])))
 
-    def _outputs(self, point: Array) -> Array:
-        """Return the outputs (N, ny) for rows of all states and inputs."""
-        _, q, v, a = self._nonlinear.accelerations(point)
+    def _outputs(self, point: Array, q: Array, v: Array, a: Array) -> Array:
+        """Return the outputs (N, ny) for rows of all states and inputs, and their motion."""
         aba, nx = self.route.aba, self.route.state.nx
         rows = []
         for k, (x, u) in enumerate(zip(point[:, :nx], point[:, nx:], strict=True)):

@@ -67,7 +67,12 @@ class Nonlinear:
 
     def rates(self, point: Array) -> Array:
         """Return dx/dt (N, nx) for rows (N, nx + nu) of states and inputs."""
-        state, (chart, _, v, a) = self.state, self.accelerations(point)
+        return self.rates_of(point, self.accelerations(point))
+
+    def rates_of(self, point: Array, motion: tuple[Chart, Array, Array, Array]) -> Array:
+        """Return dx/dt (N, nx) for rows of states and inputs, and their `accelerations`."""
+        state = self.state
+        chart, _, v, a = motion
         # The error (5.1) relative to a reference with velocities v* and w* has the derivatives
         # de/dt = (e0 (w - w*) + e x (w + w*)) / 2 and dr/dt = R_e v - v* - w* x r. Here (e, e0) is
         # the error quaternion, and R_e is the rotation matrix of the error.
