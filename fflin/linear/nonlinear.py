@@ -69,7 +69,9 @@ class Nonlinear:
         """Return dx/dt (N, nx) for rows (N, nx + nu) of states and inputs."""
         return self.rates_of(point, self.accelerations(point))
 
-    def rates_of(self, point: Array, motion: tuple[Chart, Array, Array, Array]) -> Array:
+    def rates_of(
+        self, point: Array, motion: tuple[Chart, Array, Array, Array]
+    ) -> Array:
         """Return dx/dt (N, nx) for rows of states and inputs, and their `accelerations`."""
         state = self.state
         chart, _, v, a = motion

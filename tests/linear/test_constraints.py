@@ -192,21 +192,6 @@ def test_random_constraints_agree_with_both_computations(seed, frame):
         assert check.ok, check
 
 
-@pytest.mark.exhaustive
-@pytest.mark.parametrize("seed", range(100, 140))
-def test_many_random_constraints_agree_with_both_computations(seed):
-    rng = np.random.default_rng(seed)
-    try:
-        robot, q, v, u = random_constraints(rng, count=1 + seed % 3)
-        options = {"frame": FRAMES[seed % 3], "reference": random_pose(rng, 60.0)}
-        lin = fflin.linearize(robot, q, v, u, **options)
-    except fflin.ConstraintError as error:
-        assert "singular" in str(error) or "no effect" in str(error)
-        return
-    check = fflin.check(robot, lin)
-    assert check.ok, check
-
-
 def test_the_check_closes_constraints_without_placement_at_the_point_of_the_model():
     robot = fflin.load("planar_detumble")
     held = [fflin.Spherical("hand")]
