@@ -17,11 +17,11 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 ROBOT = "servicer_7dof"
-WARM, LOOPS = 20, 100
+WARM, LOOPS = 20, 24
 _COUNT = "_count"  # the argument with which this module runs itself under valgrind
 
 # Ratios on CPython 3.11, NumPy 2.4 and Pinocchio 4.1, and by what part of them they may grow: they
-# repeat to two in a thousand, and one call of CRBA more at rest is a sixth.
+# repeat to five in a thousand, and one call of CRBA more at rest is a sixth.
 BASELINE = {
     "at rest": 1.63,
     "operating point": 2.06,

@@ -185,7 +185,7 @@ axis = [1, 0, 0]
     assert hinge.placement is None
 
 
-@pytest.mark.parametrize("seed", exhaustive(*range(200, 230)))
+@pytest.mark.parametrize("seed", exhaustive(*range(200, 212)))
 def test_random_constraints_are_closed_again_after_a_displacement(seed):
     rng = np.random.default_rng(seed)
     robot, q, *_ = random_constraints(rng, count=1 + seed % 3)
