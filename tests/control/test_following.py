@@ -6,67 +6,28 @@ import pytest
 
 import fflin
 from fflin.control.following import Following
+from tests.support.following import (
+    LAWS,
+    SAMPLE,
+    TORQUE,
+    TURN,
+    output_feedback,
+    resting,
+    satellite,
+    slew,
+    state_feedback,
+)
 from tests.support.marks import exhaustive
 from tests.support.robots import free_body
-
-SAMPLE = 0.25
-TORQUE = 3e-5  # N m
-TURN = 16.0  # s, a multiple of the sample time
-
-
-def satellite(**fields):
-    """The cubesat with three wheels, which measures its attitude and its angular rate."""
-    inputs = fflin.load_inputs("cubesat")
-    wheels = [item for item in inputs if isinstance(item, fflin.ReactionWheel)]
-    outputs = [fflin.BasePose(), fflin.Gyroscope("base")]
-    return fflin.load("cubesat", inputs=wheels, outputs=outputs, **fields)
-
-
-def slew(robot, axis=2, torque=TORQUE):
-    """Return a slew from rest to rest by a wheel that accelerates, then brakes."""
-
-    def bang_bang(t, q, v):
-        u = np.zeros(3)
-        u[axis] = torque if t < 0.5 * TURN * (1.0 - 1e-12) else -torque
-        return u
-
-    motion = fflin.simulate(robot, bang_bang, duration=TURN, sample=0.5, dt=0.5)
-    return motion.trajectory()
-
-
-def output_feedback(robot, *, delay=SAMPLE, integral=False, **changes):
-    """Return an LQG law that integrates the attitude or estimates a constant torque."""
-    lin = fflin.linearize(robot)
-    model = lin.discretize(SAMPLE, delay=delay)
-    gain = fflin.lqr(model, integral_action=["q_b"] if integral else None)
-    variances = {"q_b": 1e-10, "r_b": 1e-8, "gyroscope": 1e-12}
-    disturbance = None if integral else {"tau_b": 1e-12}
-    estimator = fflin.kalman(
-        model, {"omega_b": 1e-12}, variances, disturbance_noise=disturbance
-    )
-    return fflin.OutputFeedback(model, fflin.lqg(gain, estimator), **changes)
-
-
-def state_feedback(robot, *, delay=SAMPLE):
-    """Return a state feedback with integral action."""
-    model = fflin.linearize(robot).discretize(SAMPLE, delay=delay)
-    return fflin.StateFeedback(model, fflin.lqr(model, integral_action=["q_b"]))
-
-
-LAWS = {
-    "estimated disturbance": output_feedback,
-    "integral action": lambda robot, **options: output_feedback(
-        robot, integral=True, **options
-    ),
-    "state feedback": state_feedback,
-}
 
 
 @pytest.mark.parametrize(
     ("kind", "delay"),
     [
         ("state feedback", 0.35),
+        ("star tracker", 0.1),
         *exhaustive(
+            ("star tracker", 0.0),
             ("estimated disturbance", 0.25),
             ("integral action", 0.35),
             ("estimated disturbance", 0.0),
@@ -78,9 +39,10 @@ LAWS = {
 )
 def test_a_law_follows_a_slew_without_an_error(kind, delay):
     """The robot waits for the delay, so that each planned input acts at its time."""
-    robot = satellite()
-    policy = LAWS[kind](robot, delay=delay).follow(slew(robot))
-    motion = fflin.simulate(robot, policy, duration=TURN + 4.0, dt=0.05)
+    robot, law = LAWS[kind](delay=delay)
+    policy = law.follow(slew(robot))
+    options = {"duration": TURN + 4.0, "dt": 0.05, "noise": 0.0}
+    motion = fflin.simulate(robot, policy, **options)
     attitude = pin.Quaternion(motion.q[-1][3:7])
     assert np.degrees(attitude.angularDistance(pin.Quaternion.Identity())) > 15.0
     # Commands act at multiples of the sample time after the delay, at which the trajectory begins.
@@ -122,14 +84,6 @@ def test_the_feedforward_is_the_mean_input_of_each_sample():
             result = policy.feedforward(k * SAMPLE)
             # The sum over 100,000 points resolves each jump to 1e-5 of a sample.
             assert result == pytest.approx(expected, abs=2e-5 * np.abs(inputs).max())
-
-
-def resting(robot, base):
-    """Return the trajectory of a robot at rest at a base pose."""
-    q = fflin.configuration(robot, base=base)
-    zero = np.zeros((2, robot.nv))
-    inputs = np.zeros((2, len(fflin.linearize(robot).input_names)))
-    return fflin.Trajectory(robot, [0.0, 1.0], np.tile(q, (2, 1)), zero, inputs)
 
 
 @pytest.mark.exhaustive
@@ -305,12 +259,21 @@ def test_an_end_that_no_input_holds_is_named():
 
 
 @pytest.mark.compiled
-@pytest.mark.parametrize("kind", LAWS)
-def test_compiled_code_follows_as_python_does(kind):
-    robot = satellite()
-    policy = LAWS[kind](robot, delay=0.35).follow(slew(robot))
+@pytest.mark.parametrize(
+    ("kind", "duration"),
+    [
+        ("estimated disturbance", TURN + 4.0),
+        ("integral action", TURN + 4.0),
+        ("state feedback", TURN + 4.0),
+        *exhaustive(("star tracker", 5.0), ("star tracker", TURN + 7.0)),
+    ],
+)
+def test_compiled_code_follows_as_python_does(kind, duration):
+    """The pattern of arrivals repeats after the end of the slew, too."""
+    robot, law = LAWS[kind](delay=0.35)
+    policy = law.follow(slew(robot))
     q0 = fflin.configuration(robot, rpy=(2, -1, 3))
-    options = {"q0": q0, "duration": TURN + 4.0, "dt": 0.05}
+    options = {"q0": q0, "duration": duration, "dt": 0.05}
     python, compiled = (
         fflin.simulate(robot, policy, engine=engine, **options)
         for engine in ("python", "compiled")
@@ -322,15 +285,17 @@ def test_compiled_code_follows_as_python_does(kind):
 
 @pytest.mark.compiled
 @pytest.mark.exhaustive
-def test_a_compiled_campaign_follows_as_python_does():
-    robot = satellite()
-    policy = output_feedback(robot).follow(slew(robot))
+@pytest.mark.parametrize("kind", ["estimated disturbance", "star tracker"])
+def test_a_compiled_campaign_follows_as_python_does(kind):
+    robot, law = LAWS[kind]()
+    policy = law.follow(slew(robot))
     spreads = {"q_b": 0.01, "*.mass": 0.05, "q_b.noise": 1e-5}
-    options = {"runs": 3, "duration": TURN + 4.0, "dt": 0.125}
+    options = {"runs": 9, "duration": 5.0, "dt": 0.05}
     python, compiled = (
         fflin.monte_carlo(robot, policy, spreads, engine=engine, **options)
         for engine in ("python", "compiled")
     )
+    assert compiled.x == pytest.approx(python.x, rel=1e-7, abs=1e-10)
     for name in ("attitude", "worst attitude"):
         value = python.quantile(name, 0.5).value
         assert value > 1e-4
