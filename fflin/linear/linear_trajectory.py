@@ -236,6 +236,16 @@ class LinearTrajectory(Trajectory):
             A[rows], B[rows] = models["A"], models["B"]
         return A, B
 
+    def outputs_at(self, times: Array) -> Array:
+        """Return C (k, ny, nx) at times (k,), in the coordinates of the part at each time."""
+        parts = self._parts_at(times)
+        C = np.zeros((len(times), *self.C.shape[1:]))
+        for index in np.unique(parts).tolist():
+            rows = parts == index
+            linearizer = self._linearizers[index]
+            C[rows] = linearizer.along(*self.points(times[rows]), times[rows])["C"]
+        return C
+
     def between(self, t: float, *arrays: Array) -> tuple[Array, ...]:
         """Interpolate arrays that are given at the knots to the time t [s].
 
@@ -454,7 +464,7 @@ def along(motion: Trajectory, partition: Partition | None = None) -> LinearTraje
         switches=partition.times,
         switched_names=partition.later,
     )
-    for name in ("interval_errors", "cubics"):
+    for name in ("gaps", "cubics"):
         if name in vars(motion):  # keep cached results of the same motion
             vars(made)[name] = vars(motion)[name]
     return made
@@ -525,7 +535,17 @@ def transitions(traj: LinearTrajectory, dt: float) -> Iterator[tuple[Steps, Arra
 
 def knot_transitions(traj: LinearTrajectory) -> Iterator[tuple[Steps, Array]]:
     """Yield the integration steps and the transition matrix from each knot to the next."""
-    yield from _accurate(traj, [np.array(ends) for ends in pairwise(traj.t.tolist())])
+    yield from transitions_between(traj, traj.t)
+
+
+def transitions_between(
+    traj: LinearTrajectory, times: Array
+) -> Iterator[tuple[Steps, Array]]:
+    """Yield the integration steps and the transition matrix from each time to the next.
+
+    All knots between the first and the last of the times [s] must be among the times.
+    """
+    yield from _accurate(traj, [np.array(ends) for ends in pairwise(times.tolist())])
 
 
 def _accurate(

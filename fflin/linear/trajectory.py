@@ -7,7 +7,7 @@ from dataclasses import astuple, dataclass, field
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -76,6 +76,18 @@ _CLOSED = 1e-6
 
 # A time counts as the time of a knot if the two differ by less than this fraction of the interval.
 _NEAR = 1e-9
+
+
+class Gaps(NamedTuple):
+    """Gaps of a motion: ends of the intervals, integrated from their first knots, and next knots.
+
+    `q` and `v` (N - 1, nv) are the displacements and changes of velocity from the next knots to
+    these ends.
+    """
+
+    errors: Array  # (N - 1,) relative sizes; infinite if the integration overflows
+    q: Array
+    v: Array
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -586,18 +598,22 @@ class Trajectory(Design):
             )
         return t
 
-    @cached_property
+    @property
     def interval_errors(self) -> Array:
         """Relative error (N - 1,) of each interval, integrated from its first knot; see `residual`.
 
         The error is infinite if the integration overflows.
         """
+        return self.gaps.errors
+
+    @cached_property
+    def gaps(self) -> Gaps:
+        """Gaps between the intervals if each is integrated from its first knot."""
         # Errors are divided by the largest velocities and accelerations of the motion. A high
         # orbital velocity of the base would make this divisor so large that it hides errors.
         # Therefore, subtract the median velocity of the base. By Galilean invariance, this does not
-        # change the accelerations. A fast wheel would hide the errors of slower joints if they had
-        # the same divisor. Therefore, each rotor has its own divisor.
-        t, u, state = self.t, self.u, self._aba.state
+        # change the accelerations.
+        t = self.t
         rotations = rotation_matrices(self.q[:, 3:7])
         q = self.q.copy()
         v = self.v.copy()
@@ -613,30 +629,7 @@ class Trajectory(Design):
         if not self.robot.orbit:
             q[:, :3] -= q[0, :3] + flown
         v[:, :3] -= usual @ rotations
-        rates = self._aba.accelerations(q, v, self._in_base_axes(q, u), t)
-        terms = [
-            state.spread(self._aba.terms(*knot)) for knot in zip(q, v, u, strict=True)
-        ]
-        # Take the largest magnitudes over all knots. Infinite or NaN entries count as zero.
-        push, sums = (
-            np.nan_to_num(np.abs(x), posinf=0.0).max(axis=0) for x in (rates, terms)
-        )
-        rotors = state.robot.rotors
-        alone = [joint.idx_v for joint in state.robot.joints if joint.name in rotors]
-        others = sorted({*range(6, len(digits))} - {*alone})
-        speed = np.abs(v).max(axis=0)
-        if self.robot.orbit:
-            # A robot that is held at rest has no velocities and accelerations. So the scale of its
-            # errors is the acceleration by its inputs, over the time in which the orbit turns by
-            # 1 rad.
-            push = np.maximum(push, sums)
-            speed = np.maximum(speed, push / self.robot.orbit.mean_motion)
-        # Constraints can hold the base or the joints, so that their rates are rounding errors.
-        least = _HELD if self.robot.constraints else 0.0
-        floors = [least * x.max() for x in (speed, push)]
-        for group in ([0, 1, 2], [3, 4, 5], *([rotor] for rotor in alone), others):
-            for x, floor in zip((speed, push), floors, strict=True):
-                x[group] = max(x[group].max(initial=0.0), floor) or 1.0
+        speed, push, sums = self._error_scales(q, v)
 
         def size(of_q: Array, of_v: Array, h: float) -> float:
             miss = np.maximum(np.abs(of_q) - digits, 0.0) / (speed * h)
@@ -645,7 +638,9 @@ class Trajectory(Design):
             )
             return float(np.maximum(miss, jump).max())
 
-        errors = []
+        errors = np.zeros(len(t) - 1)
+        displacements = np.zeros((len(t) - 1, len(digits)))
+        jumps = np.zeros((len(t) - 1, len(digits)))
         steps = 1
         model = self.robot.model
         # If the knots are not a motion of the robot, the integration may overflow. The error of the
@@ -662,10 +657,46 @@ class Trajectory(Design):
                     change = size(apart, end[1] - before[1], h)
                     if change <= _ACCURACY or not np.isfinite(change):
                         break
-                errors.append(
-                    size(pin.difference(model, end[0], q[k + 1]), v[k + 1] - end[1], h)
-                )
-        return np.where(np.isfinite(errors), errors, np.inf)
+                displacements[k] = pin.difference(model, q[k + 1], end[0])
+                jumps[k] = end[1] - v[k + 1]
+                errors[k] = size(displacements[k], jumps[k], h)
+        errors = np.where(np.isfinite(errors), errors, np.inf)
+        return Gaps(errors, displacements, jumps)
+
+    def _error_scales(self, q: Array, v: Array) -> tuple[Array, Array, Array]:
+        """Return the scales (nv,) of errors of velocities and accelerations.
+
+        The third array (nv,) contains the largest sums of the magnitudes of the terms that the
+        accelerations are sums of. A fast wheel would hide the errors of slower joints if they had
+        the same scale. Therefore, each rotor has its own scale.
+        """
+        state = self._aba.state
+        rates = self._aba.accelerations(q, v, self._in_base_axes(q, self.u), self.t)
+        terms = [
+            state.spread(self._aba.terms(*knot))
+            for knot in zip(q, v, self.u, strict=True)
+        ]
+        # Take the largest magnitudes over all knots. Infinite or NaN entries count as zero.
+        push, sums = (
+            np.nan_to_num(np.abs(x), posinf=0.0).max(axis=0) for x in (rates, terms)
+        )
+        rotors = state.robot.rotors
+        alone = [joint.idx_v for joint in state.robot.joints if joint.name in rotors]
+        others = sorted({*range(6, v.shape[1])} - {*alone})
+        speed = np.abs(v).max(axis=0)
+        if self.robot.orbit:
+            # A robot that is held at rest has no velocities and accelerations. So the scale of its
+            # errors is the acceleration by its inputs, over the time in which the orbit turns by
+            # 1 rad.
+            push = np.maximum(push, sums)
+            speed = np.maximum(speed, push / self.robot.orbit.mean_motion)
+        # Constraints can hold the base or the joints, so that their rates are rounding errors.
+        least = _HELD if self.robot.constraints else 0.0
+        floors = [least * x.max() for x in (speed, push)]
+        for group in ([0, 1, 2], [3, 4, 5], *([rotor] for rotor in alone), others):
+            for x, floor in zip((speed, push), floors, strict=True):
+                x[group] = max(x[group].max(initial=0.0), floor) or 1.0
+        return speed, push, sums
 
     def end(self, k: int, steps: int, q: Array, v: Array) -> tuple[Array, Array]:
         """Integrate by (11.1) over an interval from a state at its first knot; return q, v."""

@@ -104,3 +104,47 @@ def test_springs_that_are_much_stiffer_than_the_orbit_are_reported():
     robot = fflin.load("servicer_7dof", orbit=800e3).replace(stiffness=1e9)
     with pytest.warns(fflin.FflinWarning, match="rounding"):
         fflin.modes(fflin.linearize(robot))
+
+
+def wheeled(name, orbit, **fields):
+    """A robot at rest in an orbit, with three wheels and motors in its joints."""
+    wheels = [
+        fflin.ReactionWheel(axis, inertia=0.005, max=0.05, name=f"w{letter}")
+        for axis, letter in zip(np.eye(3), "xyz", strict=True)
+    ]
+    robot = fflin.load(name, orbit=orbit, **fields)
+    if robot.n:
+        return robot.replace(inputs=[*wheels, fflin.JointTorque("*")])
+    return robot.replace(inputs=wheels)
+
+
+@pytest.mark.exhaustive
+@pytest.mark.filterwarnings("ignore:ets_vii. unphysical")
+@pytest.mark.parametrize("eccentricity", [0.0, 0.1])
+@pytest.mark.parametrize(
+    ("name", "locked", "expected"),
+    [("cubesat", (), 12), ("ets_vii", [f"joint_{k}" for k in range(2, 7)], 14)],
+)
+def test_an_orbit_counts_as_many_states_as_its_linear_model_in_a_circle(
+    name, locked, expected, eccentricity
+):
+    """Wheels and joints set all but the base position: six of the states are out of reach.
+
+    Errors of the attitude grow up to 10^6 times in a period, but not in a part of it.
+    """
+    circle = fflin.CircularOrbit(altitude=1200e3)
+    robot = wheeled(name, circle, lock=locked)
+    held = fflin.relative_equilibria(robot, robot.neutral())[0]
+    constant = fflin.linearize_orbit(robot, held.q, steps=32)[0]
+    assert fflin.controllability(constant).dimension == expected
+    orbit = circle
+    if eccentricity:
+        orbit = fflin.EllipticOrbit(perigee=500e3, eccentricity=eccentricity)
+    along = fflin.linearize_orbit(robot.replace(orbit=orbit), held.q, steps=32)
+    reached = fflin.controllability(along)
+    assert reached.dimension == expected == len(along.state_names) - 6
+    assert reached.margin.kept > 20.0 and reached.margin.dropped < 1e-3
+    # All states are measured.
+    seen = fflin.observability(along)
+    assert seen.dimension == len(along.state_names)
+    assert seen.margin.kept > 1e4
