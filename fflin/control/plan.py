@@ -14,9 +14,10 @@ from fflin.base.names import chosen, group_of, input_keys
 from fflin.base.process import Progress
 from fflin.base.tables import counted
 from fflin.base.validation import Array, ArrayLike, Mask, number, whole
+from fflin.control.optimal.controlled_ends import controlled_ends
 from fflin.control.optimal.initial_guess import JointMotion, initial_guess
 from fflin.control.optimal.plan_search import Search, excess
-from fflin.control.optimal.shooting import Point, Shooting
+from fflin.control.optimal.shooting import Point, Shooting, passive_springs
 from fflin.control.weights import Weight, weight
 from fflin.dynamics import points
 from fflin.dynamics.closure import closure_of
@@ -75,6 +76,12 @@ def plan(
     If the robot has constraints, start and goal must be closed, see `closed`. The search uses
     independent coordinates at each knot, and each knot of the plan is closed. States in `free` may
     still follow from the other states.
+
+    Springs without motors, such as modes of flexible appendages, end at the goal if the inputs
+    excite them. Of two equal wings, torques on the base excite only the symmetric or only the
+    antisymmetric mode. Printing the trajectory names the modes that are not prescribed for this
+    reason, and their final deflection. A warning is issued if it exceeds 5 % of the largest
+    deflection.
 
     The base may rotate by any angle, including full turns if the angular rates at both ends require
     them. Continuous joints take the shorter direction.
@@ -183,15 +190,7 @@ def plan(
     shooting = Shooting(robot, t, hold == "previous", wheels)
     acting = chosen_limits(robot, limits, wheels)
     low, high = input_limits(robot, acting)
-    if R is None:
-        size = np.maximum(np.abs(low), np.abs(high))
-        R = np.where(np.isfinite(size) & (size > 0.0), size, 1.0) ** -2.0
-    matrix = weight("R", R, input_keys(actuation), definite=True)
-    weights = matrix.diagonal()
-    if (matrix != np.diag(weights)).any():
-        raise InputError(
-            "R has nonzero off-diagonal entries, expected a diagonal weight; give its diagonal"
-        )
+    weights = _weights(R, low, high, input_keys(actuation))
     left = {*shooting.wheels, *chosen("state", free, state.names)}
     rates = range(*state.groups.omega_b.indices(state.nx))
     if _without_velocity(goal) and left.isdisjoint(rates):
@@ -205,12 +204,16 @@ def plan(
         inputs = np.array((low, high))
         cost = _knot_weights(shooting)[:, None] * weights
         size = np.abs(np.where(np.isfinite(bounds), bounds, 0.0)).max(axis=0)
-        determining = shooting.determining(end, asked)
+        first = initial_guess(shooting, guess, start, end, asked, bounds, weights)
+        shooting.refine(*first, np.inf)
+        controlled, importance = controlled_ends(shooting, *first, weights, asked)
+        determining = shooting.determining(end, controlled)
         search = Search(
             shooting,
             start,
             end,
-            asked,
+            controlled,
+            importance,
             determining,
             bounds,
             inputs,
@@ -219,19 +222,18 @@ def plan(
             _PARTS,
             line.say,
         )
-        first = initial_guess(shooting, guess, start, end, asked, bounds, weights)
         made = _least(search, first)
     if made.reached:
         q, v, u = made.q, made.v, made.u
-        if asked.all():
+        if controlled.all():
             q[-1], v[-1] = end  # the integrated motion misses it by at most _REACHED
-        note = _note(shooting, made)
-        for text in _faults(made, note):
+        within = _note(shooting, made)
+        vibrating, fault = _vibrations(shooting, made, end, asked & ~controlled)
+        for text in (*fault, *_faults(made, within)):
             warnings.warn(text, FflinWarning, stacklevel=2)
-        note += f"\n{made.optimality or _UNKNOWN}"
-        note += _nearest_to_limits(
-            shooting, actuation, made, np.hstack((bounds, inputs))
-        )
+        limits_of_all = np.hstack((bounds, inputs))
+        nearest = _nearest_to_limits(shooting, actuation, made, limits_of_all)
+        note = f"{within}\n{made.optimality or _UNKNOWN}{vibrating}{nearest}"
         return Trajectory(
             robot, t, q, v, u, hold=hold, _note=note, _optimality=made.optimality
         )
@@ -260,6 +262,20 @@ class _Made(NamedTuple):
     def reached(self) -> bool:
         """Whether the motion ends at the goal and is within the limits at the knots."""
         return bool(max(self.missed.max(), self.at_knots.max()) <= _REACHED)
+
+
+def _weights(R: Weight | None, low: Array, high: Array, inputs: Sequence[str]) -> Array:
+    """Return the weights (nu,) of the squared inputs, by default from their limits."""
+    if R is None:
+        size = np.maximum(np.abs(low), np.abs(high))
+        R = np.where(np.isfinite(size) & (size > 0.0), size, 1.0) ** -2.0
+    matrix = weight("R", R, inputs, definite=True)
+    weights: Array = matrix.diagonal()
+    if (matrix != np.diag(weights)).any():
+        raise InputError(
+            "R has nonzero off-diagonal entries, expected a diagonal weight; give its diagonal"
+        )
+    return weights
 
 
 def _goal_point(
@@ -428,13 +444,8 @@ def _passive_joints(shooting: Shooting, asked: Mask) -> list[str]:
     """Return the joints with springs but without a motor whose final values are prescribed."""
     state = shooting.state
     robot = state.robot
-    motors = {item.joint for item in robot.inputs if isinstance(item, JointTorque)}
     prescribed = {state.names[i] for i in np.flatnonzero(asked)}
-    return [
-        name
-        for name, stiffness in robot.stiffness.items()
-        if stiffness and name not in motors and f"q_m.{name}" in prescribed
-    ]
+    return [name for name in passive_springs(robot) if f"q_m.{name}" in prescribed]
 
 
 def _diverged(made: _Made, duration: float) -> bool:
@@ -459,6 +470,43 @@ def _faults(made: _Made, note: str) -> Iterator[str]:
             f"{optimality.stationarity:.1e} of the gradient of the effort, and the complementarity "
             f"is {optimality.complementarity:.1e}, expected at most {STATIONARY:.0e}"
         )
+
+
+# A warning is given if deflections that no input controls end farther from the goal than this
+# fraction of the largest deflection of the motion.
+_VIBRATES = 0.05
+
+
+def _vibrations(
+    shooting: Shooting, made: _Made, end: Point, uncontrolled: Mask
+) -> tuple[str, list[str]]:
+    """Return a note and warnings about deflections that the inputs do not control.
+
+    Both are empty without such deflections. `uncontrolled` (nx,) is True for the states that are
+    prescribed, but that the inputs cannot choose, see `controlled_ends`.
+    """
+    state = shooting.state
+    half = state.nx // 2
+    left = [i for i in shooting.deflections if uncontrolled[[i, half + i]].any()]
+    if not left:
+        return "", []
+    names = listed([state.names[i].removeprefix("q_m.") for i in left])
+    positions = shooting.limited_values(made.q, made.v)[:, :half]
+    goal = shooting.limited_values(*end)[:half]
+    error = float(np.abs(positions[-1] - goal)[left].max())
+    largest = float(np.abs(positions - goal)[:, shooting.deflections].max())
+    percent = f"{100.0 * error / (largest or 1.0):.2g} %"
+    note = (
+        f"{names} cannot be chosen at the end beside the other states: the deflection ends "
+        f"{percent} of the largest deflection from the goal"
+    )
+    if error <= _VIBRATES * largest:
+        return f"\n{note}", []
+    remedy = (
+        "the inputs do not excite these deflections, or are held for nearly whole periods of them: "
+        "give another number of knots or another duration"
+    )
+    return f"\n{note}", [f"{note}; {remedy}"]
 
 
 def _note(shooting: Shooting, made: _Made) -> str:

@@ -157,11 +157,15 @@ class CommutatorFree4(Integrator):
     )
 
     @classmethod
+    def factor(cls, z: Values) -> Values:
+        """Return R(z), the Taylor polynomial of exp(z) of order 4; see `Integrator.growth`."""
+        return 1.0 + z * (1.0 + z / 2.0 * (1.0 + z / 3.0 * (1.0 + z / 4.0)))
+
+    @classmethod
     def growth(cls, z: Values) -> Array:
-        """Return ln|R(z)| with the Taylor polynomial R of order 4; see `Integrator.growth`."""
-        R = 1.0 + z * (1.0 + z / 2.0 * (1.0 + z / 3.0 * (1.0 + z / 4.0)))
+        """Return ln|R(z)|; see `Integrator.growth`."""
         with np.errstate(divide="ignore"):
-            growth: Array = np.log(np.abs(R))
+            growth: Array = np.log(np.abs(cls.factor(z)))
         return growth
 
     @classmethod

@@ -25,6 +25,9 @@ _LIMITED, _TIGHTER = 0.002, 0.005
 # one motion.
 _MEETS = 1e-10
 
+# Gaps of a plan that is integrated as one motion, relative to the largest velocity plus 1.
+_JOINED = 1e-13
+
 # After a plan is first integrated as one motion, its violations are corrected only if their sum
 # is at most half of this value. Later sums must be at most half of the previous sum.
 _NEARLY = 1e-3
@@ -136,6 +139,8 @@ class Search(NamedTuple):
     start: Point
     end: Point
     asked: Mask  # states whose value at the end is prescribed (nx,)
+    # An error of a state at the end counts this many times (nx,).
+    importance: Array
     determining: Mask  # prescribed states (nx,) that determine all of them near the end
     bounds: Array  # limits of states (2, nx)
     limits: Array  # limits of inputs (2, nu)
@@ -342,6 +347,7 @@ class Search(NamedTuple):
         to_end = shooting.between((q[-1], v[-1]), self.end)
         goal = self.determining
         knots[:, -1, goal] = np.clip(to_end, *knots[:, -1])[goal]
+        knots[:, -1] *= self.importance
         tighter = self.bounds + _TIGHTER * np.array((self.size, -self.size))
         inside = tighter[:, None, None] - shooting.inside(motions, self.parts)[:, :-1]
         return Trial(q, v, u, shooting.missed(q, v, motions), knots, inside)
@@ -375,8 +381,10 @@ class Search(NamedTuple):
         knot, state = np.nonzero(np.isfinite(trial.knots).any(axis=0))
         columns = knot[:, None] * nw + np.arange(nz)
         starts = np.arange(len(knot) + 1) * nz
+        importance = np.where(knot == knots - 1, self.importance[state], 1.0)
+        entries = importance[:, None] * charts.T[knot, state]
         at_knots = sp.csr_array(
-            (charts.T[knot, state].ravel(), columns.ravel(), starts),
+            (entries.ravel(), columns.ravel(), starts),
             (len(knot), knots * nw),
         )
         at_knots.eliminate_zeros()
@@ -443,7 +451,9 @@ class Search(NamedTuple):
         The list `left` contains the predicted violation after each quadratic program; this method
         appends a value.
         """
-        left.append(float(excess(trial.knots - step.z).sum()))
+        moved = step.z.copy()
+        moved[-1] *= self.importance
+        left.append(float(excess(trial.knots - moved).sum()))
         before = np.inf
         if len(left) > _STAGNANT:
             before = left[-1 - _STAGNANT]
@@ -465,7 +475,7 @@ class Search(NamedTuple):
             limited = limited | self._exceeding(trial)
             self._report("closing the gaps", trial, limited)
             if trial.gap <= _MEETS and trial.outside(limited) <= _ENDS:
-                one = self._flown(trial.u)
+                one = self._joined(trial)
                 limited = limited | self._exceeding(one)
                 before = last
                 last = one.outside(limited)
@@ -488,6 +498,14 @@ class Search(NamedTuple):
         if trial.gap <= _MEETS:
             return trial
         return self._flown(trial.u)
+
+    def _joined(self, trial: Trial) -> Trial:
+        """Return the trial whose motion has no gaps, for a trial with small gaps."""
+        joined = self.shooting.joined(self.start, *trial[:3], _JOINED)
+        if joined is None:
+            return self._flown(trial.u)
+        one = self._trial(*joined, trial.u)
+        return one._replace(missed=0.0 * one.missed)
 
     def _flown(self, u: Array) -> Trial:
         """Integrate the motion from the start under the inputs u, and return it as a trial."""

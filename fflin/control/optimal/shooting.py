@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 from scipy.linalg import qr
 
-from fflin.base.errors import located
+from fflin.base.errors import InputError, located
 from fflin.base.rotation import rotation_matrices
 from fflin.base.validation import Array, Indices, Mask
 from fflin.dynamics.aba import Aba
@@ -23,6 +23,7 @@ from fflin.dynamics.projection import ProjectedAba
 from fflin.dynamics.state import StateMap
 from fflin.linear.linearization import Linearizer
 from fflin.linear.trajectory import cubic
+from fflin.robot.inputs import JointTorque
 from fflin.robot.robot import Robot
 
 _FEWEST_STEPS, _MOST_STEPS = 4, 128
@@ -35,6 +36,15 @@ _STEPS = 16
 # Jacobians are integrated with a quarter of the steps of the motion, but with at most this number
 # of steps.
 _MOST_OF_JACOBIANS = 16
+
+# A step of h [s] multiplies the part of an error that belongs to the pole lambda by R(lambda h)
+# instead of exp(lambda h). The relative difference of these factors is at most _RESOLVED h / T, so
+# that it adds up to _RESOLVED over the duration T of the plan, or at most _RESOLVED |Re lambda| h.
+# An interval has at most _MOST_RESOLVING steps for this reason.
+_RESOLVED, _MOST_RESOLVING = 0.1, 1024
+
+# Newton's method joins the motions of the intervals in at most this many steps.
+_MOST_JOINING = 5
 
 # A prescribed state is determined by others if its pivot is below this fraction of the largest.
 _DETERMINED = 1e-6
@@ -76,6 +86,8 @@ class Shooting:
         self.t = t
         self.held = held
         self.steps = _FEWEST_STEPS
+        # Least number of steps per interval that resolve all poles of the robot, see `refine`.
+        self.resolving = 1
         self.h = np.diff(t)
         self._aba = Aba(self.state)
         # Projection on the constraints of the robot, or None if it has none.
@@ -85,17 +97,25 @@ class Shooting:
         self._linearizer = Linearizer(robot, moving=True)
         free = robot.wheels if wheels is None else wheels
         self.wheels = [self.state.names.index(f"q_m.{name}") for name in free]
+        # Positions of joints with springs but without motors, such as modes of flexible appendages.
+        self.deflections = [
+            self.state.names.index(f"q_m.{name}") for name in passive_springs(robot)
+        ]
         self._size = np.where(np.arange(self.state.nx) < 3, 2.0, 1.0)
 
     def between(self, start: Point, end: Point) -> Array:
         """Return the step z (nx,) from `start` to `end`, with zero change of the wheel angles."""
-        state = self.state
-        difference = pin.difference(state.robot.model, start[0], end[0])
-        z = np.concatenate(
-            (state.velocities(difference), state.velocities(end[1] - start[1]))
-        )
+        z = self._step_between(start, end)
         z[self.wheels] = 0.0
         return z
+
+    def _step_between(self, start: Point, end: Point) -> Array:
+        """Return the step z (nx,) from `start` to `end`."""
+        state = self.state
+        difference = pin.difference(state.robot.model, start[0], end[0])
+        return np.concatenate(
+            (state.velocities(difference), state.velocities(end[1] - start[1]))
+        )
 
     def moved(self, q: Array, v: Array, z: Array) -> Point:
         """Return the knots q, v after steps z (N + 1, nx), one for each knot."""
@@ -181,6 +201,39 @@ class Shooting:
             q[k + 1], v[k + 1] = motions[0][0, -1], motions[1][0, -1]
         return q, v
 
+    def joined(
+        self, start: Point, q: Array, v: Array, u: Array, rounding: float
+    ) -> Point | None:
+        """Return the knots of the motion from a point under the inputs u.
+
+        The knots q, v must be near this motion. Newton's method moves them until no gap exceeds
+        `rounding`, relative to the state. Return None if it does not converge.
+        """
+        ends, _ = self.jacobians(q, v, u)
+        charts = self.charts(q, v)
+        nz = charts.kept.shape[1]
+        q = q.copy()
+        v = v.copy()
+        for _ in range(_MOST_JOINING):
+            q[0], v[0] = start
+            configurations, velocities = self.motions(q, v, u)
+            step = np.zeros(nz)
+            z = np.zeros((len(q), self.state.nx))
+            largest = 0.0
+            for k in range(1, len(q)):
+                end = configurations[k - 1, -1], velocities[k - 1, -1]
+                gap = self._step_between((q[k], v[k]), end)
+                size = 1.0 + np.abs(self.state.velocities(v[k])).max()
+                largest = max(largest, float(np.abs(gap).max()) / size)
+                step = ends[k - 1, :, :nz] @ step + gap[charts.kept[k]]
+                z[k] = charts.T[k] @ step
+            if largest <= rounding:
+                return q, v
+            if not np.isfinite(z).all():
+                return None
+            q, v = self.moved(q, v, z)
+        return None
+
     def limited_values(self, q: Array, v: Array) -> Array:
         """Return the values (.., nx) of the states that can have limits: joint positions and rates.
 
@@ -205,15 +258,23 @@ class Shooting:
     def refine(self, q: Array, v: Array, u: Array, accuracy: float) -> None:
         """Double the number of steps until the interval ends have the given accuracy [rad, m, s].
 
-        The number of steps is at most _MOST_STEPS.
+        The accuracy of a wheel's rate is relative to its largest rate, if this exceeds 1 rad/s.
+        The steps resolve all poles of the robot, also of modes that the given motion does not
+        excite. Otherwise, their number is at most _MOST_STEPS.
         """
-        self.steps = _FEWEST_STEPS
+        nx = self.state.nx
+        tolerance = np.full(nx, accuracy)
+        rates = self.state.velocities(v)
+        for i in self.wheels:
+            tolerance[nx // 2 + i] *= max(1.0, np.abs(rates[:, i]).max())
+        self.resolving = self._resolving(q, v, u)
+        self.steps = max(_FEWEST_STEPS, self.resolving)
         missed = self.missed(q, v, self.motions(q, v, u, self.steps))
         while self.steps < _MOST_STEPS:
             self.steps *= 2
             before = missed
             missed = self.missed(q, v, self.motions(q, v, u, self.steps))
-            if np.abs(missed - before).max() <= accuracy:
+            if (np.abs(missed - before) <= tolerance).all():
                 break
 
     def jacobians(
@@ -235,7 +296,8 @@ class Shooting:
         # Integrate dZ/dt = A Z + G along the motions by Runge-Kutta steps. Z contains the Jacobians
         # of all intervals, and G = [0, (1 - s) B, s B], because the input is (1 - s) times the
         # input at the first knot plus s times the input at the next knot. A and B are computed at
-        # the stages of these steps: the beginning, the middle and the end of each step.
+        # the stages of these steps: the beginning, the middle and the end of each step. If fast
+        # poles require it, a step has substeps, between which A and B are interpolated.
         N = len(self.h)
         nx = len(self._size)
         nu = u.shape[1]
@@ -243,13 +305,16 @@ class Shooting:
             charts = self.charts(q, v)
         nz = charts.kept.shape[1]
         steps = min(self.steps // 4, _MOST_OF_JACOBIANS)
+        substeps = max(1, self.resolving // steps)
         stages = 2 * steps + 1  # of an interval; neighbouring steps share a stage
         s = np.arange(stages) / (2.0 * steps)
         if self.held:
             s = np.zeros(stages)  # the input of the first knot is held
-        q, v = self.motions(q, v, u, 4 * steps)
-        q = q[:, ::2]
-        v = v[:, ::2]
+        fine = max(4 * steps, self.resolving)
+        q, v = self.motions(q, v, u, fine)
+        every = fine // (2 * steps)
+        q = q[:, ::every]
+        v = v[:, ::every]
         inputs = u[:-1, None] + s[:, None] * np.diff(u, axis=0)[:, None]
         points = (rows.reshape(-1, rows.shape[-1]) for rows in (q, v, inputs))
         along, driven = self._models(*points)
@@ -260,27 +325,59 @@ class Shooting:
         by_step = np.zeros((N, stages, nx, nz))
         G = np.concatenate((by_step, (1.0 - s) * B, s * B), axis=3)
 
-        h = self.h[0] / steps
+        h = self.h[0] / (steps * substeps)
         Z: Array = np.zeros((N, nx, nz + 2 * nu))
         Z[:, :, :nz] = charts.T[:-1]
-        # Points within the interval, in steps from its beginning. The Jacobians at these points are
-        # interpolated by a cubic polynomial over each step.
-        inner_points = np.arange(1, parts) / parts * steps
+        # Points within the interval, in substeps from its beginning. The Jacobians at these points
+        # are interpolated by a cubic polynomial over each substep.
+        inner_points = np.arange(1, parts) / parts * (steps * substeps)
         inside = list[Array]()
-        for step in range(steps):
-            first = 2 * step
+        for step in range(steps * substeps):
+            first = 2 * (step // substeps)
             last = first + 2
-            rate = partial(_rate, A[:, first : last + 1], G[:, first : last + 1])
+            part = step % substeps / substeps, 1.0 / substeps
+            rate = partial(_rate, A[:, first : last + 1], G[:, first : last + 1], *part)
             before = Z
             Z = CommutatorFree4.vector_step(rate, h, Z)
-            begin_rate = h * (A[:, first] @ before + G[:, first])
-            end_rate = h * (A[:, last] @ Z + G[:, last])
-            coefficients = cubic(before, Z, begin_rate, end_rate)
+            coefficients = cubic(before, Z, h * rate(0.0, before), h * rate(1.0, Z))
             in_step = (inner_points >= step) & (inner_points < step + 1)
             powers = (inner_points[in_step] - step)[:, None] ** np.arange(4)
             inside.append(np.einsum("ij,kjlm->kilm", powers, coefficients))
         ends = np.take_along_axis(Z, charts.kept[1:, :, None], axis=1)
         return ends, np.concatenate(inside, axis=1)
+
+    def _resolving(self, q: Array, v: Array, u: Array) -> int:
+        """Return the number of steps per interval that resolve the poles at the knots q, v."""
+        some = [0, len(q) // 2, -1]
+        poles = np.linalg.eigvals(self._models(q[some], v[some], u[some])[0])
+        if not np.isfinite(poles).all():
+            return 1
+        tolerance = _RESOLVED * np.maximum(1.0 / self.t[-1], np.abs(poles.real))
+        steps = 1
+        while True:
+            h = self.h[0] / steps
+            error = np.abs(CommutatorFree4.factor(h * poles) * np.exp(-h * poles) - 1.0)
+            slow = error <= h * tolerance
+            if slow.all() or steps == _MOST_RESOLVING:
+                break
+            steps *= 2
+        frequency = float(np.abs(poles.imag[~slow]).max(initial=0.0)) / (2.0 * np.pi)
+        if frequency > 0.0:
+            raise InputError(
+                f"a mode of {frequency:.3g} Hz oscillates {self.h[0] * frequency:.3g} times "
+                "between two knots, which is too often to integrate; give more knots, or omit the "
+                "mode"
+            )
+        return steps
+
+    def spring_rates(self, q: Array, v: Array, u: Array) -> Array:
+        """Return the squared frequency [1/s^2] of each deflection at the start of a motion."""
+        if not self.deflections:
+            return np.zeros(0)
+        A = self._models(q[:1], v[:1], u[:1])[0][0]
+        rows = self.state.nx // 2 + np.array(self.deflections, int)
+        rates: Array = np.abs(A[rows, self.deflections])
+        return rates
 
     def _models(self, q: Array, v: Array, u: Array) -> tuple[Array, Array]:
         """Return A (k, nx, nx) and B (k, nx, nu) of the errors about k points."""
@@ -347,21 +444,53 @@ class Shooting:
         """Return inputs (K, nu) that approximately cause a motion q (K, nq), v (K, nv)."""
         u = np.zeros((len(q), len(self._aba.actuation.names)))
         wanted = np.gradient(v, t, axis=0) - self._aba.accelerations(q, v, u)
-        by_u = self._models(q, v, u)[1][:, self.state.nx // 2 :]
+        half = self.state.nx // 2
+        A, B = self._models(q, v, u)
         rates = self.state.velocities(wanted)[..., None]
+        # The deflections of springs without motors are unknowns as well: they transmit the forces
+        # that move the masses on the springs. Without them, the inputs would leave these masses
+        # behind, and be too small for the motion of the robot.
+        deflected = A[:, half:, self.deflections]
+        size = np.abs(deflected).max(axis=1, keepdims=True, initial=0.0)
+        by_u = np.concatenate(
+            (B[:, half:], deflected / np.where(size > 0.0, size, 1.0)), axis=2
+        )
         # The wheels accelerate as needed. Wheels are light, so with their rows, the least-squares
         # problem would be about standing wheels instead of the motion of the base and the joints.
-        kept = np.delete(np.arange(self.state.nx // 2), self.wheels)
+        kept = np.delete(np.arange(half), self.wheels)
         by_u, rates = by_u[:, kept], rates[:, kept]
-        inputs: Array = (np.linalg.pinv(by_u, 1e-9) @ rates)[..., 0]
+        solution = (np.linalg.pinv(by_u, 1e-9) @ rates)[..., 0]
+        inputs: Array = solution[:, : u.shape[1]]
         return inputs
 
 
-def _rate(A: Array, G: Array, node: float, Z: Array) -> Array:
-    """Return A Z + G at the fraction `node` of a step: 0, 1/2 or 1.
+def passive_springs(robot: Robot) -> list[str]:
+    """Return the joints with springs but without a motor, such as modes of appendages."""
+    motors = {item.joint for item in robot.inputs if isinstance(item, JointTorque)}
+    return [
+        name
+        for name, stiffness in robot.stiffness.items()
+        if stiffness and name not in motors
+    ]
 
-    The second axis of A and G is the beginning, the middle and the end of the step.
+
+def _rate(
+    A: Array, G: Array, begin: float, length: float, node: float, Z: Array
+) -> Array:
+    """Return A Z + G at the fraction `node` of a substep.
+
+    The second axis of A and G is the beginning, the middle and the end of a step, between which
+    they are interpolated by a parabola. `begin` and `length` are fractions of the step.
     """
-    stage = round(2.0 * node)
-    rate: Array = A[:, stage] @ Z + G[:, stage]
+    at = begin + node * length
+    weights = (
+        (1.0 - at) * (1.0 - 2.0 * at),
+        4.0 * at * (1.0 - at),
+        at * (2.0 * at - 1.0),
+    )
+    along, driven = (
+        sum(weight * values[:, k] for k, weight in enumerate(weights) if weight)
+        for values in (A, G)
+    )
+    rate: Array = along @ Z + driven
     return rate
