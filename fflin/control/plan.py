@@ -425,7 +425,7 @@ def _failure(
             "nonholonomic); give a longer duration, more knots or a `guess` (--guess) in which the "
             "joints move in loops, or leave q_b free with `free` (--free-end)"
         )
-    if passive := _passive_joints(shooting, asked):
+    if passive := _passive_joints(shooting, asked & (made.missed > _REACHED)):
         names = [f"{group}.{name}" for name in passive for group in ("q_m", "qdot_m")]
         advice = (
             f"{listed(passive)} have springs and no motor, so they vibrate at the end; leave them "

@@ -690,9 +690,8 @@ class Trajectory(Design):
             # 1 rad.
             push = np.maximum(push, sums)
             speed = np.maximum(speed, push / self.robot.orbit.mean_motion)
-        # Constraints can hold the base or the joints, so that their rates are rounding errors.
-        least = _HELD if self.robot.constraints else 0.0
-        floors = [least * x.max() for x in (speed, push)]
+        # The base, joints or wheels may be at rest, so that their rates are rounding errors.
+        floors = [_HELD * x.max() for x in (speed, push)]
         for group in ([0, 1, 2], [3, 4, 5], *([rotor] for rotor in alone), others):
             for x, floor in zip((speed, push), floors, strict=True):
                 x[group] = max(x[group].max(initial=0.0), floor) or 1.0

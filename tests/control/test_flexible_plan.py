@@ -102,10 +102,11 @@ def test_a_slew_of_a_flexible_satellite_ends_at_rest_and_is_tracked(
 ):
     robot = satellite(tmp_path, frequency)
     goal = fflin.configuration(robot, rpy=(angle, 0, 0))
-    duration = 24.0 if angle < 100 else 80.0
-    knots = 13 if angle < 100 else 41
+    duration = 40.0 if angle < 100 else 80.0
+    knots = 21 if angle < 100 else 41
     motion = fflin.plan(robot, (goal, None), duration, knots=knots, free=["r_b", "v_b"])
     assert motion.optimality.stationary
+    assert motion.residual.max() < 1e-5
     modes = [robot.joint(name) for name in ("left_mode_1", "right_mode_1")]
     deflections = motion.q[:, [joint.idx_q for joint in modes]]
     assert np.abs(deflections[-1]).max() < 1e-3 * np.abs(deflections).max()
