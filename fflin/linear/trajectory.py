@@ -71,6 +71,9 @@ _POSITION_ROUNDING, _SUM_ROUNDING = 16.0 * _EPS, 1e3 * _EPS
 # zero.
 _HELD = 1e-6
 
+# The same fraction for a robot without constraints, whose wheels may be at rest.
+_RESTS = 1e-12
+
 # Largest difference [SI units] between the first and the last state of a periodic motion.
 _CLOSED = 1e-6
 
@@ -691,7 +694,8 @@ class Trajectory(Design):
             push = np.maximum(push, sums)
             speed = np.maximum(speed, push / self.robot.orbit.mean_motion)
         # The base, joints or wheels may be at rest, so that their rates are rounding errors.
-        floors = [_HELD * x.max() for x in (speed, push)]
+        least = _HELD if self.robot.constraints else _RESTS
+        floors = [least * x.max() for x in (speed, push)]
         for group in ([0, 1, 2], [3, 4, 5], *([rotor] for rotor in alone), others):
             for x, floor in zip((speed, push), floors, strict=True):
                 x[group] = max(x[group].max(initial=0.0), floor) or 1.0
