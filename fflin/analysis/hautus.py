@@ -96,34 +96,47 @@ def split_by_poles(
     noise = len(X) * ranks.EPS * float(np.linalg.cond(M / np.outer(root, root)))
     if dt:
         noise = max(noise, ranks.EPS * (unit / dt + float(np.linalg.norm(A, 2))))
-    # Orthogonal transformations split off left null vectors until none remain. For a defective
-    # eigenvalue, the repeated steps split off the whole Jordan chain. A staircase algorithm is not
-    # used, because it would carry the rounding error of an ill-conditioned step into the next step.
     to, back = from_x, to_x
     if dual:
         A, to, back = A.T, to_x.T, from_x.T
     B = ranks.unit_columns(to @ drive)
-    inside, margin = np.eye(2 * nv), ranks.Margin()
+    inside: Array = np.eye(2 * nv)
     if known is not None and len(known):
         taken = known @ back
         taken /= np.linalg.norm(taken, axis=1, keepdims=True)
         inside = np.linalg.qr(taken.T, mode="complete")[0][:, len(known) :]
-    rest: Array = np.zeros((2 * nv, 0))
-    while inside.shape[1]:
-        lost, step_margin = _left_vectors(
-            inside.T @ A @ inside, inside.T @ B, 20.0 * noise
-        )
-        margin &= step_margin.transformed(inside)
-        if not lost.shape[1]:
-            break
-        rest = np.hstack((rest, inside @ lost))
-        inside = inside @ ranks.image(lost, 0.5)[1]
+    inside, rest, margin = without_left_vectors(A, B, inside, 20.0 * noise)
     margin = margin.transformed(to_x[nv:, nv:], halved=True)
     fixed = ranks.FixedPoles(margin=margin)
     if rest.shape[1]:
         rates, vectors = np.linalg.eig(rest.T @ A @ rest)
         fixed = _fixed_poles(rates, unit, to_x @ rest @ vectors, dt, margin)
     return to_x @ inside, to_x @ rest, rest.T @ from_x, fixed
+
+
+def without_left_vectors(
+    A: Array, B: Array, inside: Array, tolerance: float
+) -> tuple[Array, Array, ranks.Margin]:
+    """Split a space of states into the part that the columns of B reach and the rest.
+
+    `inside` (n, m) is an orthonormal basis of the space. A has a norm of about 1, and the columns
+    of B have unit length. Return orthonormal bases of both parts, and the margin of the decisions.
+    """
+    # Orthogonal transformations split off left null vectors until none remain. For a defective
+    # eigenvalue, the repeated steps split off the whole Jordan chain. A staircase algorithm is not
+    # used, because it would carry the rounding error of an ill-conditioned step into the next step.
+    rest: Array = np.zeros((len(inside), 0))
+    margin = ranks.Margin()
+    while inside.shape[1]:
+        lost, step_margin = _left_vectors(
+            inside.T @ A @ inside, inside.T @ B, tolerance
+        )
+        margin &= step_margin.transformed(inside)
+        if not lost.shape[1]:
+            break
+        rest = np.hstack((rest, inside @ lost))
+        inside = inside @ ranks.image(lost, 0.5)[1]
+    return inside, rest, margin
 
 
 def _fixed_poles(

@@ -89,6 +89,30 @@ def ends_of(
     return None
 
 
+def signals_in_use(
+    ends: Sequence[Ends | None],
+    measured: Sequence[int],
+    commanded: Sequence[int],
+    size: int,
+) -> tuple[Array, list[int]]:
+    """Return a mask (size,) of the outputs and states in use, and the inputs in use.
+
+    They belong to the law, which measures and commands the given signals, or to a goal.
+    """
+    used = np.zeros(size, bool)
+    used[list(measured)] = True
+    inputs = set(commanded)
+    for end in ends:
+        if end is None:
+            continue
+        for kind, index in (*end.sinks, *end.sources):
+            if kind == "input":
+                inputs.add(index)
+            elif kind != "command":
+                used[index] = True
+    return used, sorted(inputs)
+
+
 def _split(
     sources: dict[tuple[str, int], float], sinks: dict[tuple[str, int], float]
 ) -> tuple[tuple[tuple[str, int], ...], tuple[tuple[str, int], ...], Array, Array]:

@@ -233,9 +233,9 @@ class Decay(Goal):
     Parameters
     ----------
     rate : float
-        Least decay rate [1/s]: the real parts of all poles are below -rate. States that affect
-        no signal of the law or of a goal, such as the position under an attitude law, and states
-        that no input reaches, are excluded.
+        Least decay rate [1/s]: the real parts of all poles are below -rate. Modes that no input of
+        the law or a goal reaches, or that none of their outputs contains, are excluded. Examples
+        are the position under an attitude law, and modes of equal wings that do not turn the base.
     hard : bool
 
     Raises

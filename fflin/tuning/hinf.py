@@ -17,7 +17,7 @@ from fflin.base.process import in_one_thread
 from fflin.base.validation import Array, instance, positive, whole
 from fflin.control.linear_controller import LinearController
 from fflin.linear.model import LinearModel
-from fflin.tuning.channels import Ends, channel_of, ends_of
+from fflin.tuning.channels import Ends, channel_of, ends_of, signals_in_use
 from fflin.tuning.goals import Goal, MaxGain
 from fflin.tuning.law import law_of
 from fflin.tuning.loop import (
@@ -25,6 +25,7 @@ from fflin.tuning.loop import (
     with_delayed_outputs,
     with_robot_lags,
 )
+from fflin.tuning.minimal import reduction_of
 from fflin.tuning.plant import Plant, plant_of, signals_of
 from fflin.tuning.reduction import truncations
 from fflin.tuning.structures import Names, indices, input_indices
@@ -260,7 +261,7 @@ def hinf(
                 "give a number, or the continuous model"
             )
         ends.append(found)
-    model = _plant(lin, ends, rows, delays)
+    model = _plant(lin, ends, rows, columns, delays)
     # Outputs without a state that the inputs move are not fed back.
     rows = tuple(row for row in rows if model.C[row].any())
     if not rows:
@@ -287,18 +288,17 @@ def hinf(
 
 
 def _plant(
-    lin: LinearModel, ends: Sequence[Ends], rows: Sequence[int], delays: Sequence[int]
+    lin: LinearModel,
+    ends: Sequence[Ends],
+    rows: Sequence[int],
+    columns: Sequence[int],
+    delays: Sequence[int],
 ) -> Plant:
-    """Return the plant with the states that the goals and the measured outputs contain."""
-    ny = len(lin.output_names)
+    """Return the plant with the states that connect signals of the goals and the controller."""
     matrices = with_delayed_outputs((lin.A, lin.B, lin.C, lin.D), delays)
-    used = np.zeros(ny + len(matrices[0]), bool)
-    used[list(rows)] = True
-    for end in ends:
-        for kind, index in (*end.sinks, *end.sources):
-            if kind in ("output", "error", "sensor"):
-                used[index] = True
-    return plant_of(matrices, lin.dt, used)
+    used, inputs = signals_in_use(ends, rows, columns, len(lin.C) + len(lin.A))
+    reduction = reduction_of([matrices], lin.dt, used, inputs)
+    return plant_of(matrices, lin.dt, reduction)
 
 
 def _generalised(

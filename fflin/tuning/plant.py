@@ -15,6 +15,7 @@ import numpy as np
 from fflin.base.names import group_of, grouped
 from fflin.base.validation import Array
 from fflin.linear.model import LinearModel
+from fflin.tuning.minimal import Reduction
 
 # A response of the plant below this fraction of the largest counts as zero.
 _ROUNDING = 1e-9
@@ -112,34 +113,15 @@ def signals_of(lin: LinearModel) -> Signals:
     )
 
 
-def joined(A: Array, B: Array, C: Array) -> list[int]:
-    """Return the indices of the states that an input reaches and that affect an output."""
-    links = np.abs(A) > _ROUNDING * np.abs(A).max(initial=0.0)
-    reached = np.abs(B).max(axis=1, initial=0.0) > _ROUNDING * np.abs(B).max(
-        initial=0.0
-    )
-    seen = C.any(axis=0)
-    for _ in A:
-        reached = reached | links[:, reached].any(axis=1)
-        seen = seen | links[seen].any(axis=0)
-    indices: list[int] = np.flatnonzero(reached & seen).tolist()
-    return indices
-
-
 def plant_of(
-    matrices: tuple[Array, Array, Array, Array], dt: float, used: Array
+    matrices: tuple[Array, Array, Array, Array], dt: float, reduction: Reduction
 ) -> Plant:
-    """Return the plant of a model.
-
-    `used` (ny + nx,) marks the outputs and states that a law or a goal uses. States without an
-    effect on them, and states that no input reaches, are left out.
-    """
+    """Return the plant of a model without its hidden states."""
     A, B, C, D = matrices
     ny, nx = len(C), len(A)
     C = np.vstack((C, np.eye(nx)))
     D = np.vstack((D, np.zeros((nx, B.shape[1]))))
-    kept = joined(A, B, C[used])
-    A, B, C = A[np.ix_(kept, kept)], B[kept], C[:, kept]
+    A, B, C = reduction.of(A, B, C)
     if not dt:
         return Plant(A, B, C, D, ny, 0.0)
     rate = 2.0 / dt

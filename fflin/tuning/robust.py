@@ -13,6 +13,7 @@ from fflin.tuning.closed_loop import ClosedLoop
 from fflin.tuning.criteria import weights_at
 from fflin.tuning.goals import Goal, Margin, MaxGain, RollOff
 from fflin.tuning.law import Law, embedded
+from fflin.tuning.minimal import Reduction
 from fflin.tuning.plant import Plant, plant_of
 from fflin.uncertainty.gain_bound import Channels, gain_bound
 from fflin.uncertainty.lft import LFT
@@ -33,12 +34,12 @@ _LEAST = 1e-9
 class UncertainLoop:
     """Closed loop of a law and a plant whose uncertain parameters are channels."""
 
-    def __init__(self, lft: LFT, law: Law, used: Array) -> None:
-        """Close the loop; `used` (ny + nx,) marks the outputs and states of the law and goals."""
+    def __init__(self, lft: LFT, law: Law, reduction: Reduction) -> None:
+        """Close the loop of a law and a plant without its hidden states."""
         self._ny, nu = lft.D22.shape
         self._nw = len(lft.C1)
         self._nu = nu
-        plant = _plant(lft, used)
+        plant = _plant(lft, reduction)
         ny = self._ny
         law = embedded(law, range(ny), range(nu), ny + self._nw, nu + self._nw)
         self._loop = ClosedLoop(plant, law)
@@ -117,21 +118,12 @@ class UncertainLoop:
         return found
 
 
-def _plant(lft: LFT, used: Array) -> Plant:
+def _plant(lft: LFT, reduction: Reduction) -> Plant:
     """Return the plant with inputs (u, w), and outputs (y, z) before the states."""
-    ny = len(lft.C2)
     matrices = (
         lft.A,
         np.hstack((lft.B2, lft.B1)),
         np.vstack((lft.C2, lft.C1)),
         np.block([[lft.D22, lft.D21], [lft.D12, lft.D11]]),
     )
-    states = used[ny:]
-    more = len(lft.A) - len(states)
-    marks = (
-        used[:ny],
-        np.ones(len(lft.C1), bool),
-        states,
-        np.zeros(max(more, 0), bool),
-    )
-    return plant_of(matrices, 0.0, np.concatenate(marks))
+    return plant_of(matrices, 0.0, reduction)

@@ -16,13 +16,14 @@ from fflin.base.errors import InputError, MissingPackageError
 from fflin.base.process import Progress, in_one_thread
 from fflin.base.validation import Array, ArrayLike, count, instance, whole
 from fflin.linear.model import Delay
-from fflin.tuning.channels import ends_of
+from fflin.tuning.channels import ends_of, signals_in_use
 from fflin.tuning.criteria import Piece
 from fflin.tuning.curves import GoalLoops
 from fflin.tuning.goals import Goal
 from fflin.tuning.hinf import hinf
-from fflin.tuning.law import Law
+from fflin.tuning.law import Law, Matrices
 from fflin.tuning.loop import sensor_delays, with_delayed_outputs
+from fflin.tuning.minimal import reduction_of
 from fflin.tuning.plant import Plant, Signals, plant_of, signals_of
 from fflin.tuning.points import Point, Points, points_of
 from fflin.tuning.problem import Case, Measure, Problem
@@ -242,14 +243,16 @@ class _Task:
         for measure in self.measures:
             if lin.dt and measure.ends is not None:
                 _require_slow(measure, lin.dt)
-        ny = len(lin.output_names)
-        self.used = np.zeros(ny + len(lin.state_names), bool)
-        self.used[list(measured)] = True
-        for measure in self.measures:
-            if measure.ends is not None:
-                for kind, index in (*measure.ends.sinks, *measure.ends.sources):
-                    if kind in ("output", "error", "sensor"):
-                        self.used[index] = True
+        used, inputs = signals_in_use(
+            [measure.ends for measure in self.measures],
+            measured,
+            commanded,
+            len(lin.output_names) + len(lin.state_names),
+        )
+        models = [
+            self._matrices(point) for point in (*points.fixed, *points.candidates)
+        ]
+        self.reduction = reduction_of(models, lin.dt, used, inputs)
         self.cases: dict[int, Case] = {}
         self.chosen: list[Point] = list(points.fixed)
         self.tight: Array = np.zeros(len(self.measures))
@@ -263,11 +266,11 @@ class _Task:
 
     def plant(self, point: Point) -> Plant:
         """Return the plant of a model."""
-        used = self.used
-        matrices = with_delayed_outputs(point.matrices, self.delays)
-        more = len(matrices[0]) + len(matrices[2]) - len(used)
-        used = np.append(used, np.zeros(max(more, 0), bool))
-        return plant_of(matrices, self.lin.dt, used)
+        return plant_of(self._matrices(point), self.lin.dt, self.reduction)
+
+    def _matrices(self, point: Point) -> Matrices:
+        """Return the matrices of a model with the delays of the measured outputs."""
+        return with_delayed_outputs(point.matrices, self.delays)
 
     def problem(self, objective: Sequence[int] | None = None) -> Problem:
         """Return the problem of the models that are chosen, and maybe of a few goals."""
@@ -526,7 +529,7 @@ class _Task:
         level = _objective_level(problem, [found.value for found in worst])
         uncertain = None
         if self.points.lft is not None:
-            uncertain = UncertainLoop(self.points.lft, law, self.used)
+            uncertain = UncertainLoop(self.points.lft, law, self.reduction)
         goals = []
         for found, measure in zip(worst, self.measures, strict=True):
             where = math.nan if found.piece is None else found.piece.where
@@ -564,6 +567,7 @@ class _Task:
             examined=len(self.examined),
             starts=starts,
             seconds=seconds,
+            remarks=self.reduction.remarks,
             history=np.exp(np.array(minimum.history).reshape(-1, 2)),
             parameter_history=np.array(
                 [problem.values(x)[0] for x in minimum.path]

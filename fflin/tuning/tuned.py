@@ -134,6 +134,9 @@ class Tuned(LinearController):
         them does not hold; infinite if no stable loop was found.
     seconds : float
         CPU time of the search [s].
+    remarks : tuple of str
+        Remarks on the plant, such as poles of the plant that do not decay and that no signal of
+        the law or the goals depends on.
     history : ndarray (k, 2)
         Largest value of the soft and of the hard goals in each step of the search, from the best
         start on. The values grow where worse models are added.
@@ -160,6 +163,7 @@ class Tuned(LinearController):
     examined: int
     starts: tuple[float, ...]
     seconds: float
+    remarks: tuple[str, ...]
     history: Array
     parameter_history: Array
     _loops: tuple[GoalLoops, ...]
@@ -189,6 +193,7 @@ class Tuned(LinearController):
             html.table(self._goal_rows(), "llrrrr"),
         ]
         parts += [html.paragraph(line) for line in self._range_lines()]
+        parts += [html.paragraph(note, "note") for note in self.remarks]
         parts.append(html.table(self._parameter_rows(), "lrl"))
         return html.result_card(self, *parts)
 
@@ -326,6 +331,8 @@ class Tuned(LinearController):
                 parts.append(folded([f"{goal.label}: {least}"]))
         if lines := self._range_lines():
             parts.append(folded(lines))
+        if self.remarks:
+            parts.append(folded(f"note: {note}" for note in self.remarks))
         return "\n\n".join((*parts, parameters, folded([search])))
 
     def record(self) -> dict[str, object]:
@@ -335,7 +342,7 @@ class Tuned(LinearController):
             for name in (
                 *("parameters", "units", "met", "factor", "relaxed", "conflict"),
                 "stationarity",
-                *("points", "examined", "starts", "seconds"),
+                *("points", "examined", "starts", "seconds", "remarks"),
             )
         }
         goals = [
