@@ -347,9 +347,9 @@ class Track(Goal):
     settling : float
         Time [s] after which the error stays within `within`.
     within : float
-        Largest error after the settling time, relative to the step.
+        Largest error after the settling time, as a fraction of the step; 0.05 is 5 %.
     overshoot : float
-        Largest overshoot, relative to the step.
+        Largest overshoot, as a fraction of the step.
     duration : float, optional
         Duration [s] that is examined; three settling times by default.
     hard : bool
@@ -357,7 +357,8 @@ class Track(Goal):
     Raises
     ------
     InputError
-        If a number is not positive, or the duration is not longer than the settling time.
+        If a number is not positive, `within` or `overshoot` is not less than 1, or the duration is
+        not longer than the settling time.
 
     Examples
     --------
@@ -373,8 +374,13 @@ class Track(Goal):
 
     def __post_init__(self) -> None:
         settling = positive("settling", self.settling, "s")
-        positive("within", self.within)
-        positive("overshoot", self.overshoot)
+        for key in ("within", "overshoot"):
+            fraction = positive(key, getattr(self, key))
+            if fraction >= 1.0:
+                raise InputError(
+                    f"{key} is {fraction:g}, expected a fraction of the step, less than 1; 0.05 is "
+                    "5 %"
+                )
         duration = self.examined
         if not positive("duration", duration, "s") > settling:
             raise InputError(

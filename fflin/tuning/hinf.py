@@ -29,7 +29,7 @@ from fflin.tuning.minimal import reduction_of
 from fflin.tuning.plant import Plant, plant_of, signals_of
 from fflin.tuning.reduction import truncations
 from fflin.tuning.structures import Names, indices, input_indices
-from fflin.tuning.tuned import matrices_of
+from fflin.tuning.tuned import matrices_of, rounded_up
 from fflin.tuning.verification import largest_in_band
 
 # Relative accuracy of the search, and relative sizes of added disturbances and outputs of states.
@@ -38,7 +38,7 @@ _ACCURACY, _SIZES = 1e-3, (0.0, 1e-6, 1e-4)
 # Largest relative excess of the norm of the closed loop over the level of its design.
 _EXCESS = 0.01
 
-# A reduced controller may have a norm larger by this factor if the goals do not hold.
+# Factor of the norm that messages propose for a reduced controller if the goals do not hold.
 _KEPT = 1.05
 
 # Largest level that is tried, and how many levels in a row may fail until the search ends.
@@ -117,20 +117,25 @@ class HInfinity(LinearController):
         order : int, optional
             Number of states. By default, the lowest order whose norm is at most `below`.
         below : float, optional
-            Largest norm of the loop; by default 1, so that all goals hold, or 1.05 `gamma` if they
-            do not hold with all states.
+            Largest norm of the loop; by default 1, so that all goals hold. It is required if the
+            goals do not hold with all states.
 
         Returns
         -------
         HInfinity
-            Controller of the lower order, with the norm of its loop; this controller if no lower
-            order keeps the norm.
+            Controller of the lower order, with the norm of its loop; this controller if its own
+            norm is at most `below`, but no lower order has such a norm.
 
         Raises
         ------
         InputError
-            If the loop with a controller of the given order is unstable or its norm is above
-            `below`, or if fewer states than `order` affect the goals.
+            If one of these conditions is true:
+
+            - the loop with a controller of the given order is unstable, or its norm is above
+              `below`;
+            - fewer states than `order` affect the goals;
+            - neither `order` nor `below` is given, and the goals do not hold with all states;
+            - `below` is less than `gamma`, and no lower order has such a norm.
 
         Examples
         --------
@@ -140,11 +145,18 @@ class HInfinity(LinearController):
         >>> policy.reduced().gamma <= 1.0
         True
         """
-        level = 1.0 if self.gamma <= 1.0 else _KEPT * self.gamma
+        level = 1.0
         if below is not None:
             level = positive("below", below)
         elif order is not None:
             level = math.inf
+        elif self.gamma > level:
+            kept = rounded_up(_KEPT * self.gamma)
+            raise InputError(
+                f"the goals do not hold with all {self.order} states, whose norm is "
+                f"{self.gamma:.4g}; give the largest norm of the reduced controller, such as "
+                f"below={kept}"
+            )
         if order is not None:
             whole("order", order, 0, max(self.order - 1, 0))
         design = self._design
@@ -164,8 +176,14 @@ class HInfinity(LinearController):
             if norm is not None and norm <= level:
                 lower = design._replace(law=law, gamma=norm)
                 return HInfinity(lower, self.lin)
-        if order is None:
+        if order is None and self.gamma <= level:
             return self
+        if order is None:
+            raise InputError(
+                f"below is {level:g}, but the controller with all {self.order} states has the norm "
+                f"{self.gamma:.4g}, and no lower order a norm of {level:g}; give "
+                f"below={rounded_up(self.gamma)} or more"
+            )
         limit = f" or has a norm above {level:.4g}" if math.isfinite(level) else ""
         raise InputError(
             f"the loop with the controller of order {order} is unstable{limit}; give a higher "

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from itertools import chain
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,6 +28,35 @@ _SIZES = -0.5, 1.5
 # Weights that make the equations of a regulator solvable, relative to the others.
 _SMALL = 1e-6
 
+# Hard goals hold if they exceed their limits by less than this number, in the logarithm.
+_HOLDS = 1e-6
+
+# Starts reached the best value if their value is larger by at most this factor.
+_NEAR = 1.01
+
+
+class Start(NamedTuple):
+    """Largest value of the soft goals at the end of a start, or of the missed hard goals.
+
+    The value is infinite if no stable loop was found.
+    """
+
+    value: float
+    holds: bool
+
+
+def reached(starts: Sequence[Start]) -> int:
+    """Return how many starts reached the best value within 1 %."""
+    if not starts:
+        return 0
+    best = min(starts, key=lambda start: (not start.holds, start.value))
+    return sum(
+        start.holds == best.holds
+        and math.isfinite(start.value)
+        and start.value <= _NEAR * best.value
+        for start in starts
+    )
+
 
 def searched(
     problem: Problem,
@@ -38,8 +68,11 @@ def searched(
     first: Array | None = None,
     others: Sequence[Array] = (),
     target: float = -math.inf,
-) -> tuple[Minimum | None, tuple[float, ...]]:
+) -> tuple[Minimum | None, tuple[Start, ...]]:
     """Search from several starts, and return the best result and the values of all.
+
+    The best result is the one with the least soft value among those whose hard goals hold. If there
+    is none, it is the one whose hard goals are missed least.
 
     The first start of a law with states is the best law with one state less, so that a law of a
     higher order is never worse. `first` is another point for the first start. `others` are further
@@ -49,12 +82,12 @@ def searched(
     total = starts + len(others)
     screening = min(steps, _SCREENING) if total > 1 else steps
     best: Minimum | None = None
-    values = []
+    values: list[Start] = []
     every = chain(others, _starts(problem, starts, steps, seed, say, first))
     for number, start in enumerate(every):
         x = None if start is None else stabilised(problem, start)
         on_step = step_texts(say, f"start {number + 1} of {total}")
-        value = math.inf
+        end = Start(math.inf, False)
         if x is not None:
             minimum = minimise(
                 problem.evaluate,
@@ -64,13 +97,11 @@ def searched(
                 target=target,
                 on_step=on_step,
             )
-            value = math.exp(minimum.objective)
-            if minimum.violation > 0.0:
-                value = max(value, math.exp(minimum.violation))
+            end = _end_of(minimum)
             if best is None or _is_better(minimum, best):
                 best = minimum
-        values.append(value)
-        if value <= math.exp(target):
+        values.append(end)
+        if end.holds and end.value <= math.exp(target):
             return best, tuple(values)
     if best is not None and best.steps == _SCREENING and steps > _SCREENING:
         on_step = step_texts(say, "best start")
@@ -226,10 +257,16 @@ def _regulator_gain(problem: Problem, rng: np.random.Generator | None) -> Array 
     return projected
 
 
+def _end_of(minimum: Minimum) -> Start:
+    """Return the value of a result, and whether its hard goals hold."""
+    if minimum.violation <= _HOLDS:
+        return Start(math.exp(minimum.objective), True)
+    return Start(math.exp(minimum.violation), False)
+
+
 def _is_better(minimum: Minimum, other: Minimum) -> bool:
-    """Return whether a result is better; one that violates hard goals less is better."""
-    least = 1e-6
-    largest = max(minimum.violation, other.violation)
-    if largest > least and abs(minimum.violation - other.violation) > least:
-        return minimum.violation < other.violation
-    return minimum.objective < other.objective
+    """Return whether a result is better: first its hard goals, then its value."""
+    end, known = _end_of(minimum), _end_of(other)
+    if end.holds != known.holds:
+        return end.holds
+    return end.value < known.value

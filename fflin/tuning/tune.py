@@ -29,7 +29,7 @@ from fflin.tuning.points import Point, Points, points_of
 from fflin.tuning.problem import Case, Measure, Problem
 from fflin.tuning.robust import UncertainLoop
 from fflin.tuning.search import Minimum, minimise
-from fflin.tuning.starts import searched, stabilised, step_texts
+from fflin.tuning.starts import Start, reached, searched, stabilised, step_texts
 from fflin.tuning.structures import Structure, Structured
 from fflin.tuning.tuned import GoalValue, Tuned, is_active, with_check
 from fflin.tuning.verification import peak_above, second_value
@@ -280,7 +280,7 @@ class _Task:
 
     def first(
         self, search: _Search, start: Mapping[str, float] | None
-    ) -> tuple[Problem, Minimum, tuple[float, ...]]:
+    ) -> tuple[Problem, Minimum, tuple[Start, ...]]:
         """Search from several starts, and return the best result and the values of all."""
         problem = self.problem()
         given = None if start is None else problem.given(start)
@@ -521,7 +521,7 @@ class _Task:
         return _Solution(problem, start, figures, _largest(figures), start.x)
 
     def result(
-        self, solution: _Solution, starts: tuple[float, ...], seconds: float
+        self, solution: _Solution, starts: tuple[Start, ...], seconds: float
     ) -> Tuned:
         """Return the tuned law with its report."""
         problem, minimum, worst = solution[:3]
@@ -565,7 +565,8 @@ class _Task:
             stationarity=minimum.stationarity,
             points=tuple(dict(point.parameters) for point in self.chosen),
             examined=len(self.examined),
-            starts=starts,
+            starts=tuple(start.value for start in starts),
+            reached=reached(starts),
             seconds=seconds,
             remarks=self.reduction.remarks,
             history=np.exp(np.array(minimum.history).reshape(-1, 2)),

@@ -131,7 +131,11 @@ class Tuned(LinearController):
         Number of models at which the goals were evaluated at the end.
     starts : tuple of float
         Largest value of the soft goals at the end of each start, or of the hard goals if one of
-        them does not hold; infinite if no stable loop was found.
+        them does not hold; infinite if no stable loop was found. If all goals are hard, their
+        largest value.
+    reached : int
+        Number of starts that reached the best value within 1 %. Starts whose hard goals hold are
+        better than all others.
     seconds : float
         CPU time of the search [s].
     remarks : tuple of str
@@ -162,6 +166,7 @@ class Tuned(LinearController):
     points: tuple[Mapping[str, float], ...]
     examined: int
     starts: tuple[float, ...]
+    reached: int
     seconds: float
     remarks: tuple[str, ...]
     history: Array
@@ -308,11 +313,9 @@ class Tuned(LinearController):
 
     def report(self) -> str:
         """Return the report: goals with their values, parameters and figures of the search."""
-        finite = [value for value in self.starts if math.isfinite(value)]
-        near = sum(value <= 1.01 * min(finite) for value in finite) if finite else 0
         search = (
-            f"{counted(len(self.starts), 'start')}, of which {near} reached the best value within "
-            f"1 %; stationarity {self.stationarity:.1e}; "
+            f"{counted(len(self.starts), 'start')}, of which {self.reached} reached the best value "
+            f"within 1 %; stationarity {self.stationarity:.1e}; "
             f"{counted(len(self.points), 'model')} in the search, {self.examined} examined"
         )
         rows = cut(self._fitting_rows(), "see goals")
@@ -342,7 +345,7 @@ class Tuned(LinearController):
             for name in (
                 *("parameters", "units", "met", "factor", "relaxed", "conflict"),
                 "stationarity",
-                *("points", "examined", "starts", "seconds", "remarks"),
+                *("points", "examined", "starts", "reached", "seconds", "remarks"),
             )
         }
         goals = [

@@ -268,6 +268,9 @@ def test_what_cannot_be_tuned_is_refused(key, stiff):
         (lambda: fflin.Margin(2.5), "disk"),
         (lambda: fflin.Damping(1.5), "ratio"),
         (lambda: fflin.Track("y", 10.0, duration=5.0), "duration"),
+        (lambda: fflin.Track("y", 10.0, within=5), "within is 5.*0.05 is 5 %"),
+        (lambda: fflin.Track("y", 10.0, within=1.0), "within is 1"),
+        (lambda: fflin.Track("y", 10.0, overshoot=20), "overshoot is 20.*0.05 is 5 %"),
         (lambda: fflin.Variance("u", {"y": 1.0}), "inputs"),
         (lambda: fflin.Tunable(3.0, least=4.0), "value"),
         (lambda: fflin.Tunable(least=4.0, largest=1.0), "bounds"),
@@ -345,6 +348,28 @@ def test_a_reduced_controller_may_have_a_given_order_or_norm(optimal):
         optimal.reduced(0)
     with pytest.raises(fflin.InputError, match="order"):
         optimal.reduced(10)
+
+
+def test_no_norm_below_that_of_full_order_is_promised(optimal):
+    least = rf"{optimal.gamma:.4g}, and no lower order .*; give below=0.0"
+    with pytest.raises(fflin.InputError, match=least) as error:
+        optimal.reduced(below=0.5 * optimal.gamma)
+    proposed = float(str(error.value).split("below=")[1].split()[0])
+    assert optimal.gamma <= proposed < 1.001 * optimal.gamma
+    assert optimal.reduced(below=proposed).gamma <= proposed
+
+
+def test_the_norm_is_required_if_goals_do_not_hold_with_all_states(stiff):
+    pytest.importorskip("slycot")
+    goal = fflin.MaxGain({"tau_b": 0.01, "q_b": 1e-3}, {"q_b": 1e-4, "tau_b": 1e-2})
+    full = fflin.hinf(fflin.linearize(stiff), goal, measured="q_b")
+    assert full.gamma > 1.0
+    with pytest.raises(fflin.InputError, match=r"do not hold .*below=") as error:
+        full.reduced()
+    proposed = float(str(error.value).split("below=")[1])
+    assert full.gamma < proposed
+    reduced = full.reduced(below=proposed)
+    assert reduced.gamma <= proposed and reduced.order <= full.order
 
 
 @pytest.mark.exhaustive
