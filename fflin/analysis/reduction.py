@@ -375,8 +375,34 @@ def ignorable_wheels(lin: LinearModel) -> tuple[Indices, Indices]:
     return wheels[angle_is_ignorable], wheels[angle_is_ignorable & speed_is_ignorable]
 
 
-def removed_wheels(lin: LinearModel, wheel_speeds: bool | None) -> Indices:
-    """Return the indices (k,) of the wheels that a design does not regulate (9.5)."""
+def _wheels_carried_along_orbit(lin: LinearModel) -> Indices:
+    """Return the wheels whose speeds affect other states only because the base turns with an orbit.
+
+    The result is empty if the robot moves relative to the axes of the orbit, apart from its wheels.
+    """
+    # The torque of such a wheel on its body is the product of the orbital rate and the wheel's
+    # momentum. It is a slow disturbance of the attitude: a law that does not control the momentum
+    # compensates it. The momentum then keeps its magnitude and turns relative to the body, once in
+    # each revolution of the orbit.
+    angles, free = ignorable_wheels(lin)
+    coupled = np.setdiff1d(angles, free)
+    nv = len(lin.M)
+    names = lin.state_names[nv : 2 * nv]
+    still = [name.removeprefix("qdot_m.") not in lin.wheels for name in names]
+    if not lin.mean_motion or lin.x0[nv : 2 * nv][still].any():
+        return coupled[:0]
+    # Friction acts on the wheel itself.
+    damping = mechanics.second_order(lin).D.values
+    return coupled[[not damping[wheel, wheel] for wheel in coupled]]
+
+
+def removed_wheels(
+    lin: LinearModel, wheel_speeds: bool | None, *, carried: bool = False
+) -> Indices:
+    """Return the indices (k,) of the wheels that a design does not regulate (9.5).
+
+    If `carried` is true, they include wheels that only the orbital rate couples to other states.
+    """
     # The angles and speeds of the wheels in `free` do not affect the other states, so these wheels
     # can be removed. Without `wheel_speeds`, all of them are removed. With `wheel_speeds`, a design
     # regulates as many of them as the inputs can spin independently without a net force on the
@@ -386,16 +412,19 @@ def removed_wheels(lin: LinearModel, wheel_speeds: bool | None) -> Indices:
         raise InputError(
             f"wheel_speeds is {wheel_speeds!r}, expected True, False or None"
         )
-    _, free = ignorable_wheels(lin)
-    if not len(free):
-        return free
     source = lin.generator or lin
+    _, free = ignorable_wheels(lin)
+    slow = _wheels_carried_along_orbit(source) if carried else free[:0]
+    if not len(free) + len(slow):
+        return free
     if wheel_speeds is None:
         names = lin.state_names[: len(lin.M)]
         attitude = [name.startswith("q_b.") for name in names]
         torques_on_robot = mechanics.second_order(source).S.values[attitude]
         wheel_speeds = bool(torques_on_robot.any())
     if not wheel_speeds:
+        return np.union1d(free, slow).astype(np.intp)
+    if not len(free):
         return free
     # Combinations of inputs (nu, k) without a force on the rigid motions of the other bodies.
     forces = rigid_forces(without(source, free))
@@ -433,8 +462,8 @@ def regulated_part(lin: LinearModel, wheel_speeds: bool | None = None) -> Linear
     base = unpushed_positions(lin)
     if not (len(base) or wheel_inputs(lin) or lin.wheels):
         return lin
-    removed = np.union1d(base, removed_wheels(lin, wheel_speeds)).astype(np.intp)
-    part = without(lin, removed)
+    removed = np.union1d(base, removed_wheels(lin, wheel_speeds, carried=True))
+    part = without(lin, removed.astype(np.intp))
     angles = {lin.state_names[i] for i in ignorable_wheels(lin)[0]}
     rest = [name for name in part.state_names if name not in angles]
     if len(rest) == len(part.M):

@@ -8,8 +8,9 @@ from functools import partial
 
 import numpy as np
 
-from fflin.base.errors import InputError
-from fflin.base.validation import Array, Mask
+from fflin.analysis.reduction import regulated_part
+from fflin.base.errors import InputError, StabilizabilityError
+from fflin.base.validation import Array, Indices, Mask
 from fflin.control.loop_margins import ChannelMargins, Margins, Place
 from fflin.control.optimal.channel_limits import (
     Crossing,
@@ -103,7 +104,9 @@ class ClosedLoop:
 
     def kept_states(self, model: LinearModel, C: Array) -> list[int]:
         """Return the indices of the states of the plant; C has the rows of the used signals."""
-        return _joined(model.A, model.B, C)
+        judged = judged_states(model, C)
+        A, B, C = model.A[np.ix_(judged, judged)], model.B[judged], C[:, judged]
+        return [int(judged[index]) for index in _joined(A, B, C)]
 
     @property
     def is_continuous_plant(self) -> bool:
@@ -440,6 +443,25 @@ def _sampling_time(law: System, lin: LinearModel, sample: float | None) -> float
             "continuous model, and a sample time only for a continuous law"
         )
     return longest
+
+
+def judged_states(model: LinearModel, C: Array) -> Indices:
+    """Return the indices of the states that decide about the stability of a loop.
+
+    A law that measures only ``C x`` leaves the states outside of the regulated part alone if C has
+    no entry for them. Examples are the position in orbit, the angles of wheels, and a momentum that
+    turns with the orbit. They would be neutral modes of the loop.
+    """
+    names = model.state_names
+    for wheel_speeds in (False, True):
+        try:
+            part = regulated_part(model, wheel_speeds)
+        except StabilizabilityError:
+            continue
+        kept = np.isin(names, part.state_names)
+        if not C[:, ~kept].any():
+            return np.flatnonzero(kept)
+    return np.arange(len(names))
 
 
 def _joined(A: Array, B: Array, C: Array) -> list[int]:

@@ -99,7 +99,9 @@ def lqr(
 
     - the position and velocity of the base, along axes in which no input pushes the base;
     - wheel angles, which are ignorable;
-    - wheel speeds, if only wheels rotate the body, because the body's rate then determines them.
+    - wheel speeds, if only wheels rotate the body, because the body's rate then determines them. In
+      orbit, the momentum of such wheels turns relative to the body. Its small torque is a
+      disturbance of the attitude, unless `wheel_speeds` is True.
 
     Parameters
     ----------

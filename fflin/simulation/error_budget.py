@@ -28,7 +28,7 @@ from fflin.base.validation import (
     truth,
     vector,
 )
-from fflin.control.closed_loop import ClosedLoop
+from fflin.control.closed_loop import ClosedLoop, judged_states
 from fflin.control.data_sheet import output_keys
 from fflin.control.gain import Gain
 from fflin.control.lags import (
@@ -704,16 +704,19 @@ class DisturbedLoop(ClosedLoop):
         self._source = model
         self._forces, self._force_inputs = _forces_of(model)
         attitude = [model.state_names.index(name) for name in _ATTITUDE]
+        judged = np.zeros(len(model.A), dtype=bool)
+        judged[judged_states(model, C)] = True
+        A = np.where(np.outer(judged, judged), model.A, 0.0)
         reached: Mask = np.any(model.B, axis=1)
         for key in self._acting:
             at = self._signals("force", key, self._forces)
             reached = reached | self._force_inputs[:, at].any(axis=1)
         seen: Mask = np.any(C, axis=0)
         seen[attitude] = True
-        for _ in model.A:
-            reached = reached | model.A[:, reached].any(axis=1)
-            seen = seen | model.A[seen].any(axis=0)
-        kept: Mask = reached & seen
+        for _ in A:
+            reached = reached | A[:, reached].any(axis=1)
+            seen = seen | A[seen].any(axis=0)
+        kept: Mask = reached & seen & judged
         kept[attitude] = True
         self._kept = np.flatnonzero(kept).tolist()
         return self._kept
