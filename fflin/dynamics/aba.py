@@ -111,7 +111,7 @@ class Aba:
     def terms(self, q: Array, v: Array, u: Array) -> Array:
         """Return, for each entry of dnu/dt (6 + n,), the sum of the magnitudes of its terms.
 
-        The sum excludes the gravity gradient, and gyroscopic torques of wheels without inertia.
+        The sum excludes gyroscopic torques of wheels without inertia.
         """
         state, data = self.state, self._data
         M = state.project(pin.crba(self._model, data, q).T)
@@ -122,6 +122,9 @@ class Aba:
             + np.abs(bias)
             + np.abs(self._passive_force(q, v))
         )
+        if self.field:
+            pin.forwardKinematics(self._model, data, q)
+            forces += self.field.force_sizes(data, M)
         total: Array = np.abs(np.linalg.inv(M)) @ forces
         return total
 

@@ -255,6 +255,39 @@ class OrbitField:
         total: Array = (J.mT @ wrench).sum(axis=0)
         return total
 
+    @property
+    def strength(self) -> float:
+        """Bound of the accelerations per unit distance [1/s^2] that the frame adds, see (14.1).
+
+        The gravity gradient, the centrifugal acceleration and the Euler acceleration count by
+        their magnitudes, because they may cancel each other.
+        """
+        gravity = float(np.linalg.norm(self.tide, 2))
+        turning = float(self.rate @ self.rate)
+        return gravity + turning + float(np.linalg.norm(self.rate_change))
+
+    def force_sizes(self, data: pin.Data, M: Array) -> Array:
+        """Bound the generalised forces (6 + n,) of the frame by the Cauchy-Schwarz inequality.
+
+        The force of coordinate i is an integral of accelerations K x times dx/dq_i over the mass,
+        and M_ii (6 + n, 6 + n) is the integral of the square of dx/dq_i. `data` contains the
+        placements of the bodies.
+        """
+        reach = math.sqrt(self._weighted(data, np.eye(3)))
+        sizes: Array = self.strength * reach * np.sqrt(M.diagonal())
+        return sizes
+
+    def derivative_sizes(self, M: Array) -> tuple[Array, Array]:
+        """Return sizes of the derivatives of the forces of the frame with respect to q and v.
+
+        They are bounds of the integrals of (dx/dq_i)^T K dx/dq_j and of the Coriolis terms, as in
+        `force_sizes`. The results are (6 + n, 6 + n).
+        """
+        root = np.sqrt(M.diagonal())
+        product = np.outer(root, root)
+        coriolis = 2.0 * float(np.linalg.norm(self.rate))
+        return self.strength * product, coriolis * product
+
     def near(self, q: Array, v: Array) -> tuple[Array, Array]:
         """Return q with q[:3] = 0, and the inertial v with zero linear velocity of the base.
 

@@ -178,6 +178,9 @@ class Route:
         # generalised forces.
         weights = np.abs(inverse)
         terms_A = np.vstack((sums_A[:nv], weights @ np.abs(self.M @ A[nv:])))
+        if self.aba.field:
+            # In orbit, the terms of the rotating frame may cancel, for example those of a wheel.
+            terms_A[nv:] += weights @ np.hstack(self.aba.field.derivative_sizes(self.M))
         terms_B = np.vstack((sums_B[:nv], weights @ np.abs(self.M @ B[nv:])))
         # Rounding errors of the model's constants, such as the placements of joints, do not change
         # with the operating point. They change the entries of M, relative to these entries.

@@ -9,6 +9,7 @@ import pinocchio as pin
 import pytest
 
 import fflin
+from fflin.linear.check import References
 from fflin.linear.equilibrium import on_orbit
 from tests.support.orbits import N, in_orbit
 from tests.support.robots import free_body, random_pose
@@ -306,3 +307,63 @@ def test_a_held_attitude_checks_though_its_inputs_are_rounding(name):
         f0 = lin.f0.copy()
         f0[6] += 0.1 * robot.orbit.mean_motion**2
         assert not fflin.check(robot, replace(lin, f0=f0)).ok
+
+
+def failed_blocks(references, lin):
+    """The blocks in which a model differs from the independent computations."""
+    return {row.block for row in references.rows(lin) if not row.ok}
+
+
+def balanced_satellite():
+    """A body with three wheels and two equal wings, with principal axes in the orbital axes."""
+    axes = np.eye(3).tolist()
+    wheels = [fflin.ReactionWheel(axis, inertia=0.012) for axis in axes]
+    wings = [
+        fflin.FlexibleAppendage(
+            "base", [0.4], [[0], [0], [1.9]], [[side], [0], [0]], name=name
+        )
+        for name, side in (("left", 3.6), ("right", -3.6))
+    ]
+    body = free_body((48.0, 28.0, 55.0))
+    return fflin.from_model(
+        body.model, appendages=wings, inputs=wheels, orbit=fflin.CircularOrbit(550e3)
+    )
+
+
+def test_terms_of_an_orbit_that_cancel_are_compared_by_their_magnitudes():
+    """By symmetry, the terms of the wheels and of the base at its orbit cancel to rounding."""
+    robot = balanced_satellite()
+    lin = fflin.linearize(robot)
+    n2 = robot.orbit.mean_motion**2
+    assert np.abs(lin.f0).max() < 1e-9 * n2
+    references = References(robot, lin)
+    errors = {row.block: row.error for row in references.rows(lin)}
+    assert not failed_blocks(references, lin)
+    assert max(errors["f0[v_b]"], errors["f0[omega_b]"]) < 1e-12
+    # A part of 1e-6 of the terms of the orbit is detected in every block of accelerations.
+    groups = fflin.StateMap(robot).groups._asdict()
+    for row in ("omega_b", "v_b", "qdot_m"):
+        f0 = lin.f0.copy()
+        f0[groups[row]] += 1e-6 * n2
+        assert failed_blocks(references, replace(lin, f0=f0)) == {f"f0[{row}]"}
+    wheel = lin.state_names.index("qdot_m.wheel_2")
+    A = lin.A.copy()
+    A[wheel, lin.state_names.index("q_m.wheel_2")] += 1e-6 * n2
+    assert failed_blocks(references, replace(lin, A=A)) == {"A[qdot_m, q_m]"}
+
+
+def test_flipped_sign_of_the_gravity_gradient_is_detected():
+    robot = balanced_satellite()
+    q = fflin.configuration(robot, rpy=(4.0, -3.0, 5.0))
+    lin = fflin.linearize(robot, q)
+    free = fflin.linearize(robot.replace(orbit=None), q)
+    groups = fflin.StateMap(robot).groups
+    references = References(robot, lin)
+    assert not failed_blocks(references, lin)
+    gradient = (lin.A - free.A)[groups.omega_b, groups.q_b]
+    A = lin.A.copy()
+    A[groups.omega_b, groups.q_b] -= 2.0 * gradient
+    assert failed_blocks(references, replace(lin, A=A)) == {"A[omega_b, q_b]"}
+    f0 = lin.f0.copy()
+    f0[groups.omega_b] *= -1.0
+    assert failed_blocks(references, replace(lin, f0=f0)) == {"f0[omega_b]"}
