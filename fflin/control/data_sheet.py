@@ -8,14 +8,19 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from fflin.base.errors import InputError, listed, require_known
+from fflin.base.errors import InputError, listed
 from fflin.base.names import by_name, stands_for_any
 from fflin.base.validation import Array, instance, quantity
 from fflin.control.sensors import sensors_of_model
 from fflin.control.weights import Weight
 from fflin.linear.model import LinearModel
 from fflin.robot.outputs import Output, SensorError, StarTracker
-from fflin.robot.sensor_figures import BIAS_FIGURES, NOISE_FIGURES, Figure
+from fflin.robot.sensor_figures import (
+    BIAS_FIGURES,
+    NOISE_FIGURES,
+    Figure,
+    checked_figure,
+)
 
 # An intensity or a covariance, or one figure of a data sheet such as {"angle_random_walk": 0.1}.
 Sheet: TypeAlias = "float | Mapping[str, float]"
@@ -196,18 +201,5 @@ def _squared(
     what: str, given: Mapping[str, float], unit: str, known: Mapping[str, Figure]
 ) -> tuple[Figure, float]:
     """Return the figure of a data sheet, and its square in SI units."""
-    require_known(f"part of {what}", given, tuple(known))
-    if len(given) != 1:
-        raise InputError(
-            f"{what} has {len(given)} figures, expected one, such as {{'{next(iter(known))}': 0.1}}"
-        )
-    ((name, value),) = given.items()
-    figure = known[name]
-    factor = figure.factors.get(unit)
-    if factor is None:
-        units = " or ".join(figure.factors)
-        raise InputError(
-            f"{what} has the figure {name}, which is for outputs in {units}, but the unit of the "
-            f"output is {unit}"
-        )
-    return figure, (factor * quantity(f"{name} in {what}", value, figure.unit)) ** 2
+    figure, value = checked_figure(what, given, [unit], known)
+    return figure, (figure.factors[unit] * value) ** 2

@@ -4,14 +4,14 @@ Reference axes are the axes of the reference placement. The state is relative to
 module `fflin.dynamics.outputs` computes the outputs and their derivatives.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import ClassVar, TypeAlias
 
 from fflin.base.errors import InputError, require_known
 from fflin.base.shown import shown_fields
 from fflin.base.validation import number, positive
-from fflin.robot.sensor_figures import BIAS_FIGURES, NOISE_FIGURES
+from fflin.robot.sensor_figures import BIAS_FIGURES, NOISE_FIGURES, checked_figure
 
 # Standard deviation, or one figure of a data sheet such as {"angle_random_walk": 0.1}.
 SensorError: TypeAlias = float | Mapping[str, float]
@@ -42,6 +42,8 @@ class Output:
     WORD: ClassVar[str]
     # (name, unit) of each measured vector (3,); empty if the components of the output are states.
     VECTORS: ClassVar[tuple[tuple[str, str], ...]] = ()
+    # Units of the components if they are states; empty if the units depend on the robot.
+    UNITS: ClassVar[tuple[str, ...]] = ()
     # Whether the output depends on accelerations, and therefore on the inputs.
     FEELS_ACCELERATION: ClassVar[bool] = False
 
@@ -73,7 +75,8 @@ class Output:
             if value is None:
                 continue
             if isinstance(value, Mapping):
-                require_known(f"part of {name} of {self.WORD}", value, figures)
+                units = [unit for _, unit in self.VECTORS] or self.UNITS
+                checked_figure(f"'{name}' of {self.WORD}", value, units, figures)
                 object.__setattr__(self, name, dict(value))
             else:
                 given = positive(f"{name} of {self.WORD}", value)
@@ -146,22 +149,27 @@ class BasePose(Output):
     """
 
     WORD = "base"
+    UNITS = "1", "m"
+
+
+def _names(field: str, value: object, example: str) -> tuple[str, ...]:
+    """Return a field as a tuple of names; a single name is a tuple of one."""
+    names = [value] if isinstance(value, str) else value
+    if isinstance(names, Sequence) and all(isinstance(name, str) for name in names):
+        return tuple(names)
+    raise InputError(f'{field} is {value!r}, expected names such as ["{example}"]')
 
 
 @dataclass(frozen=True, repr=False)
 class JointOutput(Output):
     """Base class of joint outputs, for chosen joints or by default for all joints."""
 
-    joints: tuple[str, ...] | None = None
+    joints: str | tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        # Refuse a string, because it would be read as a sequence of names with one letter each.
-        if isinstance(self.joints, str):
-            given = repr(self.joints)
-            raise InputError(
-                f"joints is {given}, expected a tuple of names: write ({given},)"
-            )
+        if self.joints is not None:
+            object.__setattr__(self, "joints", _names("joints", self.joints, "wheel_*"))
 
 
 class JointPositions(JointOutput):
@@ -169,7 +177,7 @@ class JointPositions(JointOutput):
 
     Parameters
     ----------
-    joints : tuple of str, optional
+    joints : str or tuple of str, optional
         Names of independent joints, or patterns, in the order of the outputs. The default is all
         independent joints in state order.
 
@@ -188,7 +196,7 @@ class JointVelocities(JointOutput):
 
     Parameters
     ----------
-    joints : tuple of str, optional
+    joints : str or tuple of str, optional
         Names of independent joints, or patterns, in the order of the outputs. The default is all
         independent joints in state order.
 
@@ -339,6 +347,7 @@ class StarTracker(Output):
     """
 
     WORD = "star_tracker"
+    UNITS = ("1",)
 
 
 class Gyroscope(FrameOutput):
@@ -424,7 +433,7 @@ class ConstraintForce(Output):
     ----------
     name : str
         Name of the constraint.
-    components : tuple of str, optional
+    components : str or tuple of str, optional
         Components, such as ``("force.x", "torque.z")``; all six by default.
 
     Examples
@@ -439,20 +448,20 @@ class ConstraintForce(Output):
     FEELS_ACCELERATION = True
 
     name: str
-    components: tuple[str, ...] | None = None
+    components: str | tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
-        given = self.components
-        if given is not None and not isinstance(given, tuple | list):
-            raise InputError(
-                f"components is {given!r}, expected a tuple of names such as ('force.x',)"
-            )
+        if self.components is not None:
+            names = _names("components", self.components, "force.x")
+            object.__setattr__(self, "components", names)
         require_known("component of a constraint force", self.chosen, FORCES)
 
     @property
     def chosen(self) -> tuple[str, ...]:
         """Names of the components, such as force.x."""
-        return tuple(FORCES) if self.components is None else self.components
+        if self.components is None:
+            return tuple(FORCES)
+        return _names("components", self.components, "force.x")
 
     @property
     def signals(self) -> list[tuple[str, str]]:

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import NamedTuple
+
+from fflin.base.errors import InputError, require_known
+from fflin.base.validation import quantity
 
 _DEGREE = math.pi / 180.0
 _HOUR = 3600.0
@@ -45,3 +48,33 @@ BIAS_FIGURES = {
     "bias_instability": Figure("deg/h", {"rad/s": _DEGREE / _HOUR**1.5}),
     "rate_random_walk": Figure("deg/h/sqrt(h)", {"rad/s": _DEGREE / _HOUR**1.5}),
 }
+
+
+def checked_figure(
+    what: str,
+    given: Mapping[str, float],
+    units: Iterable[str],
+    known: Mapping[str, Figure],
+) -> tuple[Figure, float]:
+    """Return the figure of a data sheet and its value; `units` are the units of the output.
+
+    Raise `InputError` if several figures are given, the value is not positive, or the figure is for
+    outputs with other units.
+    """
+    require_known(f"part of {what}", given, tuple(known))
+    if len(given) != 1:
+        raise InputError(
+            f"{what} has {len(given)} figures, expected one, such as {{'{next(iter(known))}': 0.1}}"
+        )
+    ((name, value),) = given.items()
+    figure = known[name]
+    for unit in units:
+        if unit in figure.factors:
+            continue
+        fitting = [key for key, other in known.items() if unit in other.factors]
+        expected = f"; give {' or '.join(fitting)}" if fitting else ""
+        raise InputError(
+            f"{what} has the figure '{name}', which is for outputs in "
+            f"{' or '.join(figure.factors)}, but the unit of the output is {unit}{expected}"
+        )
+    return figure, quantity(f"'{name}' in {what}", value, figure.unit)

@@ -171,9 +171,9 @@ def test_wrong_properties_of_sensors_are_refused():
         fflin.Gyroscope("base", delay=-1.0)
     with pytest.raises(fflin.InputError, match="noise of star_tracker is -1"):
         fflin.StarTracker(noise=-1.0)
-    _, lin = satellite([fflin.StarTracker(noise={"angle_random_walk": 1.0})])
-    with pytest.raises(fflin.InputError, match="noise of output 'q_b\\.x' has"):
-        fflin.kalman(lin, W)
+    message = "for outputs in rad/s, but .* output is 1; give noise_equivalent_angle"
+    with pytest.raises(fflin.InputError, match=message):
+        fflin.StarTracker(noise={"angle_random_walk": 1.0})
 
 
 def test_continuous_designs_with_slow_sensors_are_refused():

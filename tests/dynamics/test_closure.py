@@ -1,5 +1,7 @@
 """Closing of constraints."""
 
+import re
+
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -144,13 +146,13 @@ def test_inertial_space_is_refused_in_orbit():
             "no constraint named 'clamp'",
         ),
         (
-            lambda: fflin.ConstraintForce("clamp", "force.x"),
-            "expected a tuple of names",
+            lambda: fflin.ConstraintForce("clamp", 3),
+            'components is 3, expected names such as ["force.x"]',
         ),
     ],
 )
 def test_a_wrong_value_is_refused(item, message):
-    with pytest.raises(fflin.FflinError, match=message.replace("(", r"\(")):
+    with pytest.raises(fflin.FflinError, match=re.escape(message)):
         item()
 
 

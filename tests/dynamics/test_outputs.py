@@ -524,11 +524,6 @@ def test_an_impossible_value_is_refused(outputs, error, message):
         Sensing(StateMap(fflin.load("servicer_7dof")), outputs)
 
 
-def test_joints_are_a_tuple_of_names():
-    with pytest.raises(fflin.InputError, match="'joint_1'"):
-        JointVelocities("joint_1")
-
-
 def test_relative_pose_of_a_planar_arm_in_closed_form():
     """A joint about y, seen from the one before it."""
     robot = fflin.load("planar_detumble")

@@ -1,5 +1,6 @@
 """C, D and y0 in the chart and the frame: by `check`, by laws, and that `check` can fail."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -207,10 +208,50 @@ def test_reports_of_a_robot_show_the_pulses_of_thrusters():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"noise": {"noise_equivalent_angel": 8.0}}, "part of noise of star_tracker"),
-        ({"bias": {"angle_random_walk": 0.1}}, "part of bias of star_tracker"),
+        ({"noise": {"noise_equivalent_angel": 8.0}}, "part of 'noise' of star_tracker"),
+        ({"bias": {"angle_random_walk": 0.1}}, "part of 'bias' of star_tracker"),
     ],
 )
 def test_unknown_figures_of_a_data_sheet_are_refused(arguments, message):
     with pytest.raises(fflin.UnknownNameError, match=message):
         fflin.StarTracker(**arguments)
+
+
+@pytest.mark.parametrize(
+    ("figure", "message"),
+    [
+        (
+            "noise = { noise_equivalent_angle = -8.0 }",
+            "'noise_equivalent_angle' in 'noise' of star_tracker is -8 arc seconds, expected more",
+        ),
+        (
+            "noise = { angle_random_walk = 0.01 }",
+            "'angle_random_walk', which is for outputs in rad/s, but the unit",
+        ),
+        (
+            "bias = { bias_instability = 0.5 }",
+            "'bias_instability', which is for outputs in rad/s",
+        ),
+    ],
+)
+def test_a_wrong_figure_in_a_robot_file_is_refused_with_its_line(
+    tmp_path, figure, message
+):
+    path = tmp_path / "sat.toml"
+    path.write_text(f'urdf = "cubesat"\n[[output]]\ntype = "star_tracker"\n{figure}\n')
+    with pytest.raises(fflin.InputError) as error:
+        fflin.load(path)
+    assert message in str(error.value)
+    assert re.match(r"\S*sat\.toml:4: output 1: ", str(error.value))
+
+
+def test_a_single_name_or_pattern_of_joints_is_a_list_of_one(tmp_path):
+    path = tmp_path / "arm.toml"
+    path.write_text(
+        'urdf = "planar_detumble"\n[[output]]\ntype = "rates"\njoints = "joint_*"\n'
+    )
+    (rates,) = fflin.load(path).outputs
+    assert rates == fflin.JointVelocities(("joint_*",))
+    assert fflin.ConstraintForce("clamp", "force.x").components == ("force.x",)
+    with pytest.raises(fflin.InputError, match=r'joints is 3, .* \["wheel_\*"\]'):
+        fflin.JointVelocities(3)
