@@ -50,6 +50,9 @@ _SHORTEST_STEP = 1e-12  # [s] at which the search for a step ends
 # to such a pole, and its logarithm has large rounding errors.
 _VANISHING = 0.1
 
+# Participations in a mode count as equal up to this relative difference.
+_SAME = 1e-6
+
 # Displacements of the state from which the derivatives of a policy are estimated. If both
 # displacements give the same derivatives up to the relative difference _SMOOTH, the policy is
 # differentiable.
@@ -165,7 +168,10 @@ class Poles:
         participation = np.abs(left * right)
         # A loop may have further states without names, such as the states of its controller.
         named = participation[: len(self.state_names)]
-        return self.state_names[int(named.argmax())]
+        # Coordinate and rate of an oscillating mode have the same participation. Rounding must not
+        # decide between them.
+        largest = np.flatnonzero(named >= (1.0 - _SAME) * named.max())
+        return self.state_names[int(largest[0])]
 
 
 def rotation(rate: float) -> Poles:

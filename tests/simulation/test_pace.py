@@ -420,3 +420,13 @@ def test_the_proposed_step_divides_the_sample_time():
     )
     finer = fflin.simulate(robot, law, duration=1.0, dt=0.0416666667)
     assert "not accurate" not in str(finer)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_an_oscillating_mode_is_named_by_its_coordinate(seed):
+    """Coordinate and rate participate equally, so rounding must not decide."""
+    draw = np.random.default_rng(seed)
+    frequency = draw.uniform(0.1, 10.0)
+    damping = draw.uniform(0.0, 0.9)
+    A = np.array([[0.0, 1.0], [-(frequency**2), -2.0 * damping * frequency]])
+    assert "mainly q_m.a" in Poles.of("loop", A, ("q_m.a", "qdot_m.a")).fastest_mode
