@@ -106,7 +106,7 @@ class ClosedLoop:
         """Return the indices of the states of the plant; C has the rows of the used signals."""
         judged = judged_states(model, C)
         A, B, C = model.A[np.ix_(judged, judged)], model.B[judged], C[:, judged]
-        return [int(judged[index]) for index in _joined(A, B, C)]
+        return [int(judged[index]) for index in connected_states(A, B, C)]
 
     @property
     def is_continuous_plant(self) -> bool:
@@ -464,7 +464,7 @@ def judged_states(model: LinearModel, C: Array) -> Indices:
     return np.arange(len(names))
 
 
-def _joined(A: Array, B: Array, C: Array) -> list[int]:
+def connected_states(A: Array, B: Array, C: Array) -> list[int]:
     """Return the indices of the states that an input reaches and that affect an output."""
     reached = B.any(axis=1)
     seen = C.any(axis=0)

@@ -38,6 +38,10 @@ _REACHED = 1e-7
 # is checked at the ends of _PARTS equal parts of each interval.
 _BETWEEN, _PARTS = 0.01, 16
 
+# A warning is given if deflections that no input controls end farther from the goal than this
+# fraction of the largest deflection of the motion.
+_VIBRATES = 0.05
+
 _UNKNOWN = (
     "its KKT residuals are unknown, because the last quadratic program cannot be solved"
 )
@@ -470,11 +474,6 @@ def _faults(made: _Made, note: str) -> Iterator[str]:
             f"{optimality.stationarity:.1e} of the gradient of the effort, and the complementarity "
             f"is {optimality.complementarity:.1e}, expected at most {STATIONARY:.0e}"
         )
-
-
-# A warning is given if deflections that no input controls end farther from the goal than this
-# fraction of the largest deflection of the motion.
-_VIBRATES = 0.05
 
 
 def _vibrations(

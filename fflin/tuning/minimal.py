@@ -14,6 +14,7 @@ import numpy as np
 from fflin.analysis.hautus import without_left_vectors
 from fflin.analysis.ranks import unit_columns
 from fflin.base.validation import Array, Values
+from fflin.control.closed_loop import connected_states
 
 Matrices = tuple[Array, Array, Array, Array]
 
@@ -98,17 +99,15 @@ def _with_states(matrices: Matrices, used: Array) -> tuple[Array, Array, Array]:
 
 
 def _connected(A: Array, B: Array, C: Array) -> list[int]:
-    """Return the indices of the states that nonzero entries connect with inputs and outputs."""
-    links = np.abs(A) > _ROUNDING * np.abs(A).max(initial=0.0)
-    reached = np.abs(B).max(axis=1, initial=0.0) > _ROUNDING * np.abs(B).max(
-        initial=0.0
-    )
-    seen = C.any(axis=0)
-    for _ in A:
-        reached = reached | links[:, reached].any(axis=1)
-        seen = seen | links[seen].any(axis=0)
-    indices: list[int] = np.flatnonzero(reached & seen).tolist()
-    return indices
+    """Return the indices of the states that connect inputs and outputs, without rounding errors."""
+    return connected_states(_significant(A), _significant(B), C)
+
+
+def _significant(matrix: Array) -> Array:
+    """Return a matrix whose rounding errors are replaced by zeros."""
+    size = np.abs(matrix)
+    entries: Array = np.where(size > _ROUNDING * size.max(initial=0.0), matrix, 0.0)
+    return entries
 
 
 def _scales(A: Array, dt: float) -> tuple[Array, float]:

@@ -71,8 +71,8 @@ def searched(
 ) -> tuple[Minimum | None, tuple[Start, ...]]:
     """Search from several starts, and return the best result and the values of all.
 
-    The best result is the one with the least soft value among those whose hard goals hold. If there
-    is none, it is the one whose hard goals are missed least.
+    The best result has the least soft value of all results whose hard goals hold. If no result
+    holds them all, the best one misses them least.
 
     The first start of a law with states is the best law with one state less, so that a law of a
     higher order is never worse. `first` is another point for the first start. `others` are further
