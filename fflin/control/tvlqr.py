@@ -557,7 +557,7 @@ def _default_weights(
     """Return Q, R and the rule of the default weights along a trajectory."""
     pace = pace_along(float(traj.t[-1] - traj.t[0]), dt)
     lin = mean_model(traj) if periodic else steady_end(traj).model
-    Q, R, _, rule = rule_weights(lin, weights, pace)
+    Q, R, _, rule = rule_weights(lin, weights, pace, _wheel_speeds(traj))
     if periodic:
         rule += mean_rule(traj)
     return Q, R, rule
@@ -681,13 +681,22 @@ def asks_periodic(value: object, traj: LinearTrajectory, name: str = "Qf") -> bo
     return periodic
 
 
+def _wheel_speeds(traj: LinearTrajectory) -> bool | None:
+    """Return `wheel_speeds` of `lqr` for a regulator along a trajectory.
+
+    Over an orbit, the gravity gradient changes the momentum of the wheels. The periodic regulator
+    uses it to control their speeds.
+    """
+    return True if traj.robot.orbit else None
+
+
 def _of_regulated(traj: LinearTrajectory, Q: Array) -> tuple[Array, Mask, str]:
     """Return Q with zero weight for states that are not regulated.
 
     Further results are the mask (nx,) of the regulated states, and a text that names the others.
     """
     lin = traj[0]
-    kept = regulated_part(lin, None).state_names
+    kept = regulated_part(lin, _wheel_speeds(traj)).state_names
     left_out = [name for name in lin.state_names if name not in kept]
     rows = [lin.state_names.index(name) for name in left_out]
     Q = Q.copy()

@@ -221,14 +221,33 @@ def root_frames():
 )
 def test_neither_poles_nor_margins_depend_on_the_root_frame(name):
     robot = fflin.load(name)
-    gains = [
-        fflin.lqr(fflin.linearize(unlimited(robot, root))) for root in root_frames()
-    ]
-    expected = np.sort(np.abs(gains[0].poles))
-    for gain in gains:
-        # The squared distance in radii of gyration, 1e5 for solo12, multiplies rounding errors.
-        assert np.sort(np.abs(gain.poles)) == pytest.approx(expected, rel=1e-6)
+    expected = pole_sizes(default_gain(robot, root_frames()[0]))
+    for root in root_frames():
+        gain = default_gain(robot, root)
+        apart = np.abs(pole_sizes(gain) / expected - 1.0).max()
+        # The squared distance in radii of gyration, 1e5 for solo12, multiplies rounding errors. On
+        # some processors, the error of the cubesat is 1.03e-6.
+        assert apart <= 1e-6 or apart <= 2.0 * error_of_rounding(robot, root)
         assert gain.margins.disk == pytest.approx(2.0 * np.tan(np.pi / 6.0), abs=2e-3)
+
+
+def default_gain(robot, root):
+    return fflin.lqr(fflin.linearize(unlimited(robot, root)))
+
+
+def pole_sizes(gain):
+    return np.sort(np.abs(gain.poles))
+
+
+def error_of_rounding(robot, root):
+    """The largest relative change of the poles if rounding errors displace the root frame."""
+    poles = pole_sizes(default_gain(robot, root))
+    changes = []
+    for units in (1, 2, 3, 4):
+        placement = root.translation * (1.0 + units * np.finfo(float).eps)
+        displaced = default_gain(robot, pin.SE3(root.rotation, placement))
+        changes.append(np.abs(pole_sizes(displaced) / poles - 1.0).max())
+    return max(changes)
 
 
 @pytest.mark.parametrize("name", ["ets_vii", "planar_detumble", "solo12", "panda"])
