@@ -47,6 +47,13 @@ class Reduction:
     right: Array | None = None
     remarks: tuple[str, ...] = ()
 
+    @property
+    def size(self) -> int:
+        """Number of states that remain."""
+        if self.left is None:
+            return len(self.kept)
+        return len(self.left)
+
     def of(self, A: Array, B: Array, C: Array) -> tuple[Array, Array, Array]:
         """Return the reduced matrices of a model."""
         A, B, C = A[np.ix_(self.kept, self.kept)], B[self.kept], C[:, self.kept]
@@ -179,7 +186,10 @@ def _in_time(pole: complex, rate: float, dt: float) -> complex:
     """Return the pole [1/s] of an eigenvalue of a scaled model."""
     if not dt:
         return rate * pole
-    return complex(np.log(complex(1.0 + dt * rate * pole)) / dt)
+    factor = complex(1.0 + dt * rate * pole)
+    if not factor:  # the state of a delay, which is zero after one step
+        return complex(-np.inf)
+    return complex(np.log(factor) / dt)
 
 
 def _lasting(basis: Array, A: Array, rate: float, dt: float) -> list[complex]:

@@ -253,6 +253,12 @@ class _Task:
             self._matrices(point) for point in (*points.fixed, *points.candidates)
         ]
         self.reduction = reduction_of(models, lin.dt, used, inputs)
+        if not self.reduction.size:
+            longer = f", or a longer dt than {lin.dt:g} s" if lin.dt else ""
+            raise InputError(
+                "no mode of the model depends on the inputs of the law and the goals and changes "
+                f"their outputs; give other signals{longer}"
+            )
         self.cases: dict[int, Case] = {}
         self.chosen: list[Point] = list(points.fixed)
         self.tight: Array = np.zeros(len(self.measures))

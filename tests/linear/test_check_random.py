@@ -41,6 +41,9 @@ class Sizes:
         if case.robot.orbit:
             turning = forces[:, nv : nv + 3].max(axis=1, keepdims=True)
             forces[:, :3] += 2.0 * case.robot.orbit.mean_motion * turning
+            # Coriolis terms of the bodies cancel each other. The integral over the mass of the
+            # magnitudes of two columns of Jacobians is at most the product of their norms.
+            forces[:, nv:] += 2.0 * case.robot.orbit.mean_motion * np.outer(root, root)
         self.terms = {
             "A": np.vstack((np.abs(lin.A[:nv]), np.abs(self.inverse) @ forces)),
             "B": np.vstack(
