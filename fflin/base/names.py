@@ -11,6 +11,9 @@ T = TypeVar("T")
 _GROUPS = ("tau_b", "F_b", "tau_m")
 _OF_UNIT = {"N": "thrust", "N m": "wheel", "A m^2": "dipole"}
 
+# Groups of inputs that robots can have.
+INPUT_GROUPS = (*_GROUPS, *_OF_UNIT.values())
+
 
 def undotted(name: str) -> str:
     """Return a name for python-control, which reserves dots for the form `system.signal`.

@@ -6,7 +6,7 @@ robot.
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import replace
 from functools import partial
 from inspect import signature
@@ -16,8 +16,11 @@ from typing import TypeVar
 import numpy as np
 import pinocchio as pin
 
+from fflin.base import record as saved
 from fflin.base.errors import (
+    FflinError,
     FflinWarning,
+    FileError,
     InputError,
     ModelError,
     listed,
@@ -25,7 +28,7 @@ from fflin.base.errors import (
 )
 from fflin.base.toml_file import TomlFile, flat
 from fflin.base.validation import by_name, instance, is_rotation, printable, rotated
-from fflin.base.writing import read_file, remember
+from fflin.base.writing import RECORDS, read_file, remember, shown
 from fflin.robot.catalog import RobotFile, find_inputs, find_mesh, find_robot, folders
 from fflin.robot.constraints import FROM_FILE, Constraint
 from fflin.robot.equipment.appendages import Appendage, FlexibleAppendage, Slosh
@@ -147,6 +150,7 @@ def load(
             arguments = _xacro_arguments(file_fields.pop("xacro", None)) | arguments
         later = locks
         locks = {name: locks.pop(name, value) for name, value in file_locks.items()}
+    _refuse_result(robot_file.path)
     content = read_file(robot_file.path, "URDF", SIZE_LIMIT)
     location = document.located("lock") if document else nullcontext()
     dirs = (*dirs, *robot_file.package_dirs)
@@ -477,6 +481,21 @@ def _document(path: Path) -> TomlFile:
     with document.located():
         require_known("key of a robot file", document.record, KEYS)
     return document
+
+
+def _refuse_result(path: Path) -> None:
+    """Raise `FileError` if a path has the ending of a saved result, such as a law."""
+    if path.suffix not in RECORDS:
+        return
+    content = f"a {path.suffix} file"
+    with suppress(FflinError), saved.reading(path, "result"):
+        record, _ = saved.read_record(path)
+        kind, robot = saved.text(record["kind"]), saved.text(record["robot"])
+        content = f"a result of the kind {kind} for the robot '{robot}'"
+    raise FileError(
+        f"{shown(path)}: {content}, expected a robot; give the name of a robot, or the path of a "
+        "URDF, an MJCF file (.xml) or a robot file (.toml)"
+    )
 
 
 def _read_robot_file(file: RobotFile) -> tuple[TomlFile, RobotFile, dict[str, object]]:

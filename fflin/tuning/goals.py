@@ -68,6 +68,16 @@ def _band(band: object) -> tuple[float, float]:
     return low, high
 
 
+def _require_signals(goal: MaxGain | RollOff | Variance) -> None:
+    """Raise `InputError` if a goal has no inputs or no outputs."""
+    for key, example in (("inputs", "tau_b"), ("outputs", "q_b")):
+        given = getattr(goal, key)
+        if isinstance(given, Sequence | Mapping) and not given:
+            raise InputError(
+                f"{key} are {given!r}, expected one signal or more, such as '{example}'"
+            )
+
+
 def shown(signals: Sized) -> str:
     """Return signals as a short text."""
     if isinstance(signals, Sequence | Mapping) and not isinstance(signals, str):
@@ -103,7 +113,8 @@ class MaxGain(Goal):
     Raises
     ------
     InputError
-        If the bound is not positive, or is not a stable transfer function with stable zeros.
+        If there are no inputs or outputs, or the bound is not positive, or is not a stable transfer
+        function with stable zeros.
 
     Examples
     --------
@@ -118,6 +129,7 @@ class MaxGain(Goal):
     hard: bool = False
 
     def __post_init__(self) -> None:
+        _require_signals(self)
         object.__setattr__(self, "band", _band(self.band))
         truth("hard", self.hard)
         self.weight()
@@ -149,7 +161,7 @@ class RollOff(Goal):
     Raises
     ------
     InputError
-        If a number is not positive.
+        If a number is not positive, or there are no inputs or outputs.
 
     Examples
     --------
@@ -163,6 +175,7 @@ class RollOff(Goal):
     hard: bool = False
 
     def __post_init__(self) -> None:
+        _require_signals(self)
         positive("above", self.above, "rad/s")
         positive("below", self.below)
         truth("hard", self.hard)
@@ -309,7 +322,7 @@ class Variance(Goal):
     Raises
     ------
     InputError
-        If a number is not positive.
+        If a number is not positive, or there are no inputs or outputs.
 
     Examples
     --------
@@ -326,6 +339,7 @@ class Variance(Goal):
                 raise InputError(
                     f"{key} are {getattr(self, key)!r}, expected {{name: standard deviation}}"
                 )
+        _require_signals(self)
         truth("hard", self.hard)
 
     @property

@@ -66,6 +66,23 @@ def static_law(D: Array, dD: Array) -> Law:
     )
 
 
+def without_unused_states(law: Law) -> Law:
+    """Return a law without the states that no output depends on through nonzero entries."""
+    used = law.C.any(axis=0)
+    for _ in range(len(used)):
+        used = used | law.A[used].any(axis=0)
+    return Law(
+        law.A[used][:, used],
+        law.B[used],
+        law.C[:, used],
+        law.D,
+        law.dA[:, used][:, :, used],
+        law.dB[:, used],
+        law.dC[:, :, used],
+        law.dD,
+    )
+
+
 def repeated(law: Law, width: int) -> Law:
     """Return a law of one channel that acts on each of `width` channels."""
     return Law._make(_on_diagonal(matrix, width) for matrix in law)

@@ -132,7 +132,7 @@ class Parameter:
                 math.asinh(min(ends[1], _WIDE)),
             )
         near, far = sorted((abs(self.least), abs(self.largest)))
-        middle = max(abs(self.value), near)
+        middle = max(abs(self.value), near) or min(self.scale, far)
         low = near if near > 0.0 else middle / _WIDE
         high = far if math.isfinite(far) else middle * _WIDE
         return math.log(low), math.log(high)
@@ -193,8 +193,8 @@ def _started(parameter: Parameter, value: float | None) -> Parameter:
     if least <= value <= largest:
         return parameter
     finite = math.isfinite(least) and math.isfinite(largest)
-    if finite and parameter.sign:
-        value = parameter.sign * math.sqrt(abs(least * largest))
+    if finite and least * largest > 0.0:
+        value = parameter.sign * math.sqrt(least * largest)
     elif finite:
         value = 0.5 * (least + largest)
     else:

@@ -12,7 +12,8 @@ from functools import cached_property
 
 import numpy as np
 
-from fflin.base.names import group_of, grouped
+from fflin.base.errors import UnknownNameError, listed
+from fflin.base.names import INPUT_GROUPS, group_of, grouped
 from fflin.base.validation import Array
 from fflin.linear.model import LinearModel
 from fflin.tuning.minimal import Reduction
@@ -39,7 +40,10 @@ class Signals:
         return grouped(self.inputs, self.input_units)
 
     def expanded(self, key: str) -> tuple[str, ...]:
-        """Return the names that a key selects: the inputs of a group such as wheel, or the key."""
+        """Return the names that a key selects: the inputs of a group such as wheel, or the key.
+
+        Raise `UnknownNameError` for a group of inputs that only other robots have.
+        """
         if key in self.inputs or any(group_of(name) == key for name in self.inputs):
             return (key,)
         names = [
@@ -47,7 +51,25 @@ class Signals:
             for name, full in zip(self.inputs, self.input_keys, strict=True)
             if key in (full, group_of(full))
         ]
+        if not names:
+            self._refuse_other_group(key)
         return tuple(names) or (key,)
+
+    def _refuse_other_group(self, key: str) -> None:
+        """Raise `UnknownNameError` if a key belongs to a group of inputs of other robots."""
+        group = group_of(key) or key
+        groups: dict[str, list[str]] = {}
+        for name, full in zip(self.inputs, self.input_keys, strict=True):
+            groups.setdefault(group_of(full), []).append(name)
+        known = {*groups, *self.outputs, *map(group_of, self.outputs)}
+        if group not in INPUT_GROUPS or group in known or not groups:
+            return
+        shown = [f"{other} ({listed(names)})" for other, names in groups.items()]
+        choice = " or ".join(f"'{other}'" for other in groups)
+        raise UnknownNameError(
+            f"no input named '{key}': the inputs of this robot are {', '.join(shown)}; give "
+            f"{choice}"
+        )
 
     @cached_property
     def _markov(self) -> tuple[Array, ...]:

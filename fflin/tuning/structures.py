@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence, Sized
 from dataclasses import dataclass, field, replace
 from typing import TypeAlias
 
 import numpy as np
 
-from fflin.base.errors import InputError
+from fflin.base.errors import InputError, listed
 from fflin.base.names import matching
 from fflin.base.validation import (
     Array,
@@ -157,16 +157,16 @@ class _Sum(Structure):
         parameters = (*first.parameters, *second.parameters)
         return Element(parameters, every, commanded_by, law)
 
+    def simpler(self) -> Structure | None:
+        """Return a structure with fewer states, whose parameters have the same names."""
+        return _simpler(_Sum, self.first, self.second)
+
 
 def _united(
     first: tuple[int, ...] | None, second: tuple[int, ...] | None
 ) -> tuple[int, ...]:
     """Return the indices of two sets of signals, in order."""
     return tuple(sorted({*(first or ()), *(second or ())}))
-
-    def simpler(self) -> Structure | None:
-        """Return a structure with fewer states, whose parameters have the same names."""
-        return _simpler(_Sum, self.first, self.second)
 
 
 def _simpler(
@@ -267,8 +267,16 @@ def indices(kind: str, keys: object, names: Sequence[str]) -> tuple[int, ...]:
     if not isinstance(keys, Sequence) or not all(isinstance(key, str) for key in keys):
         raise InputError(f"{kind}s are {keys!r}, expected names, such as 'q_b'")
     every = [index for key in keys for index in matching(kind, key, names)]
-    if not every or len({*every}) < len(every):
-        raise InputError(f"{kind}s are {keys!r}, expected names, and each name once")
+    if not every:
+        raise InputError(
+            f"{kind}s are {keys!r}, expected at least one name; the model has "
+            f"{listed(names)}"
+        )
+    if len({*every}) < len(every):
+        twice = next(index for index in every if every.count(index) > 1)
+        raise InputError(
+            f"{kind}s are {keys!r}, which contain '{names[twice]}' twice; give each name once"
+        )
     return tuple(every)
 
 
@@ -1088,7 +1096,8 @@ class StateSpaceLaw(Structure):
 class CustomLaw(Structure):
     """Law that a function of named parameters defines.
 
-    The derivatives are central differences of the function.
+    The derivatives are central differences of the function. The search rejects values of the
+    parameters at which the matrices are not finite.
 
     Parameters
     ----------
@@ -1103,7 +1112,8 @@ class CustomLaw(Structure):
     Raises
     ------
     InputError
-        If a parameter has no start value and no bounds, or a matrix has a wrong shape.
+        If a parameter has no start value and no bounds, or a matrix has a wrong shape or is not
+        finite at the start values.
 
     Examples
     --------
@@ -1157,6 +1167,8 @@ class CustomLaw(Structure):
                 )
             )
 
+        self._require_finite(_values(parameters), len(measured), len(inputs))
+
         def law(values: Array, width: int) -> Law:
             center = self._system(values, len(measured), len(inputs))
             changes: list[Matrices] = []
@@ -1174,12 +1186,29 @@ class CustomLaw(Structure):
 
         return Element(tuple(parameters), measured, inputs, law)
 
+    def _require_finite(self, starts: Array, ny: int, nu: int) -> None:
+        """Raise `InputError` if a matrix is not finite at the start values."""
+        matrices = self._system(starts, ny, nu)
+        for key, matrix in zip("ABCD", matrices, strict=True):
+            if np.isfinite(matrix).all():
+                continue
+            values = zip(self._keys, starts.tolist(), strict=True)
+            where = ", ".join(f"{name} = {value:g}" for name, value in values)
+            raise InputError(
+                f"the function of the law returned a matrix {key} that is not finite at the start "
+                f"values {where}, expected finite numbers; correct the function, or give other "
+                "bounds or start values"
+            )
+
     def _system(self, values: Array, ny: int, nu: int) -> Matrices:
         """Return the matrices at the values of the parameters, with their sizes checked."""
         given = self.matrices(dict(zip(self._keys, values.tolist(), strict=True)))
-        if len(given) != 4:
+        if not isinstance(given, Sized) or len(given) != 4:
+            kind = type(given).__name__
+            count = f" of length {len(given)}" if isinstance(given, Sized) else ""
             raise InputError(
-                f"the function of the law returned {len(given)} values, expected A, B, C and D"
+                f"the function of the law returned a {kind}{count}, expected the four matrices A, "
+                "B, C and D; return them as a tuple"
             )
         A, B, C, D = (
             np.atleast_2d(as_double(key, matrix))

@@ -12,16 +12,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fflin.base.errors import InputError, MissingPackageError
+from fflin.base.errors import InputError, MissingPackageError, listed
+from fflin.base.names import group_of
 from fflin.base.process import Progress, in_one_thread
-from fflin.base.validation import Array, ArrayLike, count, instance, whole
+from fflin.base.validation import Array, ArrayLike, Values, count, instance, whole
 from fflin.linear.model import Delay
 from fflin.tuning.channels import ends_of, signals_in_use
+from fflin.tuning.closed_loop import ClosedLoop
 from fflin.tuning.criteria import Piece
 from fflin.tuning.curves import GoalLoops
 from fflin.tuning.goals import Goal
 from fflin.tuning.hinf import hinf
-from fflin.tuning.law import Law, Matrices
+from fflin.tuning.law import Law, Matrices, without_unused_states
 from fflin.tuning.loop import sensor_delays, with_delayed_outputs
 from fflin.tuning.minimal import reduction_of
 from fflin.tuning.plant import Plant, Signals, plant_of, signals_of
@@ -59,6 +61,9 @@ _TIGHTENINGS, _NEARLY = 3, 1.05
 
 # Factor by which such a goal is then below its limit.
 _BELOW = 1.0 - 1e-6
+
+# Number of random laws whose poles are added.
+_RANDOM_LAWS = 3
 
 # A pole of the plant is fixed if a test of Hautus has a smaller singular value.
 _FIXED = 1e-9
@@ -154,9 +159,7 @@ def tune(
     True
     """
     started = time.process_time()
-    instance(
-        "structure", structure, Structure, "a structure of a law, such as fflin.PD"
-    )
+    _require_structure(structure)
     every = [goals] if isinstance(goals, Goal) else goals
     if not isinstance(every, Sequence) or not every:
         raise InputError(f"goals are {goals!r}, expected one goal or more")
@@ -674,6 +677,42 @@ class _Task:
         points.append(best.x)
         return _largest(self.figures(problem, best.x)) <= 1.0
 
+    def _has_no_damping(self, problem: Problem) -> bool:
+        """Return whether no law is stable because of the sum of the poles of its loop.
+
+        The sum of the poles, or of their inverses, is the same for all laws if it is the same at
+        random parameters. If it is not negative, some real parts are not negative.
+        """
+        plant = problem.cases[0].plant
+        poles = []
+        for seed in range(_RANDOM_LAWS):
+            law = problem.law(problem.start(np.random.default_rng(seed)))
+            loop = ClosedLoop(plant, without_unused_states(law))
+            if not loop.well_posed or not np.isfinite(loop.A).all():
+                return False
+            poles.append(loop.poles)
+        rows: Values = np.array(poles)
+        if _sum_never_changes(rows):
+            return True
+        return bool(rows.all()) and _sum_never_changes(np.reciprocal(rows))
+
+    def _without_damping(self, commanded: Sequence[int]) -> str:
+        """Return that a law has no damping, and which rates it can measure."""
+        signals = self.signals
+        rates = []
+        for index, name in enumerate(signals.outputs):
+            responses = [signals.response(index, command) for command in commanded]
+            if any(gain and order == 1 for gain, order in responses):
+                rates.append(group_of(name) or name)
+        advice = "add an output of rates, such as fflin.Gyroscope, to the robot"
+        if rates:
+            advice = f"measure rates, such as {listed(rates)}"
+        return (
+            "no law of this structure is stable: the sum of the poles of the loop, or of their "
+            f"inverses, is never negative, so the law adds no damping; {advice}, or use a PD whose "
+            "kd is not 0"
+        )
+
     def _why_unstable(self, problem: Problem, starts: int) -> str:
         """Return why no start was stable."""
         plant = problem.cases[0].plant
@@ -699,6 +738,8 @@ class _Task:
                         "plant; give other inputs or outputs, or goals without the states of this "
                         "pole"
                     )
+        if self._has_no_damping(problem):
+            return self._without_damping(commanded)
         models = len(problem.cases)
         loop = (
             "a stable loop" if models == 1 else f"stable loops of all {models} models"
@@ -707,6 +748,16 @@ class _Task:
             f"none of {starts} starts reached {loop}; give start values (start= or "
             "fflin.Tunable), more starts, or another structure"
         )
+
+
+def _sum_never_changes(poles: Values) -> bool:
+    """Return whether the sums of rows of poles are equal, and not negative.
+
+    Differences below a fraction of the magnitudes of the poles are rounding errors.
+    """
+    sums = poles.sum(axis=1).real
+    rounding = _FIXED * np.abs(poles).sum(axis=1).max()
+    return bool(np.ptp(sums) <= rounding and sums.min() >= -rounding)
 
 
 def _largest(figures: Sequence[_Worst]) -> float:
@@ -720,6 +771,26 @@ def _objective_level(problem: Problem, values: Sequence[float]) -> float:
         value
         for value, is_constraint in zip(values, problem.is_constraint, strict=True)
         if not is_constraint
+    )
+
+
+def _require_structure(structure: object) -> None:
+    """Raise `InputError` unless the structure of a law is one structure."""
+    if isinstance(structure, list | tuple):
+        raise InputError(
+            f"structure is a {type(structure).__name__}, expected one structure, such as "
+            "fflin.PD('q_b', 'tau_b'); write sums of structures as a + b, and series as a * b"
+        )
+    if isinstance(structure, type):
+        raise InputError(
+            f"structure is the class {structure.__name__}, expected an object, such as "
+            "fflin.PD('q_b', 'tau_b')"
+        )
+    instance(
+        "structure",
+        structure,
+        Structure,
+        "a structure of a law, such as fflin.PD('q_b', 'tau_b')",
     )
 
 
