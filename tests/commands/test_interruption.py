@@ -16,8 +16,9 @@ pytestmark = pytest.mark.process
 LONG = {
     "sweep": "sweep ets_vii --random 300000 --velocity joint_1=0.3 -o x.h5",
     "sweep by processes": "sweep ets_vii --random 300000 --workers 2 -o x.h5",
-    "validity": "validity ets_vii --samples 900000",
-    "validity by processes": "validity ets_vii --samples 900000 --jobs 2",
+    "validity": "validity ets_vii --samples 30000",
+    # It draws all displacements before it starts its processes, in 0.1 ms each.
+    "validity by processes": "validity ets_vii --samples 30000 --jobs 2",
     "simulate": "simulate ets_vii --rpy 10 0 0 --duration 9000 -o x.npz",
     "view": "view ets_vii --no-open",
 }
