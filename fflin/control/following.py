@@ -13,6 +13,7 @@ from fflin.base.errors import EquilibriumError, InputError
 from fflin.base.validation import Array, instance
 from fflin.control.loops import Loop, Sample, StateMeasuring, Step
 from fflin.control.policy import Command, Noise, OutputForm, Policy, Reference
+from fflin.control.rigid_reference import on_flexible_robot
 from fflin.control.sensed_laws import sensed
 from fflin.control.sensors import SensorTiming, require_timing, timing_of_robot
 from fflin.control.trajectory_end import resting_end
@@ -65,7 +66,8 @@ class Following(Policy):
                 f"the {self.law.kind} is continuous, expected a sampled law to follow a "
                 "trajectory; design it for lin.discretize(dt)"
             )
-        self.trajectory = _with_inputs_of(self.lin, self.trajectory)
+        same_joints = on_flexible_robot(self.lin, self.trajectory)
+        self.trajectory = _with_inputs_of(self.lin, same_joints)
         self._require_fit(self.trajectory.robot)
         displacement = np.concatenate((self.lin.x0[:6], self.lin.v[:6]))
         if np.abs(displacement).max() > _ROUNDING:

@@ -159,11 +159,16 @@ class PointLaw(Feedback):
         are small compared with the bandwidth of the law, and if the joints stay near the point. For
         other trajectories, use `tvlqr` and `tvkalman`.
 
+        A robot with flexible appendages or slosh also follows the trajectory of the same robot
+        without them, or with these joints locked. The reference of the deflections is then their
+        value at the operating point. The inputs of such a trajectory excite the modes, which the
+        law must damp. A trajectory of the flexible robot itself leaves much smaller errors.
+
         Parameters
         ----------
         trajectory : Trajectory
             Trajectory for the same states, inputs and outputs as the model of the law, such as the
-            result of `plan`.
+            result of `plan`. It may lack springs without motors, and inputs.
 
         Returns
         -------
@@ -176,6 +181,8 @@ class PointLaw(Feedback):
         InputError
             If the law is continuous, its base is displaced or moves at the operating point, the
             robot of the trajectory has other signals, or no inputs hold the robot at the end. Also
+            if the trajectory lacks springs, and its robot has another inertia than the robot of the
+            model without deflection, or the latter has accelerometers. Also
             if inputs are delayed and the base moves at the start of the trajectory, or the outputs
             of the robot have other sample times or delays than the design of a `MultirateFeedback`.
         """

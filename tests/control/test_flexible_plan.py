@@ -7,37 +7,9 @@ import scipy.linalg
 import fflin
 from fflin.control.optimal.controlled_ends import controlled_ends
 from fflin.control.optimal.shooting import Shooting
+from tests.support.robots import winged_satellite
 
 HALF_TURN = np.linspace(0.0, 24.0, 13)
-
-MODES = {"translation": [[0], [0], [2.2]], "damping": 0.005}
-
-
-def satellite(tmp_path, frequency=0.35, modes=MODES):
-    """Return a satellite of 180 kg with two wings and four wheels; rigid with frequency=None."""
-    urdf = tmp_path / "satellite.urdf"
-    urdf.write_text(
-        '<robot name="satellite"><link name="base"><inertial><mass value="180"/>'
-        '<inertia ixx="60" iyy="35" izz="70" ixy="0" ixz="0" iyz="0"/>'
-        "</inertial></link></robot>"
-    )
-    wings = []
-    if frequency is not None:
-        wings = [
-            fflin.FlexibleAppendage(
-                "base",
-                frequency=[frequency],
-                rotation=[[sign * 3.5], [0], [0]],
-                name=name,
-                **modes,
-            )
-            for name, sign in (("left", 1), ("right", -1))
-        ]
-    wheels = [
-        fflin.ReactionWheel(axis=axis, inertia=0.02, max=0.1, max_speed=600)
-        for axis in ((1, 0, 1), (-1, 0, 1), (0, 1, 1), (0, -1, 1))
-    ]
-    return fflin.load(urdf, inputs=wheels, appendages=wings)
 
 
 def guess(robot, t=HALF_TURN):
@@ -50,7 +22,7 @@ def guess(robot, t=HALF_TURN):
 
 @pytest.mark.parametrize("frequency", [0.35, 3.0])
 def test_jacobians_of_intervals_resolve_modes_that_are_not_excited(tmp_path, frequency):
-    robot = satellite(tmp_path, frequency)
+    robot = winged_satellite(tmp_path, frequency)
     t = np.array([0.0, 2.0, 4.0])
     shooting = Shooting(robot, t, True)
     q = np.tile(robot.neutral(), (3, 1))
@@ -68,13 +40,13 @@ def test_jacobians_of_intervals_resolve_modes_that_are_not_excited(tmp_path, fre
 
 def test_a_guess_moves_the_mass_of_the_wings(tmp_path):
     """The guess has the torques of the rigid satellite: springs carry the wings along."""
-    _, (_, _, rigid) = guess(satellite(tmp_path, None))
-    _, (_, _, flexible) = guess(satellite(tmp_path))
+    _, (_, _, rigid) = guess(winged_satellite(tmp_path, None))
+    _, (_, _, flexible) = guess(winged_satellite(tmp_path))
     assert flexible == pytest.approx(rigid, abs=1e-6 * np.abs(rigid).max())
 
 
 def test_torques_choose_one_of_two_equal_wings(tmp_path):
-    robot = satellite(tmp_path)
+    robot = winged_satellite(tmp_path)
     shooting, first = guess(robot)
     shooting.refine(*first, 1e-6)
     nx = shooting.state.nx
@@ -89,7 +61,7 @@ def test_torques_choose_one_of_two_equal_wings(tmp_path):
 
 
 def test_a_mode_that_is_too_fast_for_the_knots_is_named(tmp_path):
-    robot = satellite(tmp_path, 100.0)
+    robot = winged_satellite(tmp_path, 100.0)
     goal = fflin.configuration(robot, rpy=(30, 0, 0))
     with pytest.raises(fflin.InputError, match=r"oscillates .* give more knots"):
         fflin.plan(robot, (goal, None), 24.0, knots=13, free=["r_b", "v_b"])
@@ -100,7 +72,7 @@ def test_a_mode_that_is_too_fast_for_the_knots_is_named(tmp_path):
 def test_a_slew_of_a_flexible_satellite_ends_at_rest_and_is_tracked(
     tmp_path, frequency, angle
 ):
-    robot = satellite(tmp_path, frequency)
+    robot = winged_satellite(tmp_path, frequency)
     goal = fflin.configuration(robot, rpy=(angle, 0, 0))
     duration = 40.0 if angle < 100 else 80.0
     knots = 21 if angle < 100 else 41

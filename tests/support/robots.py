@@ -9,6 +9,7 @@ from fflin.robot.catalog import bundled_directory
 
 BUNDLED = tuple(sorted(path.stem for path in bundled_directory().glob("*.urdf")))
 FRAMES = ("hybrid", "local", "world")
+WING_MODES = {"translation": [[0], [0], [2.2]], "damping": 0.005}
 
 
 def mostly(names, *quick):
@@ -134,3 +135,30 @@ LINKS = "".join(
     <inertia ixx=".1" ixy="0" ixz="0" iyy=".1" iyz="0" izz=".1"/></inertial></link>"""
     for name, mass in (("la", 1.5), ("lb", 0.7))
 )
+
+
+def winged_satellite(tmp_path, frequency=0.35, modes=WING_MODES):
+    """Return a satellite of 180 kg with two wings and four wheels; rigid with frequency=None."""
+    urdf = tmp_path / "satellite.urdf"
+    urdf.write_text(
+        '<robot name="satellite"><link name="base"><inertial><mass value="180"/>'
+        '<inertia ixx="60" iyy="35" izz="70" ixy="0" ixz="0" iyz="0"/>'
+        "</inertial></link></robot>"
+    )
+    wings = []
+    if frequency is not None:
+        wings = [
+            fflin.FlexibleAppendage(
+                "base",
+                frequency=[frequency],
+                rotation=[[sign * 3.5], [0], [0]],
+                name=name,
+                **modes,
+            )
+            for name, sign in (("left", 1), ("right", -1))
+        ]
+    wheels = [
+        fflin.ReactionWheel(axis=axis, inertia=0.02, max=0.1, max_speed=600)
+        for axis in ((1, 0, 1), (-1, 0, 1), (0, 1, 1), (0, -1, 1))
+    ]
+    return fflin.load(urdf, inputs=wheels, appendages=wings)
