@@ -39,8 +39,8 @@ class Progress:
         """Print a text on stderr when the first step is done, so that no error follows it."""
         self._announced = text
 
-    def expect(self, seconds: float, cores: int) -> None:
-        """Print the estimated duration of a computation, if it is at least 10 s."""
+    def expect(self, seconds: float, cores: int, what: str = "") -> None:
+        """Print the estimated duration of the computation `what`, if it is at least 10 s."""
         if seconds < _WORTH:
             return
         if seconds < 120.0:
@@ -51,7 +51,10 @@ class Progress:
             size, unit = seconds / 3600.0, "h"
         shown = float(f"{size:.2g}")
         counted_cores = "1 core" if cores == 1 else f"{cores} cores"
-        print(f"fflin: about {shown:g} {unit} on {counted_cores}", file=sys.stderr)
+        text = f"about {shown:g} {unit} on {counted_cores}"
+        if what:
+            text = f"{what}: {text}"
+        print(f"fflin: {text}", file=sys.stderr)
 
     def __call__(self, done: int, total: int, what: str = "", hint: str = "") -> None:
         """Show the label `what`, and a bar for `done` of `total` steps.

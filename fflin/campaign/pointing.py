@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from time import monotonic
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from fflin.base import html, intervals
 from fflin.base.errors import FflinWarning, InputError, unknown
 from fflin.base.intervals import Estimate
-from fflin.base.process import Progress
 from fflin.base.tables import folded, grid
 from fflin.base.validation import (
     Array,
@@ -23,12 +24,13 @@ from fflin.base.validation import (
     instance,
     share,
 )
+from fflin.batch.run import Execution
 from fflin.simulation.pointing import Pointing, PointingError, pointing
 
 if TYPE_CHECKING:
     from fflin.campaign.campaign import Campaign
+    from fflin.campaign.runs import CampaignJob
     from fflin.robot.robot import Robot
-    from fflin.simulation.motion import Motion
 
 # {statistic over the time of a run: end of the name of its figure}
 _STATISTICS = {"largest": "", "rms": " rms", "p95": " p95", "p997": " p997"}
@@ -329,12 +331,14 @@ def campaign_pointing(
     line_of_sight: ArrayLike | None = None,
     robot: Robot | None = None,
     policy: object = None,
+    progress: Callable[[int, int], object] | None = None,
     **options: object,
 ) -> CampaignPointing:
     """Return the pointing errors of all runs, in the terms of ECSS-E-ST-60-10C.
 
     A campaign does not contain the motions of its runs, so every run is simulated again, and
-    `Motion.pointing` is applied to it. Only the figures of each run are kept.
+    `Motion.pointing` is applied to it. Only the figures of each run are kept. Runs of the compiled
+    engine are computed on all cores.
 
     Parameters
     ----------
@@ -344,6 +348,8 @@ def campaign_pointing(
         As in `Motion.pointing`.
     robot, policy, **options
         As in `Campaign.replay`, for a campaign that was loaded from a file.
+    progress : callable, optional
+        As in `sweep`.
 
     Returns
     -------
@@ -364,26 +370,32 @@ def campaign_pointing(
     ----------
     ECSS-E-ST-60-10C, Space engineering: control performance, 2008.
     """
+    from fflin.campaign.replay import job_of_campaign
+
     completed = np.flatnonzero(~campaign.stopped)
     if not len(completed):
         raise InputError("all runs were stopped early, so no run has pointing errors")
-    figures = list[Pointing]()
-    missed = 0.0
-    how: dict[str, Any] = {
-        "after": after,
-        "apart": apart,
-        "accuracy": accuracy,
-        "line_of_sight": line_of_sight,
-    }
-    bar = Progress()
-    try:
-        motions = _motions(campaign, completed, robot, policy, options)
-        for run, motion in zip(completed.tolist(), motions, strict=True):
-            missed = max(missed, float(np.abs(motion.q[-1] - campaign.q[run]).max()))
-            figures.append(pointing(motion, window, **how))
-            bar(len(figures), len(completed))
-    finally:
-        bar.close()
+    job = job_of_campaign(campaign, robot, policy, options)
+    drawn = np.array(campaign.drawn)
+    q = np.array(campaign.q)
+
+    def errors_of(runs: Indices) -> list[tuple[Pointing, float]]:
+        """Return the pointing errors of a few runs, and how far they end from the recorded q."""
+        errors = list[tuple[Pointing, float]]()
+        for run, motion in zip(runs.tolist(), job.replays(drawn[runs]), strict=True):
+            one = pointing(
+                motion,
+                window,
+                after=after,
+                apart=apart,
+                accuracy=accuracy,
+                line_of_sight=line_of_sight,
+            )
+            errors.append((one, float(np.abs(motion.q[-1] - q[run]).max())))
+        return errors
+
+    found = _of_groups(errors_of, completed, job, progress)
+    missed = max(distance for _, distance in found)
     if missed > 0.0:
         warnings.warn(
             f"runs end {missed:.2g} (largest difference of q) from the recorded end; the policy, "
@@ -391,21 +403,41 @@ def campaign_pointing(
             FflinWarning,
             stacklevel=2,
         )
-    return _joined(campaign, completed, figures)
+    return _joined(campaign, completed, [errors for errors, _ in found])
 
 
-def _motions(
-    campaign: Campaign,
+def _of_groups(
+    errors_of: Callable[[Indices], list[tuple[Pointing, float]]],
     runs: Indices,
-    robot: Robot | None,
-    policy: object,
-    options: Mapping[str, object],
-) -> Iterator[Motion]:
-    """Simulate runs again, and return their motions one after the other."""
-    from fflin.campaign.replay import job_of_campaign
+    job: CampaignJob,
+    progress: Callable[[int, int], object] | None,
+) -> list[tuple[Pointing, float]]:
+    """Return the results of a function of groups of runs, which threads compute in parallel."""
+    groups = [runs[at : at + job.lanes] for at in range(0, len(runs), job.lanes)]
+    results = list[tuple[Pointing, float]]()
+    with Execution(progress=progress) as how:
+        threads = min(how.count(job), len(groups))
+        computed: Iterable[list[tuple[Pointing, float]]] = map(errors_of, groups)
+        if threads > 1:
+            pool = ThreadPoolExecutor(threads)
+            how.callback(pool.shutdown, wait=False, cancel_futures=True)
+            computed = pool.map(errors_of, groups)
+        begun = monotonic()
+        for group in computed:
+            if not results:
+                _expect(how.progress, monotonic() - begun, len(groups), threads)
+            results += group
+            if how.progress:
+                how.progress(len(results), len(runs))
+    return results
 
-    job = job_of_campaign(campaign, robot, policy, options)
-    yield from job.replays(np.array(campaign.drawn)[runs])
+
+def _expect(progress: object, seconds: float, groups: int, threads: int) -> None:
+    """Report the estimated time to fflin's progress bar, from the time [s] of the first group."""
+    tell = getattr(progress, "expect", None)
+    if tell is not None:
+        rest = math.ceil(groups / threads) - 1
+        tell(rest * seconds, threads, "pointing errors")
 
 
 def _joined(

@@ -6,10 +6,10 @@ of the statistics does not depend on the duration of the run.
 """
 
 import math
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from copy import copy
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from time import perf_counter
 from timeit import repeat
 from typing import Any, TypeAlias
@@ -391,17 +391,19 @@ class CampaignJob:
             run = lanes.recorded(self.plan, self.dispersions.in_lanes(drawn[None]))
         return replace(motion_of(plan, run), _nominal=self.plant.robot.urdf_sha256)
 
-    def replays(self, drawn: Array) -> Iterator[Motion]:
-        """Repeat runs with drawn values (N, k), eight at a time in compiled code."""
+    def replays(self, drawn: Array) -> list[Motion]:
+        """Repeat at most `lanes` runs with drawn values (N, k), by the same engine.
+
+        The motions of the compiled engine have no notes, and their energy and momentum are NaN.
+        """
         if self.engine == "python":
-            yield from map(self.replay, drawn)
-            return
-        for first in range(0, len(drawn), LANES):
-            eight = drawn[first : first + LANES]
-            values = self.dispersions.in_lanes(eight)
-            recordings = lanes.recorded_runs(self.plan, values, len(eight))
-            for row, run in zip(eight, recordings, strict=True):
-                yield motion_of(self.plan_of(row), run)
+            return [*map(self.replay, drawn)]
+        plan = self.plan
+        if plan.follows is not None:
+            plan = plan.replace(follows=cache(plan.follows))
+        values = self.dispersions.in_lanes(drawn)
+        recordings = lanes.recorded_runs(plan, values, len(drawn))
+        return [motion_of(plan, run) for run in recordings]
 
 
 class RunStatistics(lanes.Statistics):

@@ -461,7 +461,10 @@ def montecarlo(arguments: Namespace) -> Report:
     text = "\n".join([*shown, *worst_runs(campaign, arguments.worst)])
     result = {**campaign_record(campaign, arguments.worst), "notes": notes}
     if window is not None and not campaign.stopped.all():
-        errors = campaign.pointing(window, accuracy=arguments.accuracy)
+        with going_on(path, "runs") as progress:
+            errors = campaign.pointing(
+                window, accuracy=arguments.accuracy, progress=progress
+            )
         result["pointing"] = pointing_record(errors)
         text += f"\n\n{errors}"
     if budget is not None:

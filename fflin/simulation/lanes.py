@@ -56,6 +56,9 @@ from fflin.simulation.run import (
 # the loop is already stored.
 LONG = 20_000
 
+# Place of the inputs among the vectors of a recorded row; see `LaneLoop`.
+_INPUTS = 2
+
 SLOTS = 128  # number of samples for which noise is stored at once
 _MEMORY = 2**22  # [bytes] memory for recorded rows
 
@@ -497,23 +500,24 @@ class LaneRows(Statistics):
 
 
 class RowsOfRuns(Statistics):
-    """Recorded rows of eight runs, with the columns that `LaneLoop` describes."""
+    """Recorded rows (LANES, rows, width) of eight runs, with columns up to the inputs."""
 
-    def __init__(self, times: Times, width: int) -> None:
+    def __init__(self, times: Times, loop: LaneLoop) -> None:
         self.every = times.every
-        self._rows = np.zeros((times.rows, width, LANES))
+        self.width = int(loop.ends[_INPUTS])
+        self.rows = np.empty((LANES, times.rows, self.width))
 
     def add(self, first: int, rows: Array) -> None:
         """Store rows; see `Statistics`."""
         begin = -(-first // self.every)
-        self._rows[begin : begin + len(rows)] = rows
+        kept = rows[:, : self.width]
+        self.rows[:, begin : begin + len(rows)] = np.moveaxis(kept, -1, 0)
 
     def outcome(self, done: int, stop: Array) -> dict[str, Array]:
-        """Return the rows of all runs, and the number of their steps."""
-        return {
-            "done": np.full(LANES, float(done)),
-            "kept": np.moveaxis(self._rows, -1, 0),
-        }
+        """Return the numbers of steps, and the last rows of all runs."""
+        # After a run, its lane copies another run, whose rows may replace this last row.
+        last = self.rows[:, -(-done // self.every)]
+        return {"done": np.full(LANES, float(done)), "last": last}
 
 
 def recorded(plan: Plan, runs: Runs | None = None) -> Recording:
@@ -536,30 +540,40 @@ def recorded(plan: Plan, runs: Runs | None = None) -> Recording:
 def recorded_runs(plan: Plan, runs: Runs, count: int) -> list[Recording]:
     """Simulate up to eight dispersed runs with the compiled loop.
 
-    `runs` contains their values, with one row for each of the `count` runs.
+    `runs` contains their values, with one row for each of the `count` runs. The recordings are
+    brief.
     """
     loop = LaneLoop(plan, runs)
-    rows = RowsOfRuns(plan.times, loop.width)
+    statistics = RowsOfRuns(plan.times, loop)
     out = {
         "done": np.zeros(count),
-        "kept": np.zeros((count, plan.times.rows, loop.width)),
+        "last": np.zeros((count, statistics.width)),
     }
-    reasons = loop.fly(rows, out, runs)
-    return [
-        _recording(plan, loop, kept, int(done), reason)
-        for kept, done, reason in zip(out["kept"], out["done"], reasons, strict=True)
-    ]
+    reasons = loop.fly(statistics, out, runs)
+    recordings = list[Recording]()
+    for lane, (done, reason) in enumerate(zip(out["done"], reasons, strict=True)):
+        kept = statistics.rows[lane]
+        kept[-(-int(done) // plan.times.every)] = out["last"][lane]
+        recordings.append(_recording(plan, loop, kept, int(done), reason))
+    return recordings
 
 
 def _recording(
     plan: Plan, loop: LaneLoop, kept: Array, done: int, stopped: str
 ) -> Recording:
-    """Return the recording of a run that ended after `done` steps, from its recorded rows."""
+    """Return the recording of a run that ended after `done` steps, from its recorded rows.
+
+    If the rows end with the inputs, the recording is brief.
+    """
     every, dt = plan.times.every, plan.times.dt
     count = -(-done // every)
     t = np.append(every * np.arange(count) * dt, done * dt)
     count += not stopped.startswith(("diverged", "interrupted"))
-    q, nu, u, momentum, center, forces, _ = np.split(kept[:count], loop.ends, axis=1)
+    kept = kept[:count]
+    q, nu, u, momentum, center, forces, _ = np.split(kept, loop.ends, axis=1)
+    brief = not momentum.size
+    if brief:
+        momentum = center = kept[:0]
     return Recording(
         t=t[:count],
         q=q,
@@ -570,7 +584,7 @@ def _recording(
         steps=done,
         stopped=stopped,
         engine="compiled",
-        forces=None if loop.constraints is None else forces,
+        forces=None if brief or loop.constraints is None else forces,
     )
 
 

@@ -226,7 +226,11 @@ class Conserved:
 
 
 class Recording(NamedTuple):
-    """Recorded rows of a run: times, configurations, velocities, inputs and predicted momentum."""
+    """Recorded rows of a run: times, configurations, velocities, inputs and predicted momentum.
+
+    A brief recording has no rows of the predicted momentum and centre of mass, and no forces of
+    constraints.
+    """
 
     t: Array
     q: Array
@@ -238,6 +242,11 @@ class Recording(NamedTuple):
     stopped: str  # reason if the run ended early, or an empty text
     engine: str  # name of the engine
     forces: Array | None = None  # (N, r) of constraints, or None without constraints
+
+    @property
+    def is_brief(self) -> bool:
+        """Whether the recording is brief."""
+        return not len(self.momentum)
 
 
 def _follower(plan: Plan) -> Callable[[int], None] | None:

@@ -331,7 +331,10 @@ def is_detumbling(policy: object) -> bool:
 def motion_of(
     plan: Plan, run: Recording, predicting: Predictor | None = None
 ) -> Motion:
-    """Build the motion from the recorded rows of a run; `predicting` computes the prediction."""
+    """Build the motion from the recorded rows of a run; `predicting` computes the prediction.
+
+    The motion of a brief recording has no notes, and its energy and momentum are NaN.
+    """
     plant, state, robot = plan.plant, plan.plant.state, plan.plant.robot
     if plant.field and not run.stopped:
         plant.field.require_near(run.q[np.linalg.norm(run.q[:, :3], axis=1).argmax()])
@@ -349,28 +352,15 @@ def motion_of(
     prediction = x[:0]
     if predicting is not None and beyond is None:
         prediction = predict(plan, predicting, x, run.steps)
-    energy, momentum, center, kept, scale = Conserved(plan).histories(
-        run.t, run.q, run.v
-    )
-    notes = plan.policy.notes if plan.policy else ()
-    if plan.policy and plan.errors:
-        errors = note_on_errors(plan.policy.sensors, plan.errors, plan.options.seed)
-        notes = (*notes, errors)
-    if plan.law and isinstance(plan.law.policy, BoundLaw):
-        notes += plan.law.policy.notes
-    loop_notes: tuple[str, ...] = ()
-    if plan.policy:
-        loop_notes = plan.policy.loop_notes(plan.times.sample * plan.times.dt)
-    if plant.constrained is not None:
-        notes = (*notes, *plant.constrained.notes(plan.q))
+    balances: dict[str, Any]
+    notes: tuple[str, ...] = ()
+    if run.is_brief:
+        balances = _unknown_balances(len(run.t))
+    else:
+        balances, of_energy = _balances(plan, run)
+        of_turn = half_turn_notes(plan, beyond, predicted=predicting is not None)
+        notes = _notes(plan, of_energy, of_turn)
     limits = limits_of(plan.options.robot) | plan.acting
-    # In orbit, `com_drift` is empty, because the centre of mass moves on a curve even without
-    # inputs and disturbances.
-    com_drift = np.linalg.norm(center - run.center, axis=1)
-    if robot.orbit:
-        com_drift = com_drift[:0]
-    missing = np.linalg.norm((kept - run.momentum).reshape(-1, 2, 3), axis=2)
-    drift = np.divide(missing, scale, np.zeros_like(missing), where=scale > 0.0)
     return Motion(
         t=run.t,
         q=run.q,
@@ -382,10 +372,6 @@ def motion_of(
         x=x,
         target=target,
         prediction=prediction,
-        energy=energy,
-        momentum=np.roll(momentum, 3, axis=1),
-        momentum_drift=drift.max(axis=1),
-        com_drift=com_drift,
         placement=pin.SE3ToXYZQUAT(state.reference),
         state_names=state.names,
         input_names=plant.actuation.names,
@@ -403,17 +389,61 @@ def motion_of(
         modes=tuple(map(attrgetter("name"), robot.modes)),
         mode_rotations=np.array([*map(attrgetter("rotation"), robot.modes)]),
         steered=plan.steered,
-        notes=(
-            *loop_notes,
-            *plan.times.notes,
-            *_energy_note(plan, run, energy, float(scale[0])),
-            *dict.fromkeys(notes),
-            *half_turn_notes(plan, beyond, predicted=predicting is not None),
-        ),
+        notes=notes,
         limit_names=tuple(limits),
         limits=np.array(list(limits.values())).reshape(-1, 2),
+        **balances,
         **_constraint_forces(plan, run),
     )
+
+
+def _notes(plan: Plan, of_energy: list[str], of_turn: list[str]) -> tuple[str, ...]:
+    """Return the notes of a motion, with the given notes on its energy and on half a turn."""
+    plant, policy, times = plan.plant, plan.policy, plan.times
+    loop_notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    if policy:
+        loop_notes = policy.loop_notes(times.sample * times.dt)
+        notes = policy.notes
+    if policy and plan.errors:
+        errors = note_on_errors(policy.sensors, plan.errors, plan.options.seed)
+        notes = (*notes, errors)
+    if plan.law and isinstance(plan.law.policy, BoundLaw):
+        notes += plan.law.policy.notes
+    if plant.constrained is not None:
+        notes = (*notes, *plant.constrained.notes(plan.q))
+    return (*loop_notes, *times.notes, *of_energy, *dict.fromkeys(notes), *of_turn)
+
+
+def _unknown_balances(rows: int) -> dict[str, Any]:
+    """Return the fields of a motion about energy and momentum, all NaN."""
+    unknown = np.broadcast_to(np.nan, (rows, 6))
+    return {
+        "energy": unknown[:, 0],
+        "momentum": unknown,
+        "momentum_drift": unknown[:, 0],
+    }
+
+
+def _balances(plan: Plan, run: Recording) -> tuple[dict[str, Any], list[str]]:
+    """Return the fields of a motion about energy and momentum, and notes on them."""
+    energy, momentum, center, kept, scale = Conserved(plan).histories(
+        run.t, run.q, run.v
+    )
+    # In orbit, `com_drift` is empty, because the centre of mass moves on a curve even without
+    # inputs and disturbances.
+    com_drift = np.linalg.norm(center - run.center, axis=1)
+    if plan.plant.robot.orbit:
+        com_drift = com_drift[:0]
+    missing = np.linalg.norm((kept - run.momentum).reshape(-1, 2, 3), axis=2)
+    drift = np.divide(missing, scale, np.zeros_like(missing), where=scale > 0.0)
+    fields = {
+        "energy": energy,
+        "momentum": np.roll(momentum, 3, axis=1),
+        "momentum_drift": drift.max(axis=1),
+        "com_drift": com_drift,
+    }
+    return fields, [*_energy_note(plan, run, energy, float(scale[0]))]
 
 
 def _constraint_forces(plan: Plan, run: Recording) -> dict[str, Any]:

@@ -9,6 +9,7 @@ import pytest
 import fflin
 from fflin.base import intervals
 from fflin.base.errors import InputError, UnknownNameError
+from fflin.base.process import Progress
 from fflin.commands.cli import main
 
 SPREADS = {"q_b": 0.05, "*.mass": 0.02, "q_b.noise": 1e-4}
@@ -143,11 +144,28 @@ def test_a_stopped_lane_keeps_its_own_rows(satellite):
     options = {"duration": 10.0, "dt": 0.25, "engine": "compiled"}
     runs = fflin.monte_carlo(*satellite, {"omega_b.x": [0.0, 1e7]}, runs=9, **options)
     assert 0 < runs.stopped.sum() < 9
-    motions = list(runs._job.replays(np.array(runs.drawn)))
+    drawn = np.array(runs.drawn)
+    motions = [*runs._job.replays(drawn[:8]), *runs._job.replays(drawn[8:])]
     for run, motion in enumerate(motions):
         expected = runs.replay(run)
         assert np.array_equal(motion.q, expected.q)
         assert np.array_equal(motion.t, expected.t)
+
+
+def test_the_duration_of_pointing_errors_is_announced(campaign, capsys, monkeypatch):
+    now = iter([0.0, 20.0])
+    monkeypatch.setattr("fflin.campaign.pointing.monotonic", lambda: next(now))
+    steps = []
+
+    class Bar(Progress):
+        def __call__(self, done, total, what="", hint=""):
+            steps.append((done, total))
+
+    campaign.pointing(4.0, progress=Bar())
+    assert capsys.readouterr().err == (
+        "fflin: pointing errors: about 2.7 min on 1 core\n"
+    )
+    assert steps == [(run + 1, 9) for run in range(9)]
 
 
 @pytest.mark.exhaustive

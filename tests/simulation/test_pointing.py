@@ -1,11 +1,13 @@
 """Pointing errors of motions that are known in closed form."""
 
 from dataclasses import replace
+from fractions import Fraction
 
 import numpy as np
 import pytest
 
 import fflin
+from fflin.base.errors import InputError
 
 
 @pytest.fixture(scope="module")
@@ -74,6 +76,66 @@ def test_errors_of_a_ramp(flown):
     assert turned(flown, rate * t, t).pointing(4.0, after=20.0).drift.largest.max() > 0
     short = turned(flown, rate * t, t).pointing(4.0, after=24.0)
     assert short.drift is None
+
+
+def _not_exceeded(sizes, durations, level):
+    """Return the smallest size that is not exceeded in a fraction of the time, exactly."""
+    weights = [round(duration * 2**60) for duration in durations.tolist()]
+    least = Fraction(level) * (1 - Fraction(1, 10**9)) * sum(weights)
+    lasting = 0
+    for row in np.argsort(sizes):
+        lasting += weights[row]
+        if lasting >= least:
+            return sizes[row]
+    raise AssertionError
+
+
+@pytest.mark.parametrize("regular", [True, False])
+def test_relative_errors_follow_their_definition_window_by_window(flown, regular):
+    rng = np.random.default_rng(3)
+    # With 21 rows in each of 20 windows, 95 % of the time end exactly at one of the sizes.
+    steps = np.full(40, 0.25) if regular else rng.uniform(0.1, 0.4, 40)
+    t = np.concatenate(([0.0], np.cumsum(steps)))
+    window = 5.0
+    rotations = np.zeros((41, 3))
+    rotations[:, 2] = rng.normal(size=41)
+    motion = turned(flown, np.radians(rotations[:, 2]), t)
+    found = motion.pointing(window, after=0.0).relative
+    starts = t[t <= t[-1] - window]
+    lasting = np.gradient(starts, edge_order=1)
+    lasting[[0, -1]] *= 0.5
+    sizes, durations = list[float](), list[float]()
+    for start, length in zip(starts, lasting, strict=True):
+        end = start + window
+        times = np.unique((*t[(t >= start) & (t <= end)], end))
+        mean = np.trapezoid(np.interp(times, t, rotations[:, 2]), times) / window
+        rows = np.flatnonzero((t >= start - 1e-9) & (t <= end + 1e-9))
+        sizes += [*np.abs(rotations[rows, 2] - mean)]
+        of_rows = np.gradient(t[rows], edge_order=1)
+        of_rows[[0, -1]] *= 0.5
+        durations += [*(length * of_rows / of_rows.sum())]
+    sizes, durations = np.array(sizes), np.array(durations)
+    near = {"rel": 1e-12}
+    assert found.largest[2] == pytest.approx(sizes.max(), **near)
+    rms = np.sqrt(durations @ sizes**2 / durations.sum())
+    assert found.rms[2] == pytest.approx(rms, **near)
+    for values, level in ((found.p95, "0.95"), (found.p997, "0.997")):
+        expected = _not_exceeded(sizes, durations, level)
+        assert values[2] == pytest.approx(expected, **near)
+        assert values[3] == pytest.approx(expected, **near)
+
+
+def test_a_window_shorter_than_a_step_is_refused(flown):
+    t = np.linspace(0.0, 10.0, 101)
+    motion = turned(flown, np.radians(np.sin(t)), t)
+    with pytest.raises(
+        InputError, match=r"window is 0\.05 s, but rows .* 0\.1 s apart"
+    ):
+        motion.pointing(0.05)
+    # In a window of one step, the error differs from its mean by half of its change.
+    found = motion.pointing(0.1, after=0.0)
+    change = np.abs(np.diff(np.sin(t))).max()
+    assert found.relative.largest[2] == pytest.approx(0.5 * change, rel=1e-9)
 
 
 def test_a_line_of_sight_is_judged_by_its_own_angle(flown):
