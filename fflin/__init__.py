@@ -77,7 +77,8 @@ _PUBLIC = {
     },
     "Tuning": {
         "tuning.tune": "tune",
-        "tuning.tuned": "Tuned GoalValue",
+        "tuning.tuned": "Tuned",
+        "tuning.goal_values": "GoalValue",
         "tuning.parameters": "Tunable",
         "tuning.structures": "PD PID LowPass Lead Notch StaticGain StateSpaceLaw CustomLaw "
         "Structure",

@@ -124,7 +124,7 @@ from fflin.uncertainty.lft import LFT as LFT
 # Tuning
 from fflin.tuning.tune import tune as tune
 from fflin.tuning.tuned import Tuned as Tuned
-from fflin.tuning.tuned import GoalValue as GoalValue
+from fflin.tuning.goal_values import GoalValue as GoalValue
 from fflin.tuning.parameters import Tunable as Tunable
 from fflin.tuning.structures import PD as PD
 from fflin.tuning.structures import PID as PID

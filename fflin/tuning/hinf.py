@@ -18,6 +18,7 @@ from fflin.base.validation import Array, instance, positive, whole
 from fflin.control.linear_controller import LinearController
 from fflin.linear.model import LinearModel
 from fflin.tuning.channels import Ends, channel_of, ends_of, signals_in_use
+from fflin.tuning.goal_values import rounded_up
 from fflin.tuning.goals import Goal, MaxGain
 from fflin.tuning.law import law_of
 from fflin.tuning.loop import (
@@ -29,7 +30,7 @@ from fflin.tuning.minimal import reduction_of
 from fflin.tuning.plant import Plant, plant_of, signals_of
 from fflin.tuning.reduction import truncations
 from fflin.tuning.structures import Names, indices, input_indices
-from fflin.tuning.tuned import matrices_of, rounded_up
+from fflin.tuning.tuned import matrices_of
 from fflin.tuning.verification import largest_in_band
 
 # Relative accuracy of the search, and relative sizes of added disturbances and outputs of states.

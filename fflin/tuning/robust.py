@@ -44,22 +44,29 @@ class UncertainLoop:
         law = embedded(law, range(ny), range(nu), ny + self._nw, nu + self._nw)
         self._loop = ClosedLoop(plant, law)
 
-    def bound(self, goal: Goal, ends: Ends | None, value: float) -> float:
-        """Return an upper bound of the value of a goal over the whole range.
+    def bound(self, goal: Goal, ends: Ends | None, value: float) -> tuple[float, str]:
+        """Return an upper bound of the value of a goal over the whole range, and why there is none.
 
         The first bound that is tried is 1.01 times `value`, the largest value that is known, or 1
         if the goal just holds. The result is infinite if no bound was found, and NaN for goals
         that are not gains.
         """
         if ends is None or not isinstance(goal, MaxGain | RollOff | Margin):
-            return math.nan
+            return math.nan, "no bound: only gains and margins have one"
         if not self._loop.is_stable or not math.isfinite(value):
-            return math.inf
+            return math.inf, "no bound: the loop is not stable"
         channels = self._channels(goal, ends)
         level = _ABOVE * max(value, _LEAST)
         if value <= 1.0 < level:
             level = 1.0
-        return gain_bound(channels, self._rates(ends), level)
+        bound = gain_bound(channels, self._rates(ends), level)
+        if math.isfinite(bound.value):
+            return bound.value, ""
+        reason = (
+            f"no bound was found near {bound.missing:.3g} rad/s; give narrower ranges, or more "
+            "damping there"
+        )
+        return math.inf, reason
 
     def _channels(self, goal: Goal, ends: Ends) -> Channels:
         """Return the response of the loop with the channels of the parameters and of a goal."""

@@ -21,6 +21,7 @@ from fflin.tuning.channels import ends_of, signals_in_use
 from fflin.tuning.closed_loop import ClosedLoop
 from fflin.tuning.criteria import Piece
 from fflin.tuning.curves import GoalLoops
+from fflin.tuning.goal_values import GoalValue, with_check
 from fflin.tuning.goals import Goal
 from fflin.tuning.hinf import hinf
 from fflin.tuning.law import Law, Matrices, without_unused_states
@@ -33,7 +34,7 @@ from fflin.tuning.robust import UncertainLoop
 from fflin.tuning.search import Minimum, minimise
 from fflin.tuning.starts import Start, reached, searched, stabilised, step_texts
 from fflin.tuning.structures import Structure, Structured
-from fflin.tuning.tuned import GoalValue, Tuned, is_active, with_check
+from fflin.tuning.tuned import Tuned, is_active
 from fflin.tuning.verification import peak_above, second_value
 
 # Goals limit the least factor if their value is nearer to the largest one than this fraction, or
@@ -544,10 +545,12 @@ class _Task:
             where = math.nan if found.piece is None else found.piece.where
             hard = measure.goal.hard
             active = is_active(found.value, hard, level)
-            bound = math.nan
+            bound, no_bound = math.nan, ""
             if uncertain is not None:
                 self.say(f"bound over the whole ranges: {measure.goal.label}")
-                bound = uncertain.bound(measure.goal, measure.ends, found.larger)
+                bound, no_bound = uncertain.bound(
+                    measure.goal, measure.ends, found.larger
+                )
             goals.append(
                 GoalValue(
                     measure.goal.label,
@@ -559,6 +562,7 @@ class _Task:
                     active,
                     self._least(measure.goal),
                     bound,
+                    no_bound,
                 )
             )
         parameters = self.structured.parameters

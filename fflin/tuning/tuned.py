@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -12,89 +11,25 @@ import numpy as np
 from fflin.base import html
 from fflin.base.figures import Figure
 from fflin.base.record import write_record
-from fflin.base.tables import counted, cut, folded, grid, width
+from fflin.base.tables import counted, cut, folded, grid
 from fflin.base.validation import Array
 from fflin.base.writing import as_path
 from fflin.control.linear_controller import LinearController
 from fflin.linear.model import LinearModel
 from fflin.tuning.curves import GoalLoops
 from fflin.tuning.files import record_of_law
+from fflin.tuning.goal_values import (
+    GoalValue,
+    goal_rows,
+    goal_table,
+    legend,
+    model_lines,
+    rounded_up,
+)
 from fflin.tuning.law import Law
 
 # A goal whose value is this near to the largest one is active.
 _ACTIVE = 1e-2
-
-
-@dataclass(frozen=True)
-class GoalValue:
-    """Value of a goal for a tuned law.
-
-    Attributes
-    ----------
-    label : str
-        The goal in words.
-    hard : bool
-    value : float
-        Value at the worst model; the goal holds if it is at most 1.
-    check : float
-        The same value by a second method; NaN for poles.
-    frequency : float
-        Frequency [rad/s] of the peak, magnitude [rad/s] of the pole, or time [s] of a step
-        response; NaN for variances.
-    parameters : mapping
-        Uncertain parameters at which the value occurs; empty for the nominal model.
-    active : bool
-        Whether this goal limits the others: its value is the largest, or it is a hard goal that
-        just holds.
-    least : float
-        Least value of all linear controllers for the nominal model, from `hinf`, within 1 %. NaN if
-        `hinf` does not accept the goal, or slycot is not installed.
-    bound : float
-        Upper bound of the value over the whole ranges of an `Uncertain`, from the structured
-        singular value; infinite if no bound was found. NaN for goals that are not gains, for
-        sampled laws, and for plants without ranges.
-
-    Examples
-    --------
-    >>> lin = fflin.linearize(fflin.load("planar_detumble"))
-    >>> law = fflin.PD("q_b", "tau_b", rates="omega_b")
-    >>> tuned = fflin.tune(lin, law, [fflin.Decay(0.1)], starts=1)
-    >>> tuned.goals[0].met, tuned.goals[0].label
-    (True, 'decay rate')
-    """
-
-    label: str
-    hard: bool
-    value: float
-    check: float
-    frequency: float
-    parameters: Mapping[str, float]
-    active: bool
-    least: float = math.nan
-    bound: float = math.nan
-
-    @property
-    def worst(self) -> float:
-        """The larger of both values."""
-        return with_check(self.value, self.check)
-
-    @property
-    def met(self) -> bool:
-        """Whether both values are at most 1."""
-        return self.worst <= 1.0
-
-
-def rounded_up(value: float) -> str:
-    """Return a number with four digits that is not smaller."""
-    if not math.isfinite(value):
-        return f"{value:g}"
-    size = 10.0 ** (math.floor(math.log10(value)) - 3)
-    return f"{math.ceil(value / size) * size:.4g}"
-
-
-def with_check(value: float, check: float) -> float:
-    """Return the larger of a value and its check, which is NaN if there is none."""
-    return value if math.isnan(check) else max(value, check)
 
 
 class Tuned(LinearController):
@@ -195,9 +130,10 @@ class Tuned(LinearController):
     def _repr_html_(self) -> str:
         parts = [
             html.paragraph(self._verdict()),
-            html.table(self._goal_rows(), "llrrrr"),
+            html.table(goal_rows(self.goals), "llrrrr"),
         ]
-        parts += [html.paragraph(line) for line in self._range_lines()]
+        lines = (*legend(self.goals), *self._range_lines())
+        parts += [html.paragraph(line) for line in lines]
         parts += [html.paragraph(note, "note") for note in self.remarks]
         parts.append(html.table(self._parameter_rows(), "lrl"))
         return html.result_card(self, *parts)
@@ -227,55 +163,6 @@ class Tuned(LinearController):
             return f"{text} contradict each other: no law was found that meets both"
         return f"Laws were found that meet two of {text}, but no law that meets all"
 
-    def _goal_rows(self) -> list[list[str]]:
-        """Return the table of the goals."""
-        several = any(goal.parameters for goal in self.goals)
-        rows = [["goal", "", "value", "check", "at", *(["model"] if several else [])]]
-        for goal in self.goals:
-            mark = "hard " if goal.hard else ""
-            if goal.active:
-                mark += "*"
-            check = "" if math.isnan(goal.check) else f"{goal.check:.6g}"
-            where = ""
-            if not math.isnan(goal.frequency):
-                unit = "s" if goal.label.startswith("step") else "rad/s"
-                where = f"{goal.frequency:.3g} {unit}"
-            model = [self._model(goal.parameters)] if several else []
-            rows.append([goal.label, mark, f"{goal.value:.6g}", check, where, *model])
-        return rows
-
-    def _fitting_rows(self) -> list[list[str]]:
-        """Return the table of the goals in the width of the terminal; long labels are cut."""
-        rows = self._goal_rows()
-        sizes = [max(map(len, column)) for column in zip(*rows, strict=True)]
-        room = width() - sum(sizes[1:]) - 2 * (len(sizes) - 1)
-        for row in rows:
-            if len(row[0]) > room:
-                row[0] = row[0][: max(room, 8) - 3] + "..."
-        return rows
-
-    def _models(self) -> list[Mapping[str, float]]:
-        """Return the parameters of the models in the table of goals, without the nominal one."""
-        models: list[Mapping[str, float]] = []
-        for goal in self.goals:
-            if goal.parameters and goal.parameters not in models:
-                models.append(goal.parameters)
-        return models
-
-    def _model(self, parameters: Mapping[str, float]) -> str:
-        """Return the number of a model in the table of the goals."""
-        if not parameters:
-            return "nominal"
-        return str(self._models().index(parameters) + 1)
-
-    def _model_lines(self) -> list[str]:
-        """Return the parameters of the numbered models."""
-        lines = []
-        for number, parameters in enumerate(self._models(), 1):
-            values = (f"{key} {value:.4g}" for key, value in parameters.items())
-            lines.append(f"model {number}: {', '.join(values)}")
-        return lines
-
     def _range_lines(self) -> list[str]:
         """Return what is known of the values between the examined models of an `Uncertain`."""
         if self.examined == len(self.points):
@@ -290,17 +177,23 @@ class Tuned(LinearController):
             for goal in self.goals
             if math.isfinite(goal.bound)
         ]
-        without = [goal.label for goal in self.goals if not math.isfinite(goal.bound)]
+        without: dict[str, list[str]] = {}
+        for goal in self.goals:
+            if not math.isfinite(goal.bound):
+                without.setdefault(goal.no_bound, []).append(goal.label)
         lines = []
         if finite:
             lines.append(
                 "upper bounds of the values over the whole ranges, by the structured singular "
                 f"value: {', '.join(finite)}; a bound above 1 does not certify its goal"
             )
+        for reason, labels in without.items():
+            lines.append(
+                f"not certified over the whole ranges: {', '.join(labels)}; {reason}"
+            )
         if without:
             lines.append(
-                f"not certified over the whole ranges: {', '.join(without)}; between the examined "
-                "models, the values can be larger"
+                "without a bound, the values can be larger between the examined models"
             )
         return lines
 
@@ -318,15 +211,13 @@ class Tuned(LinearController):
             f"within 1 %; stationarity {self.stationarity:.1e}; "
             f"{counted(len(self.points), 'model')} in the search, {self.examined} examined"
         )
-        rows = cut(self._fitting_rows(), "see goals")
-        goals = grid(rows, "llrrrr"[: len(rows[0])])
         parameters = grid(cut(self._parameter_rows(), "see parameters"), "lr")
-        legend = (
-            "value: largest value divided by its limit, which must be at most 1; check: the same "
-            "by a second method; *: active, limits the other goals"
-        )
-        parts = [folded([self._verdict()]), goals, folded([legend])]
-        if lines := self._model_lines():
+        parts = [
+            folded([self._verdict()]),
+            goal_table(self.goals),
+            folded(legend(self.goals)),
+        ]
+        if lines := model_lines(self.goals):
             parts.append(folded(lines))
         for goal in self.goals:
             if math.isfinite(goal.least):
@@ -358,6 +249,7 @@ class Tuned(LinearController):
                 "active": goal.active,
                 "least": goal.least,
                 "bound": goal.bound,
+                "no_bound": goal.no_bound,
                 "frequency": goal.frequency,
                 "parameters": goal.parameters,
             }

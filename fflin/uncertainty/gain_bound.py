@@ -61,7 +61,14 @@ class Scaling(NamedTuple):
     h: Array
 
 
-def gain_bound(channels: Channels, rates: Array, level: float) -> float:
+class Bound(NamedTuple):
+    """Upper bound of a gain; if it is infinite, the frequency [rad/s] near which none was found."""
+
+    value: float
+    missing: float = math.nan
+
+
+def gain_bound(channels: Channels, rates: Array, level: float) -> Bound:
     """Return an upper bound of the gain from d to e over all parameters, at least `level`.
 
     Parameters
@@ -74,7 +81,7 @@ def gain_bound(channels: Channels, rates: Array, level: float) -> float:
 
     Returns
     -------
-    float
+    Bound
         Bound; infinite if no bound below 20 times `level` was found in a limited number of
         searches. Each interval of frequencies is examined at five frequencies.
     """
@@ -93,16 +100,16 @@ def gain_bound(channels: Channels, rates: Array, level: float) -> float:
             continue
         failures += 1
         if failures > _FAILURES:
-            return math.inf
+            return Bound(math.inf, a)
         if halved < _HALVINGS and math.isfinite(b):
             middle = 0.5 * (a + b)
             waiting += [(middle, b, halved + 1), (a, middle, halved + 1)]
             continue
         bound *= raises.pop(0) if raises else _RAISE
         if bound > _LARGEST * level:
-            return math.inf
+            return Bound(math.inf, a)
         waiting.append((a, b, halved))
-    return bound
+    return Bound(bound)
 
 
 def _within(channels: Channels, low: float, high: float) -> Values:
