@@ -9,6 +9,9 @@ from dataclasses import dataclass
 
 from fflin.base.tables import cut, grid, width
 
+# A goal whose value is this near to the largest one is active.
+_ACTIVE = 1e-2
+
 # Least width of the column of the goals.
 _NARROWEST = 16
 
@@ -94,6 +97,12 @@ def rounded_up(value: float) -> str:
 def with_check(value: float, check: float) -> float:
     """Return the larger of a value and its check, which is NaN if there is none."""
     return value if math.isnan(check) else max(value, check)
+
+
+def is_active(value: float, hard: bool, level: float) -> bool:
+    """Return whether a goal limits the others; `level` is the largest value of the soft goals."""
+    limit = 1.0 if hard else level
+    return value >= limit * (1.0 - _ACTIVE)
 
 
 def models_of(goals: Sequence[GoalValue]) -> list[Mapping[str, float]]:

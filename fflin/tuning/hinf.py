@@ -8,19 +8,31 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from fflin.base import html
 from fflin.base.errors import InputError, optional_package
 from fflin.base.process import in_one_thread
+from fflin.base.tables import folded
 from fflin.base.validation import Array, instance, positive, whole
 from fflin.control.linear_controller import LinearController
 from fflin.linear.model import LinearModel
 from fflin.tuning.channels import Ends, channel_of, ends_of, signals_in_use
-from fflin.tuning.goal_values import rounded_up
+from fflin.tuning.closed_loop import ClosedLoop
+from fflin.tuning.criteria import pieces_of
+from fflin.tuning.goal_values import (
+    GoalValue,
+    goal_rows,
+    goal_table,
+    is_active,
+    legend,
+    rounded_up,
+)
 from fflin.tuning.goals import Goal, MaxGain
-from fflin.tuning.law import law_of
+from fflin.tuning.law import Law, law_of
 from fflin.tuning.loop import (
     sensor_delays,
     with_delayed_outputs,
@@ -31,7 +43,7 @@ from fflin.tuning.plant import Plant, plant_of, signals_of
 from fflin.tuning.reduction import truncations
 from fflin.tuning.structures import Names, indices, input_indices
 from fflin.tuning.tuned import matrices_of
-from fflin.tuning.verification import largest_in_band
+from fflin.tuning.verification import largest_in_band, second_value
 
 # Relative accuracy of the search, and relative sizes of added disturbances and outputs of states.
 _ACCURACY, _SIZES = 1e-3, (0.0, 1e-6, 1e-4)
@@ -64,17 +76,33 @@ class Generalised(NamedTuple):
 
 
 class _Design(NamedTuple):
-    """Controller for a generalised plant, its norm, and its signals among the model's signals."""
+    """Controller for a generalised plant, its norm, and its signals among the model's signals.
+
+    `model` is the plant of the goals with their `ends`. `full` contains the order and the norm of
+    the controller of full order.
+    """
 
     law: tuple[Array, Array, Array, Array]
     gamma: float
     plant: Generalised
     selected: Array
     placed: Array
+    model: Plant
+    goals: tuple[Goal, ...]
+    ends: tuple[Ends, ...]
+    full: tuple[int, float]
+
+    def continuous_law(self) -> Law:
+        """Return the continuous law from all outputs to all inputs of the model."""
+        A, B, C, D = self.law
+        B, C, D = B @ self.selected, self.placed @ C, self.placed @ D @ self.selected
+        return law_of((A, B, C, D), [])
 
 
 class HInfinity(LinearController):
     """Controller of full order that `hinf` designed; a linear policy.
+
+    ``print`` shows the value of each goal.
 
     Attributes
     ----------
@@ -83,6 +111,9 @@ class HInfinity(LinearController):
         limit. All goals hold if it is at most 1.
     order : int
         Number of states of the controller.
+    goals : tuple of GoalValue
+        Value of each goal by itself, divided by its limit; `least` is the norm of full order if
+        there is one goal.
 
     Examples
     --------
@@ -97,13 +128,81 @@ class HInfinity(LinearController):
     order: int
 
     def __init__(self, design: _Design, lin: LinearModel) -> None:
-        A, B, C, D = design.law
-        selected, placed = design.selected, design.placed
-        law = law_of((A, B @ selected, placed @ C, placed @ D @ selected), [])
+        law = design.continuous_law()
         super().__init__(matrices_of(law, lin.dt), lin)
         self.gamma = design.gamma
-        self.order = len(A)
+        self.order = len(law.A)
         self._design = design
+
+    @cached_property
+    def goals(self) -> tuple[GoalValue, ...]:
+        """Value of each goal by itself, divided by its limit."""
+        design = self._design
+        loop = ClosedLoop(design.model, design.continuous_law())
+        peaks = []
+        for goal, ends in zip(design.goals, design.ends, strict=True):
+            channel = channel_of(goal, ends, design.model)
+            piece = pieces_of(goal, ends, channel, loop, np.zeros(0))[0]
+            check = second_value(goal, ends, channel, loop)
+            peaks.append((piece, math.nan if check is None else check))
+        largest = max(piece.value for piece, _ in peaks)
+        least = design.full[1] if len(peaks) == 1 else math.nan
+        return tuple(
+            GoalValue(
+                goal.label,
+                goal.hard,
+                piece.value,
+                check,
+                piece.where,
+                {},
+                is_active(piece.value, False, largest),
+                least,
+            )
+            for goal, (piece, check) in zip(design.goals, peaks, strict=True)
+        )
+
+    def _verdict(self) -> str:
+        """Return whether the goals hold, and the norm of the loop."""
+        missed = [goal.label for goal in self.goals if not goal.met]
+        text = f"{', '.join(missed)} not met" if missed else "all goals hold"
+        together = ""
+        if len(self.goals) > 1:
+            together = " from all inputs to all outputs of the goals"
+        return (
+            f"{self.lin.robot}: {text} with order {self.order}; the norm of the loop{together} is "
+            f"{self.gamma:.4g}"
+        )
+
+    def _bound(self) -> str:
+        """Return the least norm of all linear controllers."""
+        order, gamma = self._design.full
+        return (
+            f"full order {order}: the norm is {gamma:.4g}, within 1 % of the least norm of all "
+            "linear controllers"
+        )
+
+    def report(self) -> str:
+        """Return the report: goals with their values, the order, and the norm of full order."""
+        return "\n\n".join(
+            (
+                folded([self._verdict()]),
+                goal_table(self.goals),
+                folded(legend(self.goals)),
+                folded([self._bound()]),
+            )
+        )
+
+    def __str__(self) -> str:
+        return self.report()
+
+    def _repr_html_(self) -> str:
+        return html.result_card(
+            self,
+            html.paragraph(self._verdict()),
+            html.table(goal_rows(self.goals), "llrrrr"),
+            *(html.paragraph(line) for line in legend(self.goals)),
+            html.paragraph(self._bound()),
+        )
 
     def reduced(
         self, order: int | None = None, *, below: float | None = None
@@ -303,7 +402,18 @@ def hinf(
     law, gamma = synthesis(plant)
     ny, nu = len(signals.outputs), len(signals.inputs)
     selected, placed = np.eye(ny)[list(rows)], np.eye(nu)[:, list(columns)]
-    return HInfinity(_Design(law, gamma, plant, selected, placed), lin)
+    design = _Design(
+        law,
+        gamma,
+        plant,
+        selected,
+        placed,
+        model,
+        tuple(every),
+        tuple(ends),
+        (len(law[0]), gamma),
+    )
+    return HInfinity(design, lin)
 
 
 def _plant(

@@ -21,7 +21,7 @@ from fflin.tuning.channels import ends_of, signals_in_use
 from fflin.tuning.closed_loop import ClosedLoop
 from fflin.tuning.criteria import Piece
 from fflin.tuning.curves import GoalLoops
-from fflin.tuning.goal_values import GoalValue, with_check
+from fflin.tuning.goal_values import GoalValue, is_active, with_check
 from fflin.tuning.goals import Goal
 from fflin.tuning.hinf import hinf
 from fflin.tuning.law import Law, Matrices, without_unused_states
@@ -34,7 +34,7 @@ from fflin.tuning.robust import UncertainLoop
 from fflin.tuning.search import Minimum, minimise
 from fflin.tuning.starts import Start, reached, searched, stabilised, step_texts
 from fflin.tuning.structures import Structure, Structured
-from fflin.tuning.tuned import Tuned, is_active
+from fflin.tuning.tuned import Tuned
 from fflin.tuning.verification import peak_above, second_value
 
 # Goals limit the least factor if their value is nearer to the largest one than this fraction, or

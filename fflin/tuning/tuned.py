@@ -28,9 +28,6 @@ from fflin.tuning.goal_values import (
 )
 from fflin.tuning.law import Law
 
-# A goal whose value is this near to the largest one is active.
-_ACTIVE = 1e-2
-
 
 class Tuned(LinearController):
     """Law that `tune` found; a linear policy.
@@ -296,9 +293,3 @@ def matrices_of(law: Law, dt: float) -> tuple[Array, Array, Array, Array, float]
         D + C @ inverse @ B,
         dt,
     )
-
-
-def is_active(value: float, hard: bool, level: float) -> bool:
-    """Return whether a goal limits the others; `level` is the largest value of the soft goals."""
-    limit = 1.0 if hard else level
-    return value >= limit * (1.0 - _ACTIVE)

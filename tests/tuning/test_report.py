@@ -2,10 +2,12 @@
 
 import math
 
+import numpy as np
 import pytest
 
 import fflin
 from fflin.tuning.goal_values import goal_table, legend
+from tests.support.tuning import of_sweep
 from tests.tuning.test_hidden_modes import equal_wings
 
 NAMES = ("star_tracker.x", "star_tracker.y", "star_tracker.z", "gyroscope.hub.x")
@@ -95,3 +97,37 @@ def test_the_report_says_why_a_bound_is_missing(untied):
         "whole ranges: decay rate, damping ratio; no bound: only gains and margins"
         in report
     )
+
+
+@pytest.fixture(scope="module")
+def designed():
+    """A controller of full order for two goals."""
+    pytest.importorskip("slycot")
+    robot = fflin.load(
+        "cubesat", inputs=[fflin.BaseTorque()], outputs=[fflin.BasePose()]
+    )
+    goals = [
+        fflin.MaxGain({"tau_b": 0.01}, {"q_b": 0.05}),
+        fflin.MaxGain({"q_b": 1e-3}, {"tau_b": 0.02}),
+    ]
+    return fflin.hinf(fflin.linearize(robot), goals, measured="q_b")
+
+
+def test_each_goal_of_hinf_has_the_value_of_a_sweep(designed):
+    lin = designed.lin
+    frequencies = np.geomspace(1e-2, 1e3, 400)
+    gains = of_sweep(designed, (lin.A, lin.B, lin.C, lin.D), frequencies)
+    torque, effort = gains[:, 0, 0] * 0.01 / 0.05, gains[:, 1, 1] * 1e-3 / 0.02
+    for goal, swept in zip(designed.goals, (torque, effort), strict=True):
+        assert goal.value == pytest.approx(swept.max(), rel=1e-2)
+        assert goal.value >= swept.max() * (1.0 - 1e-6)
+        assert goal.value == pytest.approx(goal.check, rel=1e-6)
+        assert goal.value <= designed.gamma * (1.0 + 1e-6) and math.isnan(goal.least)
+    assert designed.goals[0].label in str(designed)
+
+
+def test_the_report_of_hinf_has_the_order_and_the_norm(designed):
+    report = str(designed).replace("\n  ", " ")
+    assert f"hold with order {designed.order}; the norm of the loop from all" in report
+    assert f"full order {designed.order}: the norm is {designed.gamma:.4g}" in report
+    assert repr(designed).startswith("HInfinity('cubesat', gamma=")

@@ -342,6 +342,9 @@ def test_a_reduced_controller_keeps_the_goals_in_a_sweep(optimal):
 def test_a_reduced_controller_may_have_a_given_order_or_norm(optimal):
     near = optimal.reduced(below=1.01 * optimal.gamma)
     assert near.order == 8 and near.gamma <= 1.01 * optimal.gamma
+    report = str(near)
+    assert f"order 8; the norm of the loop is {near.gamma:.4g}" in report
+    assert f"full order 10: the norm is {optimal.gamma:.4g}" in report
     # Two of the ten states do not matter, so the norm of order 8 is that of full order.
     assert optimal.reduced(8).gamma == pytest.approx(optimal.gamma, rel=1e-3)
     with pytest.raises(fflin.InputError, match="order 0"):
