@@ -1,7 +1,7 @@
 """Figures of linear models and control loops: matrices, modes, checks, poles and margins."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -33,6 +33,7 @@ from fflin.base.process import in_one_thread
 from fflin.base.tables import counted, rounding
 from fflin.base.validation import (
     Array,
+    Mask,
     Values,
     dimension,
     instance,
@@ -75,6 +76,13 @@ _SLOWEST = 1e-9
 
 # Largest loop gain of a Nichols plot [dB].
 _DECIBELS = 60.0
+
+# Space beside the curves and the critical points of a Nichols plot [deg].
+_BESIDE = 20.0
+
+# Largest change of the phase [rad] between two points of a Nichols plot, how often the distance of
+# the points is halved, and the largest number of points.
+_SMOOTH, _HALVINGS, _MOST = 0.2, 6, 4000
 
 # Vertical offset of the plotted points of each test. Without it, the points of two independent
 # computations would overlap.
@@ -430,11 +438,41 @@ def loop_responses(closed: ClosedLoop) -> tuple[Array, Values]:
     start = 0.01 * min(float(rates.min(initial=end)), end)
     w = np.geomspace(start, end, _POINTS)
     system = as_continuous(*loop, closed.dt)
-    # The bilinear map of a sampled loop warps its frequencies.
-    warped = np.tan(0.5 * w * closed.dt) if closed.dt else w
-    halves = np.array([np.diag(system.at(at)) for at in warped.tolist()])
-    # Each entry is (S - T)/2 of one channel, S = 1/(1 + L) and T = L/(1 + L).
-    return w, (0.5 - halves) / (0.5 + halves)
+
+    def at(frequencies: Array) -> Values:
+        # The bilinear map of a sampled loop warps its frequencies.
+        warped = np.tan(0.5 * frequencies * closed.dt) if closed.dt else frequencies
+        halves = np.array([np.diag(system.at(w)) for w in warped.tolist()])
+        # Each entry is (S - T)/2 of one channel, S = 1/(1 + L) and T = L/(1 + L).
+        gains: Values = (0.5 - halves) / (0.5 + halves)
+        return gains
+
+    return smooth(w, at)
+
+
+def smooth(w: Array, at: Callable[[Array], Values]) -> tuple[Array, Values]:
+    """Return responses (k, n) at frequencies between which their visible phases change little."""
+    response = at(w)
+    for _ in range(_HALVINGS):
+        turns = np.abs(np.angle(response[1:] * response[:-1].conj()))
+        shown = _is_visible(response)
+        turns[~(shown[1:] | shown[:-1])] = 0.0
+        coarse = (turns > _SMOOTH).any(axis=1)
+        if not coarse.any() or len(w) > _MOST:
+            break
+        between = np.sqrt(w[:-1] * w[1:])[coarse]
+        places = np.flatnonzero(coarse) + 1
+        w = np.insert(w, places, between)
+        response = np.insert(response, places, at(between), axis=0)
+    return w, response
+
+
+def _is_visible(response: Values) -> Mask:
+    """Return which loop gains are within the limits of a Nichols plot."""
+    sizes = np.abs(response)
+    largest = 10.0 ** (_DECIBELS / 20.0)
+    visible: Mask = (sizes <= largest) & (sizes >= 1.0 / largest)
+    return visible
 
 
 # A loop gain of zero has no finite decibels, and its point is not drawn.
@@ -494,14 +532,26 @@ def draw_nichols(panel: Axes, response: Values) -> None:
     """Draw the Nichols plot of loop gains (k, n)."""
     panel.set_prop_cycle(color=cycle(response.shape[1]))
     decibels = 20.0 * np.log10(np.abs(response))
-    angles = np.column_stack([_phase(values) for values in response.T])
+    angles = np.column_stack([phase_of(values) for values in response.T])
     panel.plot(angles, decibels, lw=1.0)
-    turns = np.arange(math.floor(angles.min() / 360.0), 1)
-    critical = 360.0 * turns + 180.0
-    critical = critical[critical < max(angles.max(), 0.0)]
+    shown = angles[_is_visible(response)]
+    critical = critical_phases(shown)
     panel.plot(critical, np.zeros(len(critical)), "+", color=_LINE, ms=10)
     panel.set(title="Nichols plot", xlabel="phase [deg]", ylabel="|L| [dB]")
     panel.set_ylim(-_DECIBELS, _DECIBELS)
+    extent = np.concatenate((shown, critical))
+    panel.set_xlim(extent.min() - _BESIDE, extent.max() + _BESIDE)
+    panel.locator_params("x", nbins=8, steps=[1, 1.8, 3.6, 4.5, 9, 10])
+
+
+def critical_phases(angles: Array) -> Array:
+    """Return the phases [deg] of L = -1 that are at most 180 deg from the range of phases."""
+    if not angles.size:
+        return np.array([-180.0])
+    first = math.ceil(angles.min() / 360.0)
+    last = math.floor(angles.max() / 360.0) + 1
+    phases: Array = 360.0 * np.arange(first, last + 1) - 180.0
+    return phases
 
 
 def _plot_gain(gain: Gain, path: str | Path | None, axes: Axes | None) -> Figure:
@@ -582,10 +632,14 @@ def _bode(sizes: Axes, phases: Axes, w: Array, response: Values) -> None:
     colors = cycle(response.shape[1])
     sizes.set_prop_cycle(color=colors)
     sizes.loglog(w, np.abs(response), lw=1.0)
+    shown = []
     for color, values in zip(colors, response.T, strict=True):
-        phases.semilogx(w, _phase(values), color=color, lw=1.0)
+        angles = phase_of(values)
+        phases.semilogx(w, angles, color=color, lw=1.0)
+        shown.append(angles[_is_visible(values)])
     sizes.axhline(1.0, color=_LINE, lw=0.8)
-    phases.axhline(-180.0, color=_LINE, lw=0.8)
+    for critical in critical_phases(np.concatenate(shown)):
+        phases.axhline(critical, color=_LINE, lw=0.8)
     phases.locator_params("y", nbins=6, steps=[1, 1.5, 3, 4.5, 6, 9, 10])
     sizes.set(title="loop gain", ylabel="|L|")
     phases.set(title="loop phase", ylabel="[deg]")
@@ -593,10 +647,17 @@ def _bode(sizes: Axes, phases: Axes, w: Array, response: Values) -> None:
         axes.set(xlabel="frequency [rad/s]", xlim=(w[0], w[-1]))
 
 
-def _phase(values: Values) -> Array:
-    """Return the continuous phase [deg] of a response, which ends between -360 deg and 0."""
+def phase_of(values: Values) -> Array:
+    """Return the continuous phase [deg] of a response.
+
+    It is between -360 deg and 0 at the first frequency where the gain crosses 1, or where it is
+    nearest to 1. At higher frequencies, the gain of a sampled loop may be a rounding error.
+    """
     angle = np.degrees(np.unwrap(np.angle(values)))
-    turns = math.ceil(angle[-1] / 360.0)
+    sizes = np.abs(values)
+    crossings = np.flatnonzero((sizes[1:] > 1.0) != (sizes[:-1] > 1.0))
+    at = crossings[0] if len(crossings) else np.abs(sizes - 1.0).argmin()
+    turns = math.ceil(angle[at] / 360.0)
     return np.asarray(angle - 360.0 * turns)
 
 

@@ -6,7 +6,7 @@ import pytest
 import fflin
 from fflin.base.errors import InputError
 from fflin.control.margins import closed_loop, margins_at_once
-from fflin.control.plots import loop_responses
+from fflin.control.plots import critical_phases, loop_responses, phase_of, smooth
 from fflin.control.policy import FunctionPolicy
 from fflin.dynamics.delays import HeldSystem
 
@@ -59,6 +59,51 @@ def test_a_sampled_loop_has_the_response_of_the_held_plant(satellite):
         value = (C @ np.linalg.solve(z * np.eye(len(Ad)) - Ad, Bd))[0, 0]
         assert response[k, 0] == pytest.approx(value, rel=1e-6)
     assert w[-1] == pytest.approx(np.pi / h)
+
+
+@pytest.mark.parametrize(
+    ("angles", "marks"),
+    [
+        ([-290.0, -95.0], [-180.0]),
+        ([-90.0, -80.0], [-180.0]),
+        ([-290.0, 80.0], [-180.0, 180.0]),
+        ([-700.0, -170.0], [-540.0, -180.0]),
+        ([540.0, 625.0], [540.0]),
+        ([], [-180.0]),
+    ],
+)
+def test_critical_points_repeat_every_360_deg_within_180_deg_of_a_curve(angles, marks):
+    assert critical_phases(np.array(angles)).tolist() == marks
+
+
+@pytest.mark.parametrize("how", [(0.0, None), (0.3, None), (0.2, 0.25), (0.9, 0.25)])
+def test_the_phase_margin_is_the_distance_of_the_curve_from_a_critical_point(
+    how, satellite
+):
+    lin, law = satellite
+    _, response = loop_responses(closed_loop(law, lin, *how))
+    margins = fflin.margins(law, lin, delay=how[0], sample=how[1])
+    for values, channel in zip(response.T, margins.channels, strict=True):
+        angles, decibels = phase_of(values), 20.0 * np.log10(np.abs(values))
+        marks = critical_phases(angles[np.abs(decibels) < 60.0])
+        crossing = np.interp(0.0, -decibels, angles)
+        assert -360.0 < crossing <= 0.0 and np.allclose(marks % 360.0, 180.0)
+        assert np.abs(marks - crossing).min() == pytest.approx(channel.phase, abs=0.1)
+
+
+def test_a_resonance_between_two_points_is_drawn_with_its_peak_and_its_phase():
+    damping = 2e-3
+
+    def gain(w):
+        return (0.1 / (1.0 - w**2 + 2j * damping * w))[:, None]
+
+    w, response = smooth(np.geomspace(0.1, 10.0, 100), gain)
+    np.testing.assert_array_equal(response, gain(w))
+    assert (np.diff(w) > 0.0).all() and len(w) < 300
+    assert np.abs(response).max() == pytest.approx(0.1 / (2.0 * damping), rel=0.01)
+    angles = phase_of(response[:, 0])
+    assert angles[0] - angles[-1] == pytest.approx(180.0, abs=0.5)
+    assert np.abs(np.diff(angles)).max() < 40.0
 
 
 @pytest.mark.exhaustive
