@@ -74,7 +74,9 @@ def pytest_configure(config):
     """Compile once, before the workers begin; watch for processes that tests start."""
     if hasattr(config, "workerinput"):
         sys.addaudithook(_watch)
-    elif kernels.wanted(config.option.markexpr) and not config.option.collectonly:
+    elif not config.option.collectonly and kernels.wanted(
+        config.option.markexpr, config.args
+    ):
         kernels.prepare()
 
 
