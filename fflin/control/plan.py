@@ -27,7 +27,7 @@ from fflin.linear.model import LinearModel
 from fflin.linear.optimality import STATIONARY, Optimality
 from fflin.linear.trajectory import Trajectory
 from fflin.robot.fields import chosen_limits, input_limits
-from fflin.robot.inputs import JointTorque, ReactionWheel
+from fflin.robot.inputs import JointTorque, ReactionWheel, has_magnetorquers
 from fflin.robot.robot import Robot
 
 # Largest permitted error at the goal, and largest permitted violation of a state limit at a knot
@@ -87,6 +87,11 @@ def plan(
     reason, and their final deflection. A warning is issued if it exceeds 5 % of the largest
     deflection.
 
+    In orbit, the motion is relative to the orbital frame with the axes ``lvlh``, also at its ends:
+    a robot at rest rotates with the orbit. The plan includes the gravity gradient and the rotation
+    of this frame. It begins at t = 0, which defines the position in an elliptic orbit. Plans in
+    orbit need about three to five times the computing time.
+
     The base may rotate by any angle, including full turns if the angular rates at both ends require
     them. Continuous joints take the shorter direction.
 
@@ -101,9 +106,10 @@ def plan(
     robot : Robot
     goal : LinearModel, (q, v) or array_like (nx,)
         End of the motion: the operating point of a model, a configuration and velocity in
-        Pinocchio's order, or a state of `StateMap` in frame "hybrid". In (q, v), q=None means the
-        neutral configuration, and v=None means rest. Wheels may end at any angle and, with v=None,
-        at any speed, which the momentum determines. If `free` contains omega_b, they end at rest.
+        Pinocchio's order, or a state of `StateMap` in the default frame. In (q, v), q=None means
+        the neutral configuration, and v=None means rest. Wheels may end at any angle and, with
+        v=None, at any speed, which the momentum determines. If `free` contains omega_b, they end at
+        rest.
     duration : float
         Duration of the motion [s].
     x0, q0, v0 : array_like, optional
@@ -175,7 +181,13 @@ def plan(
     (True, True)
     """
     state = StateMap(robot)
-    refuse_orbit(robot, "plans")
+    if robot.constraints:
+        refuse_orbit(robot, "plans of robots with constraints")
+    if has_magnetorquers(robot.inputs):
+        raise InputError(
+            f"'{robot.name}' has magnetorquers, whose torque depends on the attitude, and plans do "
+            "not support this; give other inputs with robot.replace(inputs=[...])"
+        )
     start = points.point_of(state, x0, q0, v0, partial(points.start_of, robot))
     start, end = _on_constraints(state, start, _goal_point(state, goal))
     knots, duration = whole("knots", knots, 3, 10_000), number("duration", duration)

@@ -61,7 +61,7 @@ class Schedule(ModelDesign):
     switched_names: tuple[str, ...] = field(default=(), kw_only=True)
     orbit: str = field(
         default_factory=str, kw_only=True
-    )  # of a periodic motion, as JSON text
+    )  # of the robot, as JSON text; empty without an orbit
 
     @property
     def partition(self) -> Partition:
@@ -204,7 +204,7 @@ class GainSchedule(Schedule):
         for names in self.partition.names:
             require_same(made, state, "state", names, None, part=reduced)
         require_same(made, state, "input", self.input_names, None)
-        if self.period and self.orbit != orbit_text(robot):
+        if self.orbit != orbit_text(robot):
             raise InputError(
                 f"{made} in another orbit than that of '{robot.name}'; use the same orbit for both"
             )

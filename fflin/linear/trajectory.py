@@ -20,7 +20,7 @@ from fflin.base.tables import data_frame, folded
 from fflin.base.validation import ArrayLike, as_double, frozen, instance, number, vector
 from fflin.base.writing import as_path
 from fflin.dynamics.aba import Aba
-from fflin.dynamics.coordinates import frame_of, refuse_orbit
+from fflin.dynamics.coordinates import frame_of
 from fflin.dynamics.integrators import DEFAULT_INTEGRATOR, integrate_rows
 from fflin.dynamics.points import require_slow
 from fflin.dynamics.state import Actuation, StateMap
@@ -123,12 +123,13 @@ class Trajectory(Design):
         - hybrid: force in world axes, torque in base axes;
         - world: force and torque in world axes.
 
-        If the inputs are held ("previous"), the force and torque are constant in these axes.
+        If the inputs are held ("previous"), the force and torque are constant in these axes. In
+        orbit, q and v are relative to the orbital frame with the axes ``lvlh``, t = 0 is defined by
+        the orbit, and `frame` is "local" or "lvlh", which has force in the axes ``lvlh``.
     period : float
         Time [s] after which the motion repeats: the time from the first knot to the last, or 0 for
-        a motion that ends. The states at both knots must be equal. In orbit, only periodic motions
-        are accepted, as `linearize_orbit` makes them. Their q and v are relative to the orbital
-        frame with the axes ``lvlh``, and t = 0 is defined by the orbit.
+        a motion that ends. The states at both knots must be equal. `linearize_orbit` makes periodic
+        motions.
     verified : bool
         False for data from a file without a SHA-256 digest, because damage to such a file cannot be
         detected.
@@ -168,8 +169,11 @@ class Trajectory(Design):
         robot = instance(
             "robot", self.robot, Robot, "a fflin.Robot; fflin.load makes one"
         )
-        if not self.period:
-            refuse_orbit(robot, "trajectories without a period")
+        if robot.orbit and self.frame == "hill":
+            raise InputError(
+                "frame is 'hill', but trajectories in orbit are relative to the axes lvlh; give "
+                "frame='local' or 'lvlh', also to simulate"
+            )
         nu = len(self.actuation.names)
         times = vector(
             "t", as_double("t", self.t), np.size(self.t), "times of the knots"

@@ -55,7 +55,9 @@ from fflin.dynamics.integrators import held_exponential, integrator
 from fflin.dynamics.methods import DEFAULT_METHOD
 from fflin.dynamics.state import StateMap, selection
 from fflin.linear.model import Delay, LinearModel
+from fflin.linear.trajectory import Trajectory
 from fflin.robot.fields import chosen_limits, input_keys_of
+from fflin.robot.orbit import is_elliptic
 from fflin.robot.robot import Robot
 from fflin.simulation.pace import (
     LONGEST_STEP,
@@ -413,7 +415,7 @@ def _state_of(policy: Policy | None, options: SimulationOptions) -> StateMap:
         )
     followed = policy.followed_trajectory if policy else None
     if followed is not None:
-        _require_same_orbit(robot, followed.robot)
+        _require_same_orbit(robot, followed)
     elif own_frame and _designed_in_orbit(policy, own_frame, robot) != bool(
         robot.orbit
     ):
@@ -442,8 +444,9 @@ def _designed_in_orbit(policy: Policy | None, frame: str, robot: Robot) -> bool:
     return policy.model.mean_motion > 0.0
 
 
-def _require_same_orbit(robot: Robot, design: Robot) -> None:
-    """Raise `InputError` if a trajectory was made for a robot in another orbit."""
+def _require_same_orbit(robot: Robot, followed: Trajectory) -> None:
+    """Raise `InputError` if a trajectory was made for another orbit, or begins at another time."""
+    design = followed.robot
     if robot.orbit != design.orbit:
         given = [
             f"in {x.orbit}" if x.orbit else "not in orbit" for x in (robot, design)
@@ -451,6 +454,12 @@ def _require_same_orbit(robot: Robot, design: Robot) -> None:
         raise InputError(
             f"'{robot.name}' is {given[0]}, but the trajectory to follow is for a robot "
             f"{given[1]}; use the same orbit for both"
+        )
+    start = float(followed.t[0])
+    if robot.orbit and is_elliptic(robot.orbit) and start:
+        raise InputError(
+            f"the trajectory begins at t = {start:g} s, but simulations begin at t = 0, elsewhere "
+            "in the elliptic orbit; give a trajectory that begins at t = 0"
         )
 
 

@@ -69,18 +69,13 @@ def test_refused(regulated):
     free = robot.replace(orbit=None)
     along = fflin.simulate(free, duration=0.1).trajectory()
     schedule = fflin.tvlqr(fflin.linearize_trajectory(free, along), 1.0, 1.0, 1.0)
-    q, v, u = robot.neutral(), np.zeros(robot.nv), np.zeros(len(lin.u0))
-    knots = [np.tile(row, (2, 1)) for row in (q, v, u)]
     free_model = fflin.linearize(free)
     policy = fflin.StateFeedback(free_model, fflin.lqr(free_model).K)
     for refused in (
         lambda: fflin.funnel(robot, schedule, goal={"attitude": 1.0}),
         lambda: fflin.simulate(robot, schedule),
-        lambda: fflin.linearize_trajectory(robot, [0.0, 0.1], *knots),
-        lambda: fflin.plan(robot, (q, v), 1.0),
-        lambda: fflin.simulate(robot, duration=0.1).trajectory(),
     ):
-        with pytest.raises(fflin.InputError, match=r"robot\.replace\(orbit=None\)"):
+        with pytest.raises(fflin.InputError, match="another orbit"):
             refused()
     with pytest.raises(fflin.InputError, match="'hybrid'"):
         fflin.simulate(robot, policy, duration=0.1)

@@ -81,8 +81,8 @@ def initial_guess(
 
 
 def conserves_momentum(robot: Robot) -> bool:
-    """Return whether all inputs are torques between two bodies of the robot."""
-    return all(
+    """Return whether all inputs are torques between two bodies of a robot that is not in orbit."""
+    return robot.orbit is None and all(
         isinstance(item, JointTorque)
         or (isinstance(item, ReactionWheel) and item.inertia is not None)
         for item in robot.inputs
@@ -148,6 +148,7 @@ def _needs_loops(shooting: Shooting, asked: Mask) -> bool:
         all(isinstance(item, JointTorque) for item in state.robot.inputs)
         and not shooting.wheels
         and not state.robot.constraints
+        and not state.robot.orbit
         and len(state.robot.inputs) > 1
         and bool(asked[state.groups.q_b].any())
     )

@@ -161,22 +161,26 @@ class Shooting:
         determining[rows[order[:rank]]] = True
         return determining
 
-    def motions(self, q: Array, v: Array, u: Array, steps: int = 0) -> Motions:
+    def motions(
+        self, q: Array, v: Array, u: Array, steps: int = 0, t: Array | None = None
+    ) -> Motions:
         """Integrate each interval from its first knot; q, v and the inputs u have N + 1 rows each.
 
         By default, each interval has the number of steps that `refine` found, but at least _STEPS.
+        `t` (N,) contains the times of the first knots, by default of all intervals of the plan.
         """
         q = q[:-1]
         v = v[:-1]
         first = u[:-1]
         steps = steps or max(self.steps, _STEPS)
         h = self.h[0]
+        begin = self.t[:-1] if t is None else t
         change = 0.0 * first if self.held else np.diff(u, axis=0)
         method = DEFAULT_INTEGRATOR(self.state.robot.model, h / steps, len(q))
         points = [(q, v)]
 
         def rate(t: float, q: Array, v: Array) -> Array:
-            return self._aba.accelerations(q, v, first + t / h * change)
+            return self._aba.accelerations(q, v, first + t / h * change, begin + t)
 
         for step in range(steps):
             end = method.step(rate, step * method.dt, *points[-1])
@@ -197,7 +201,8 @@ class Shooting:
         """Integrate the motion from a point under the inputs u; return q and v at the knots."""
         q, v = (np.tile(values, (len(u), 1)) for values in start)
         for k in range(len(u) - 1):
-            motions = self.motions(q[k : k + 2], v[k : k + 2], u[k : k + 2])
+            ends = slice(k, k + 2)
+            motions = self.motions(q[ends], v[ends], u[ends], t=self.t[k : k + 1])
             q[k + 1], v[k + 1] = motions[0][0, -1], motions[1][0, -1]
         return q, v
 
@@ -308,6 +313,7 @@ class Shooting:
         substeps = max(1, self.resolving // steps)
         stages = 2 * steps + 1  # of an interval; neighbouring steps share a stage
         s = np.arange(stages) / (2.0 * steps)
+        times = self.t[:-1, None] + s * self.h[:, None]
         if self.held:
             s = np.zeros(stages)  # the input of the first knot is held
         fine = max(4 * steps, self.resolving)
@@ -316,8 +322,8 @@ class Shooting:
         q = q[:, ::every]
         v = v[:, ::every]
         inputs = u[:-1, None] + s[:, None] * np.diff(u, axis=0)[:, None]
-        points = (rows.reshape(-1, rows.shape[-1]) for rows in (q, v, inputs))
-        along, driven = self._models(*points)
+        points = [rows.reshape(-1, rows.shape[-1]) for rows in (q, v, inputs)]
+        along, driven = self._models(points[0], points[1], points[2], times.ravel())
         A = along.reshape(N, stages, nx, nx)
         B = driven.reshape(N, stages, nx, nu)
         A = self._size[:, None] * A / self._size
@@ -349,7 +355,8 @@ class Shooting:
     def _resolving(self, q: Array, v: Array, u: Array) -> int:
         """Return the number of steps per interval that resolve the poles at the knots q, v."""
         some = [0, len(q) // 2, -1]
-        poles = np.linalg.eigvals(self._models(q[some], v[some], u[some])[0])
+        A, _ = self._models(q[some], v[some], u[some], self.t[some])
+        poles = np.linalg.eigvals(A)
         if not np.isfinite(poles).all():
             return 1
         tolerance = _RESOLVED * np.maximum(1.0 / self.t[-1], np.abs(poles.real))
@@ -374,16 +381,16 @@ class Shooting:
         """Return the squared frequency [1/s^2] of each deflection at the start of a motion."""
         if not self.deflections:
             return np.zeros(0)
-        A = self._models(q[:1], v[:1], u[:1])[0][0]
+        A = self._models(q[:1], v[:1], u[:1], self.t[:1])[0][0]
         rows = self.state.nx // 2 + np.array(self.deflections, int)
         rates: Array = np.abs(A[rows, self.deflections])
         return rates
 
-    def _models(self, q: Array, v: Array, u: Array) -> tuple[Array, Array]:
-        """Return A (k, nx, nx) and B (k, nx, nu) of the errors about k points."""
+    def _models(self, q: Array, v: Array, u: Array, t: Array) -> tuple[Array, Array]:
+        """Return A (k, nx, nx) and B (k, nx, nu) of the errors about k points at times t (k,)."""
         if self._projected is not None:
             return self._linearizer.tangent_along(q, v, u)
-        models = self._linearizer.along(q, v, u)
+        models = self._linearizer.along(q, v, u, t)
         return models["A"], models["B"]
 
     def guess(self, start: Point, end: Point) -> tuple[Array, Array, Array]:
@@ -443,9 +450,9 @@ class Shooting:
     def inputs(self, t: Array, q: Array, v: Array) -> Array:
         """Return inputs (K, nu) that approximately cause a motion q (K, nq), v (K, nv)."""
         u = np.zeros((len(q), len(self._aba.actuation.names)))
-        wanted = np.gradient(v, t, axis=0) - self._aba.accelerations(q, v, u)
+        wanted = np.gradient(v, t, axis=0) - self._aba.accelerations(q, v, u, t)
         half = self.state.nx // 2
-        A, B = self._models(q, v, u)
+        A, B = self._models(q, v, u, t)
         rates = self.state.velocities(wanted)[..., None]
         # The deflections of springs without motors are unknowns as well: they transmit the forces
         # that move the masses on the springs. Without them, the inputs would leave these masses
