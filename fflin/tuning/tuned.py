@@ -45,8 +45,10 @@ class Tuned(LinearController):
         Values of the goals in the order in which they were given.
     factor : float
         Largest value of all goals. If some goals do not hold, it is the least factor that was found
-        by which their limits must be relaxed. The law of `relaxed` meets all goals with these
-        limits at all examined models. A search is local, so a smaller factor may exist.
+        by which their limits must be relaxed: upper limits are multiplied by it, and limits of
+        margins, decay rates and damping ratios are divided by it. The law of `relaxed` meets all
+        goals with these limits at all examined models. A search is local, so a smaller factor may
+        exist.
     relaxed : mapping
         Values of the parameters of the law with this factor, {name: value}. They are equal to
         `parameters` if all goals hold.
