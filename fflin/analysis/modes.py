@@ -429,7 +429,8 @@ def modes(lin: LinearModel) -> Modes:
 def _percents(energy: Mapping[str, float], room: int) -> str:
     """List bodies or joints with at least 1 % of the energy, and the total of all others.
 
-    The list is shortened until it fits into `room` characters.
+    The list is shortened until it fits into `room` characters, if necessary to the first entry
+    without the total.
     """
     words = [
         f"{body} {100.0 * part:.0f} %" for body, part in energy.items() if part >= 0.01
@@ -441,8 +442,8 @@ def _percents(energy: Mapping[str, float], room: int) -> str:
         if left >= 0.005:
             text += f"; + {len(energy) - count} more {100.0 * left:.0f} %"
         if len(text) <= room:
-            break
-    return text
+            return text
+    return "".join(words[:1])
 
 
 def energies_of(

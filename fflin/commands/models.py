@@ -443,10 +443,11 @@ def modes(arguments: Namespace) -> Report:
         result["effective_masses"] = fflin.effective_masses(lin)
     parts = [str(part) for part in result.values()]
     if robot.orbit and not lin_modes.equilibrium:
-        parts.append(
+        hint = (
             "for the modes about an equilibrium in orbit, add --equilibrium or "
             "--relative-equilibrium"
         )
+        parts.append(folded([hint]))
     files = {
         arguments.plot: lambda path: fflin.plot_modes(lin_modes, path),
         arguments.html: lambda path: fflin.visualize(robot, lin_modes, html=path),

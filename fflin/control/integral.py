@@ -102,7 +102,7 @@ def _of_names(
         at = lin.output_names.index(name)
         if lin.D[at].any():
             raise InputError(
-                f"integral_action contains '{name}', which the inputs change directly; integrate "
+                f"'{name}' cannot be integrated, because the inputs change it directly; integrate "
                 "a position, an attitude or a rate"
             )
         H.append(lin.C[at])

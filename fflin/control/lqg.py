@@ -286,7 +286,7 @@ def _with_integrals(
         name = gain.integrals[int(lack.argmax())].removeprefix("integral.")
         raise InputError(
             f"the gain integrates {name}, which the outputs do not measure; add an output that "
-            "measures it, or leave it out of integral_action"
+            "measures it, or leave it out of the integral action"
         )
     combined = np.zeros((k, len(e.C)))
     combined[:, without_feedthrough] = rows

@@ -28,11 +28,13 @@ from fflin.control.optimal.riccati import (
     Solution,
     best_solution,
     is_reliable,
+    rates_of,
     solved,
     structured,
 )
 from fflin.control.slower_weights import is_late, slowed
 from fflin.control.weights import (
+    WITH_WHEEL_SPEEDS,
     Rule,
     Weight,
     are_default,
@@ -99,9 +101,12 @@ def lqr(
 
     - the position and velocity of the base, along axes in which no input pushes the base;
     - wheel angles, which are ignorable;
-    - wheel speeds, if only wheels rotate the body, because the body's rate then determines them. In
-      orbit, the momentum of such wheels turns relative to the body. Its small torque is a
-      disturbance of the attitude, unless `wheel_speeds` is True.
+    - wheel speeds, if only wheels rotate the body, because the body's rate then determines them.
+      In an orbit, the body rotates with the orbital frame, so a wheel's momentum exerts a torque on
+      it: the orbital rate times this momentum. If nothing else couples the wheel speeds to the
+      body, they are also left out by default, and this small torque is a disturbance of the
+      attitude. The momentum then keeps its magnitude and turns once per revolution relative to the
+      body. ``wheel_speeds=True`` keeps these speeds in the regulated model.
 
     Parameters
     ----------
@@ -136,8 +141,9 @@ def lqr(
         Whether to regulate the wheel speeds to their values at the operating point. By default,
         wheel speeds are regulated if inputs other than the wheels can change them. If True,
         combinations of wheel speeds that exert no net torque on the base are also regulated. If
-        False, no wheel speed is regulated. With the default weights, the bandwidth of wheel speeds
-        is a tenth of the bandwidth of the other states.
+        False, no wheel speed is regulated. The default weights aim at a tenth of the bandwidth of
+        the other states. If only the orbital rate couples the wheel speeds to the body, the loop is
+        far slower; ``gain.weights`` states its slowest decay rate.
 
     Returns
     -------
@@ -303,6 +309,9 @@ def regulator(
         S = selection(part.state_names, lin.state_names)
         Q, cross = S @ Q @ S.T, S @ cross
     solution = _solve(part, Q, R, cross)
+    if WITH_WHEEL_SPEEDS in rule:
+        slowest = -float(rates_of(solution.poles, part.dt).real.max())
+        rule += f"; the slowest mode of the loop decays at {slowest:.3g} 1/s"
     if integral_action is None:
         return make_gain(lin, part, solution, Q, R, cross, rule)
     action = integral.integral_action(lin, integral_action)

@@ -50,8 +50,11 @@ _Given: TypeAlias = tuple[float, str, bool]
 # is at most this times the largest entry.
 _ROUNDING = 1e-9
 
-# Bandwidth with which wheel speeds are regulated, relative to the bandwidth of the loop.
+# Bandwidth for which wheel speeds are weighted, relative to the bandwidth of the loop.
 _SPEEDS = 0.1
+
+# Part of the description of default weights that also regulate wheel speeds.
+WITH_WHEEL_SPEEDS = "wheel speeds are also regulated"
 
 
 def bryson(lin: LinearModel | LinearTrajectory, largest: Mapping[str, float]) -> Array:
@@ -534,9 +537,8 @@ def _of_regulated(
     Q = to_body.T @ Q @ to_body
     terms = np.append(terms[:nx] @ to_body, terms[nx:])
     if speeds := [name for name in part.state_names if name not in body.state_names]:
-        slow = _SPEEDS * bandwidth
-        Q += _wheel_speed_cost(lin, wheels, speeds, R, slow)
-        rule = f"{rule}; wheel speeds regulated with a bandwidth of {slow:.3g} rad/s"
+        Q += _wheel_speed_cost(lin, wheels, speeds, R, _SPEEDS * bandwidth)
+        rule = f"{rule}; {WITH_WHEEL_SPEEDS}"
     return Q, R, rule, terms
 
 

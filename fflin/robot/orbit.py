@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import json
 import math
-import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import KW_ONLY, asdict, dataclass, fields
 from functools import lru_cache
 from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 from fflin.base import html
-from fflin.base.errors import FflinWarning, InputError, require_known
+from fflin.base.errors import InputError, require_known
 from fflin.base.validation import (
     ONE_ROTATION,
     Array,
@@ -93,8 +92,8 @@ class CircularOrbit:
     Parameters
     ----------
     altitude : float, optional
-        Height above the surface [m]. An altitude of less than 80 km over the earth causes an
-        `FflinWarning`, because the value was probably given in km.
+        Height above the surface [m]. An altitude of less than 80 km over the earth is refused,
+        because the value was probably given in km.
     mean_motion : float, optional
         Mean motion n [rad/s], instead of the altitude.
     body : str
@@ -178,10 +177,10 @@ class CircularOrbit:
             )
         if self.altitude is not None:
             n = math.sqrt(mu / (ground + altitude)) / (ground + altitude)
-            # Do not warn if `mu` is given. In this case, the orbit was read from a saved file, or
-            # "earth" is the user's name for another body.
-            if self.body == "earth" and self.mu is None and altitude < _LOWEST:
-                _warn_of_kilometres("an altitude", altitude)
+            # If `mu` is given, the orbit was read from a saved file, or "earth" is the user's name
+            # for another body.
+            if self.body == "earth" and self.mu is None:
+                _require_above_air("an altitude", altitude)
         known = {
             "altitude": altitude,
             "mean_motion": n,
@@ -267,11 +266,18 @@ def _central_body(
     return positive("mu", mu), positive("body_radius", body_radius)
 
 
-def _warn_of_kilometres(what: str, altitude: float) -> None:
-    """Warn that an altitude over the earth was probably given in km."""
-    message = f"{what} of {altitude:.8g} m over earth is too low for an orbit"
-    message += "; altitudes are in metres, so write 400 km as 400e3"
-    warnings.warn(message, FflinWarning, stacklevel=4)
+def _require_above_air(what: str, altitude: float) -> None:
+    """Raise `InputError` if no satellite orbits the earth at an altitude, probably given in km."""
+    if altitude >= _LOWEST:
+        return
+    kilometres = 400.0
+    if altitude >= _LOWEST / 1e3:
+        kilometres = altitude
+    raise InputError(
+        f"{what} of {altitude:.8g} m over earth is too low for an orbit, expected at least "
+        f"{_LOWEST / 1e3:g} km; altitudes are in metres, so write {kilometres:.8g} km as "
+        f"{kilometres:.8g}e3"
+    )
 
 
 class OrbitState(NamedTuple):
@@ -397,8 +403,8 @@ class EllipticOrbit:
         for name, (least, largest) in angles.items():
             angle = _angle(name, getattr(self, name), least, largest)
             object.__setattr__(self, name, angle)
-        if self.body == "earth" and self.mu is None and low < _LOWEST:
-            _warn_of_kilometres("a perigee", low)
+        if self.body == "earth" and self.mu is None:
+            _require_above_air("a perigee", low)
         known = {
             "perigee": low,
             "apogee": high,

@@ -133,6 +133,18 @@ def test_a_law_that_regulates_wheel_speeds_must_stabilise_them(sign, stable):
     assert fflin.margins(fflin.StateFeedback(lin, K), lin).stable == stable
 
 
+@pytest.mark.parametrize("dt", [0.0, PERIOD])
+def test_the_slowest_decay_is_computed_from_the_loop(dt):
+    lin = fflin.linearize(satellite())
+    gain = fflin.lqr(lin.discretize(dt) if dt else lin, wheel_speeds=True)
+    rates = np.log(np.abs(gain.poles)) / dt if dt else gain.poles.real
+    # Only the orbital rate couples the wheel speeds to the body, so they hardly decay.
+    assert 0.0 < -rates.max() < 1e-4
+    assert gain.weights.endswith(
+        f"slowest mode of the loop decays at {-rates.max():.3g} 1/s"
+    )
+
+
 def test_the_momentum_of_wheels_turns_with_the_orbit():
     # If the attitude is held, the momentum is constant in inertial axes. A constant torque in base
     # axes then adds momentum without limit about the orbit normal alone.
