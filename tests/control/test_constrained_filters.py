@@ -22,6 +22,13 @@ def resting():
     return robot, q, along
 
 
+@pytest.fixture(scope="module")
+def schedule(resting):
+    """The filter along the resting trajectory, from its steady covariance."""
+    _, _, along = resting
+    return fflin.tvkalman(along, NOISE, V, sample=SAMPLE)
+
+
 @pytest.mark.exhaustive
 def test_the_covariance_is_the_exact_discrete_one(resting):
     """For constant A: the disturbance over a sample by Van Loan's matrix exponential."""
@@ -46,28 +53,30 @@ def test_the_covariance_is_the_exact_discrete_one(resting):
 
 
 @pytest.mark.exhaustive
-def test_on_a_resting_trajectory_the_filter_is_the_time_invariant_one(resting):
-    robot, q, along = resting
-    seen = fflin.tvkalman(along, NOISE, V, sample=SAMPLE)
+def test_on_a_resting_trajectory_the_filter_is_the_time_invariant_one(
+    resting, schedule
+):
+    robot, q, _ = resting
     lin = fflin.linearize(robot, q, independent=["left"]).discretize(SAMPLE)
-    W = seen.W[0]
-    for L in seen.L:
+    W = schedule.W[0]
+    for L in schedule.L:
         expected = fflin.kalman(lin, W, V).L
         np.testing.assert_allclose(L, expected, rtol=1e-8)
 
 
 @pytest.mark.exhaustive
-def test_output_feedback_along_a_resting_trajectory_is_the_time_invariant_law(resting):
+def test_output_feedback_along_a_resting_trajectory_is_the_time_invariant_law(
+    resting, schedule
+):
     """Both laws regulate the same initial error, also after the end of the trajectory."""
     robot, q, along = resting
     gains = fflin.tvlqr(along, sample=SAMPLE)
-    seen = fflin.tvkalman(along, NOISE, V, sample=SAMPLE)
-    moving = fflin.TrajectoryOutputFeedback(along, gains, seen)
+    moving = fflin.TrajectoryOutputFeedback(along, gains, schedule)
     lin = fflin.linearize(robot, q, independent=["left"])
     sampled = lin.discretize(SAMPLE)
     K = gains.K[0]
     np.testing.assert_allclose(gains.K, np.broadcast_to(K, gains.K.shape), atol=1e-9)
-    L = fflin.kalman(sampled, seen.W[0], V).L
+    L = fflin.kalman(sampled, schedule.W[0], V).L
     guess = {"left": 0.1, "bar": -0.1, "right": 0.1}
     q0 = fflin.closed(robot, fflin.configuration(robot, guess))
     # the estimate, by hand: predicted with the measured angle of the crank

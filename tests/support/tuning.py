@@ -1,6 +1,7 @@
 """Generalised plants for tests of tuning: problems of matrices without a robot."""
 
 import numpy as np
+import scipy.linalg
 
 from fflin.base.process import in_one_thread
 from fflin.tuning.channels import Channel, Ends
@@ -44,7 +45,7 @@ def least_gain(matrices, structure=None, starts=3, steps=300, seed=1):
 
 
 def of_sweep(policy, matrices, frequencies):
-    """Gains of the loop from (torque, error of q_b) to (q_b, command), (n, 2, 2, 3, 3)."""
+    """Gains (n, 2) of the loop: from a torque to q_b, and from an error of q_b to the command."""
     A, B, C, _ = matrices
     law = policy.system
     n, nz, nu, ny = len(A), len(law.A), B.shape[1], 3
@@ -52,14 +53,26 @@ def of_sweep(policy, matrices, frequencies):
     noise = np.vstack((B @ law.D[:, :ny], law.B[:, :ny]))
     drive = np.hstack((np.vstack((B, np.zeros((nz, nu)))), noise))
     read = np.block([[C[:ny], np.zeros((ny, nz))], [law.D @ C, law.C]])
-    through = np.zeros((ny + nu, nu + ny))
-    through[ny:, nu:] = law.D[:, :ny]
     # The torque does not move the position of the base, whose poles are at zero.
     kept = np.abs(drive).sum(axis=1) > 0.0
     for _ in range(n):
         kept |= (np.abs(loop[:, kept]) > 1e-12 * np.abs(loop).max()).any(axis=1)
     loop, drive, read = loop[np.ix_(kept, kept)], drive[kept], read[:, kept]
-    inner = 1j * frequencies[:, None, None] * np.eye(len(loop)) - loop
-    responses = read @ np.linalg.solve(inner, drive.astype(complex)) + through
-    blocks = responses.reshape(-1, 2, 3, 2, 3).transpose(0, 1, 3, 2, 4)
-    return np.linalg.norm(blocks, 2, axis=(3, 4))
+    responses = responses_of(loop, drive, read, 1j * frequencies)
+    pointing = responses[:, :ny, :nu]
+    command = responses[:, ny:, nu:] + law.D[:, :ny]
+    return np.linalg.norm(np.stack((pointing, command), axis=1), 2, axis=(2, 3))
+
+
+def responses_of(A, B, C, points):
+    """Frequency responses C (s I - A)^-1 B (n, ny, nu) at the points s (n,) of the plane.
+
+    With the Schur form of A, each point takes a back substitution instead of a decomposition.
+    """
+    T, Z = scipy.linalg.schur(A, output="complex")
+    drive = Z.conj().T @ B
+    states = np.empty((len(A), len(points), B.shape[1]), complex)
+    for row in range(len(A) - 1, -1, -1):
+        above = np.tensordot(T[row, row + 1 :], states[row + 1 :], 1)
+        states[row] = (drive[row] + above) / (points - T[row, row])[:, None]
+    return np.einsum("yi,ipu->pyu", C @ Z, states, optimize=True)
