@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import replace
@@ -10,9 +11,10 @@ from typing import TypeVar, cast
 import numpy as np
 from scipy.linalg import null_space
 
-from fflin.base.errors import InputError, listed
+from fflin.base.errors import FflinWarning, InputError, listed
 from fflin.base.validation import Array, frozen, instance, number
 from fflin.control.loops import NOT_CORRECTED
+from fflin.control.margins import disk_margin_of
 from fflin.control.multirate_feedback import MultirateFeedback
 from fflin.control.policies import LinearLaw, StateFeedback
 from fflin.control.sensors import timing_of_model
@@ -24,6 +26,9 @@ from fflin.robot.inputs import Thruster, lags_of
 from fflin.robot.robot import Robot
 
 LawT = TypeVar("LawT", bound=LinearLaw | MultirateFeedback)
+
+# Fraction of the disk margin below which a warning appears.
+_KEPT = 0.8
 
 # Singular values below this fraction of the largest one count as zero.
 _ZERO = 1e-9
@@ -40,10 +45,12 @@ def unload_wheels(law: LawT, design: Robot, rate: float) -> LawT:
     B_w are the rows of B of the wheel speeds, B_o the rows of all other rates, and the columns of U
     span the null space of B_o. So the external torque and the motors of the wheels cancel each
     other on the robot: the wheels return to s_0 with the rate k, and the attitude is not disturbed.
-    The unloading changes no other signal of the given law, so the margins do not change.
+    The unloading changes no other signal of the given law. But if the gain of a wheel or of the
+    external torque differs from the model, the two no longer cancel each other, so the margins
+    become smaller with the rate.
 
     In orbit, the law may feed back the wheel speeds itself, because the links that carry the wheels
-    rotate. The law then responds to the unloading, so the attitude and the margins may change.
+    rotate. The law then responds to the unloading, so the attitude may change.
     Magnetorquers produce the part of the external torque across the field by `Allocation`,
     and the wheels wait for the rest.
 
@@ -77,6 +84,12 @@ def unload_wheels(law: LawT, design: Robot, rate: float) -> LawT:
         different delays or lags, or the inputs of `design` cannot change all wheel speeds without
         accelerating the rest of the robot.
 
+    Warns
+    -----
+    FflinWarning
+        If the loop with unloading is unstable, or if its disk margin for changes of all inputs at
+        once is less than 80 % of the margin without unloading. The message states both margins.
+
     Examples
     --------
     >>> inputs = fflin.load_inputs("cubesat")
@@ -85,7 +98,7 @@ def unload_wheels(law: LawT, design: Robot, rate: float) -> LawT:
     >>> lin = fflin.linearize(satellite).discretize(0.25)
     >>> law = fflin.StateFeedback(lin, fflin.lqr(lin, integral_action=["q_b"]))
     >>> design = satellite.replace(inputs=[fflin.BaseTorque(), *wheels])
-    >>> unloading = fflin.unload_wheels(law, design, 0.05)
+    >>> unloading = fflin.unload_wheels(law, design, 0.01)
     >>> fflin.simulate(design, unloading, duration=1.0).u.shape[1]
     6
     """
@@ -104,7 +117,9 @@ def unload_wheels(law: LawT, design: Robot, rate: float) -> LawT:
     _require_unregulated(law, speeds)
     null = _null_feedback(continuous, speeds)
     if isinstance(law, MultirateFeedback):
-        return cast(LawT, _multirate(law, lin, continuous, rate * null, speeds))
+        several = _multirate(law, lin, continuous, rate * null, speeds)
+        _warn_of_margin(law, several, rate)
+        return cast(LawT, several)
 
     sensors = lin.output_names if law.senses_outputs else lin.robot_states
     rows = selection(law.lin.input_names, lin.input_names)
@@ -126,7 +141,32 @@ def unload_wheels(law: LawT, design: Robot, rate: float) -> LawT:
         attitude = rows.T @ unloading.K @ states
         wheels = null @ selection(speeds, lin.state_names)
         unloading.K = frozen(attitude + rate * wheels)
+    _warn_of_margin(law, unloading, rate)
     return unloading
+
+
+def _warn_of_margin(
+    law: LinearLaw | MultirateFeedback,
+    unloading: LinearLaw | MultirateFeedback,
+    rate: float,
+) -> None:
+    """Warn if unloading makes a stable loop unstable, or takes a large part of its disk margin."""
+    before = disk_margin_of(law, law.lin)
+    if not before:
+        return
+    after = disk_margin_of(unloading, unloading.lin)
+    if after is None or after >= _KEPT * before:
+        return
+    change = f"lowers the disk margin of the loop from {before:.3g} to {after:.3g}"
+    if not after:
+        change = (
+            f"makes the loop unstable, whose disk margin without it is {before:.3g}"
+        )
+    warnings.warn(
+        f"unloading at {rate:g} 1/s {change}; give a lower rate",
+        FflinWarning,
+        stacklevel=3,
+    )
 
 
 def _multirate(

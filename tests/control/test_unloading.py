@@ -1,6 +1,7 @@
 """Unloading of wheels by external torques, beside laws with integrals, filters and delays."""
 
 import math
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -359,6 +360,29 @@ def test_magnetorquers_unload_wheels_while_the_attitude_stays():
     motion = fflin.simulate(robot, policy, v0=v0, **options)
     assert motion.attitude_error.max() < 1.0
     assert (np.abs(motion.v[-1, 6:]) < 0.1 * np.abs(v0[6:])).all()
+
+
+@pytest.mark.parametrize(
+    ("rate", "change"),
+    [(0.1, "lowers"), *exhaustive((5.0, "unstable"), (1e-3, ""))],
+)
+def test_a_rate_that_takes_the_margin_away_gives_a_warning(rate, change):
+    """The message states the margins that `margins` computes; k h = 1.25 exceeds a delay of h."""
+    alone, design, _ = cubesat()
+    law = state_law(alone, delay=SAMPLE)
+    with warnings.catch_warnings(record=True) as record:
+        warnings.simplefilter("always", fflin.FflinWarning)
+        unloading = fflin.unload_wheels(law, design, rate)
+    text = "".join(str(item.message) for item in record)
+    before = fflin.margins(law, law.lin).disk
+    after = fflin.margins(unloading, unloading.lin)
+    assert change in text and bool(text) == bool(change)
+    assert bool(text) == (after.disk < 0.8 * before)
+    assert after.stable == (rate * SAMPLE < 1.0)
+    if text:
+        assert f"{before:.3g}" in text
+    if change == "lowers":
+        assert f"to {after.disk:.3g};" in text
 
 
 def test_laws_and_robots_that_cannot_unload_are_refused():
