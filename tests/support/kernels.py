@@ -5,28 +5,35 @@ import sys
 from importlib.util import find_spec
 from pathlib import Path
 
-# Two processes, for two cores. A function of the kernel that several loops call is translated once
-# in a process, so the second loop of a process takes about half of the time of the first one.
-_ROBOTS = """
+from fflin.kernel.compiled import available_cores
+
+_START = """
 import fflin
 free = fflin.load("planar_detumble")
 orbit = {"orbit": 700e3}
 held = {"constraints": [fflin.Weld("base", "link_1")]}
 lags = {"inputs": [fflin.BaseTorque(lag=0.1)]}
-changes = [{}, orbit, held, held | orbit, lags, lags | orbit]
-robots = [free.replace(**change) for change in changes]
 options = {"duration": 0.02, "dt": 0.01, "engine": "compiled"}
-"""
-_EIGHT_RUNS = """
-for robot in robots:
+
+def eight_runs(**changes):
+    robot = free.replace(**changes)
     fflin.monte_carlo(robot, None, {"*.mass": 0.05}, runs=8, **options)
-"""
-_ONE_RUN = """
-for robot in [*robots, free.replace(**held, **lags, **orbit)]:
-    fflin.simulate(robot, **options)
-for robot in robots[:2]:
+
+def one_run(**changes):
+    fflin.simulate(free.replace(**changes), linear=False, **options)
+
+def points(**changes):
+    robot = free.replace(**changes)
     fflin.sweep(robot, [robot.neutral()])
+
 """
+_CHANGES = ("", "**orbit", "**held", "**held, **orbit", "**lags", "**lags, **orbit")
+# Each call compiles one loop. Two processes have all loops of eight runs and all loops of one run,
+# which call the same functions.
+_CALLS = [
+    f"{loop}({changes})" for changes in _CHANGES for loop in ("eight_runs", "one_run")
+]
+_CALLS += ["one_run(**held, **lags, **orbit)", "points()", "points(**orbit)"]
 
 
 def wanted(selection: str, paths: list[str]) -> bool:
@@ -40,9 +47,11 @@ def wanted(selection: str, paths: list[str]) -> bool:
 
 def prepare() -> None:
     """Compile what is not on disk yet, and wait for it."""
+    count = min(available_cores(), len(_CALLS))
+    programs = [_START + "\n".join(_CALLS[first::count]) for first in range(count)]
     started = [
-        subprocess.Popen([sys.executable, "-W", "ignore", "-c", _ROBOTS + calls])
-        for calls in (_EIGHT_RUNS, _ONE_RUN)
+        subprocess.Popen([sys.executable, "-W", "ignore", "-c", program])
+        for program in programs
     ]
     for process in started:
         assert process.wait() == 0, (
