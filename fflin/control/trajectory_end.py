@@ -21,6 +21,7 @@ from fflin.linear.linearization import Linearizer
 from fflin.linear.model import LinearModel
 from fflin.linear.trajectory import Trajectory
 from fflin.robot.joints import ROOT
+from fflin.robot.orbit import is_elliptic
 from fflin.robot.robot import Robot
 
 # A robot falls freely if the net force of its inputs is at most this fraction of its weight.
@@ -120,6 +121,8 @@ def _at_rest(
     robot: Robot, q: Array, v: Array, independent: Sequence[str] | None = None
 ) -> LinearModel:
     """Return the model at rest, in base axes. Only wheels keep their speeds in v (nv,)."""
+    if robot.orbit and is_elliptic(robot.orbit):
+        raise EquilibriumError("in an elliptic orbit, these inputs would vary")
     still, wheels = np.zeros(robot.nv), robot.wheels_at(v)
     spinning = [joint.idx_v for joint in robot.joints if joint.name in wheels]
     still[spinning] = v[spinning]

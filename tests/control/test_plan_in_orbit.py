@@ -183,6 +183,8 @@ def test_a_trajectory_in_an_elliptic_orbit_is_flown_at_its_time():
     zero = np.zeros((2, 6))
     trajectory = fflin.Trajectory(robot, [1.0, 2.0], q, zero, zero)
     along = fflin.linearize_trajectory(robot, trajectory)
+    with pytest.raises(fflin.EquilibriumError, match="would vary; give Q, R and Qf"):
+        fflin.tvlqr(along, 1.0, 1.0, sample=0.5)
     schedule = fflin.tvlqr(along, 1.0, 1.0, np.eye(12), sample=0.5)
     policy = fflin.TrajectoryFeedback(along, schedule)
     with pytest.raises(fflin.InputError, match="begins at t = 1 s"):
