@@ -12,6 +12,7 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 _PATIENCE = 1.0  # seconds before a bar is shown
+_LONG = 600.0  # shortest work [s] for which a faster way is recommended
 _WORTH = 10.0  # shortest work [s] for which an estimate is shown
 _INTERVAL = 0.1
 _BETWEEN_LINES = 20.0  # least time [s] between two lines without a terminal
@@ -39,8 +40,13 @@ class Progress:
         """Print a text on stderr when the first step is done, so that no error follows it."""
         self._announced = text
 
-    def expect(self, seconds: float, cores: int, what: str = "") -> None:
-        """Print the estimated duration of the computation `what`, if it is at least 10 s."""
+    def expect(
+        self, seconds: float, cores: int, what: str = "", faster: str = ""
+    ) -> None:
+        """Print the estimated duration of the computation `what`, if it is at least 10 s.
+
+        If it is at least 10 min, also print `faster`, which states how to compute faster.
+        """
         if seconds < _WORTH:
             return
         if seconds < 120.0:
@@ -54,6 +60,8 @@ class Progress:
         text = f"about {shown:g} {unit} on {counted_cores}"
         if what:
             text = f"{what}: {text}"
+        if faster and seconds >= _LONG:
+            text += f"; {faster}"
         print(f"fflin: {text}", file=sys.stderr)
 
     def __call__(self, done: int, total: int, what: str = "", hint: str = "") -> None:

@@ -30,7 +30,7 @@ from fflin.dynamics.coordinates import unwound
 from fflin.dynamics.state import StateMap
 from fflin.dynamics.state_rows import attitude_errors, moving_errors, states_of
 from fflin.kernel import loop
-from fflin.kernel.compiled import kernel
+from fflin.kernel.compiled import INSTALL, kernel
 from fflin.kernel.tree import LANES, laid_out
 from fflin.robot.robot import Robot
 from fflin.simulation import lanes
@@ -542,7 +542,10 @@ def expect(
         seconds = sum(job.seconds(first, count) for job, first, count in work)
     except FflinError:
         return  # the run itself reports this error
-    tell(seconds / cores, cores)
+    faster = ""
+    if lanes.only_numba_is_missing(work[0][0].plan):
+        faster = f"faster: {INSTALL}"
+    tell(seconds / cores, cores, faster=faster)
 
 
 def chunk_size(count: int, workers: int, least: int = LANES) -> int:

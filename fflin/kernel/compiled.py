@@ -70,6 +70,9 @@ _COMPILED = {
     "take": "the run statistics",
 }
 
+# Command that installs numba.
+INSTALL = "pip install 'fflin[fast]'"
+
 # Version of Python, written as in the names of numba's cache files.
 VERSION = f"py{sys.version_info.major}{sys.version_info.minor}"
 
@@ -104,7 +107,7 @@ def available_cores() -> int:
 
 def numba_is_there() -> bool:
     """Return whether numba is installed and compiles."""
-    return find_spec("numba") is not None and not _numba_is_disabled()
+    return not numba_is_missing() and not _numba_is_disabled()
 
 
 def _numba_is_disabled() -> bool:
@@ -112,11 +115,16 @@ def _numba_is_disabled() -> bool:
     return os.environ.get("NUMBA_DISABLE_JIT", "").strip() not in ("", "0")
 
 
+def numba_is_missing() -> bool:
+    """Return whether numba is not installed."""
+    return find_spec("numba") is None
+
+
 def without_numba() -> str:
     """Return the reason why numba cannot be used."""
     if _numba_is_disabled():
         return "the environment variable NUMBA_DISABLE_JIT switches numba off"
-    return "numba is not installed (pip install 'fflin[fast]')"
+    return f"numba is not installed ({INSTALL})"
 
 
 def compiles(engine: object, obstacle: Callable[[], str]) -> bool:

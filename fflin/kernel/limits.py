@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from fflin.kernel.compiled import numba_is_there, without_numba
+from fflin.kernel.compiled import numba_is_missing, numba_is_there, without_numba
 from fflin.kernel.tree import batch_tree
 from fflin.robot.inputs import has_magnetorquers
 from fflin.robot.joints import ROOT
@@ -93,8 +93,10 @@ def _has_displaced_root(robot: Robot) -> bool:
     return not robot.model.jointPlacements[ROOT].isIdentity(0.0)
 
 
+_NUMBA = Limit(lambda task: not numba_is_there() and without_numba(), "{}")
+
 LIMITS = (
-    Limit(lambda task: not numba_is_there() and without_numba(), "{}"),
+    _NUMBA,
     Limit(lambda task: task.outputs, "the outputs are not the state"),
     Limit(lambda task: task.events, "events are computed in Python"),
     Limit(lambda task: task.callback, "callbacks are called in Python"),
@@ -134,6 +136,12 @@ LIMITS = (
     ),
     Limit(lambda task: task.measurements, "{}"),
 )
+
+
+def lacks_numba(task: Task) -> bool:
+    """Return whether the compiled engine could compute a task if numba were installed."""
+    others = [limit for limit in LIMITS if limit is not _NUMBA]
+    return numba_is_missing() and not any(limit.subject(task) for limit in others)
 
 
 def reason_against(task: Task) -> str:

@@ -30,7 +30,7 @@ from fflin.dynamics.state import StateMap
 from fflin.kernel import allocation, forward, loop, orbit, policies
 from fflin.kernel.compiled import compiles, is_kept, kernel
 from fflin.kernel.constraints import CONSTRAINTS, LEAST_FRACTION, Constraints
-from fflin.kernel.limits import Task, reason_against
+from fflin.kernel.limits import Task, lacks_numba, reason_against
 from fflin.kernel.tree import LANES, batch_tree, empty, laid_out, work_space
 from fflin.robot.disturbance import BASE, INERTIAL, UNITS, DisturbanceTerm
 from fflin.robot.fields import input_limits, limits_of
@@ -125,6 +125,11 @@ def form_of(policy: Policy, robot: Robot) -> Form | None:
 def not_compilable(plan: Plan) -> str:
     """Return why the compiled loop cannot run a plan, or an empty text if it can."""
     return reason_against(task_of(plan))
+
+
+def only_numba_is_missing(plan: Plan) -> bool:
+    """Return whether the compiled loop could run a plan if numba were installed."""
+    return lacks_numba(task_of(plan))
 
 
 def task_of(plan: Plan) -> Task:

@@ -31,7 +31,13 @@ from fflin.kernel.compiled import is_kept
 from fflin.linear.model import Delay, LinearModel, refuse_frozen
 from fflin.robot.fields import limits_of
 from fflin.robot.robot import Robot
-from fflin.simulation.lanes import engine_of, loop_name, not_compilable, recorded
+from fflin.simulation.lanes import (
+    engine_of,
+    loop_name,
+    not_compilable,
+    only_numba_is_missing,
+    recorded,
+)
 from fflin.simulation.motion import Motion
 from fflin.simulation.plan import Callback, Event, Limits, Plan, SimulationOptions
 from fflin.simulation.plant import Disturbance
@@ -277,9 +283,12 @@ def simulate(
     hint = ""
     if not compiled and not not_compilable(plan):
         hint = "(faster: --engine compiled) "
+    shown = hint
+    if only_numba_is_missing(plan):
+        shown = "(faster: fflin[fast]) "
     began = perf_counter()
     try:
-        run = recorded(plan) if compiled else go(plan, hint)
+        run = recorded(plan) if compiled else go(plan, shown)
         if hint and (spent := perf_counter() - began) > LONG_RUN:
             once = ""
             if not is_kept("loop", loop_name(plan, lanes=1)):

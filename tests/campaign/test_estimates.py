@@ -12,6 +12,7 @@ from fflin.batch.run import Execution
 from fflin.campaign import runs as runs_module
 from fflin.campaign.runs import CampaignJob
 from fflin.commands import cli
+from fflin.kernel import limits
 
 STEP = 1e-3  # seconds of a step of one run
 
@@ -19,7 +20,7 @@ STEP = 1e-3  # seconds of a step of one run
 class Told(Progress):
     """A bar that keeps what it is told."""
 
-    def expect(self, seconds, cores):
+    def expect(self, seconds, cores, faster=""):
         self.told = seconds, cores
 
 
@@ -88,6 +89,32 @@ def test_an_estimate_is_a_line_on_stderr(capsys, seconds, cores, message):
 
 
 @pytest.mark.parametrize(
+    ("seconds", "missing", "advice"),
+    [(590.0, True, False), (700.0, True, True), (700.0, False, False)],
+)
+def test_a_long_estimate_names_the_missing_package(
+    seconds, missing, advice, monkeypatch, capsys
+):
+    monkeypatch.setattr(limits, "numba_is_missing", lambda: missing)
+    monkeypatch.setattr(CampaignJob, "seconds", lambda *_: seconds)
+    robot = fflin.load("planar_detumble")
+    options = {"duration": 1.0, "dt": 0.5, "engine": "python"}
+    job = CampaignJob(robot, None, {"q_b": 0.1}, 0, options.pop("engine"), options)
+    work = [(job, job.dispersions.drawn(0, 1), 3)]
+    runs_module.expect(Progress(), work, Execution(ThreadPoolExecutor(1)))
+    error = capsys.readouterr().err
+    assert error.startswith("fflin: about ") and len(error) <= 80
+    assert ("; faster: pip install 'fflin[fast]'" in error) == advice
+
+
+def test_numba_does_not_help_where_something_else_prevents_compilation(monkeypatch):
+    monkeypatch.setattr(limits, "numba_is_missing", lambda: True)
+    robot = fflin.load("planar_detumble")
+    assert limits.lacks_numba(limits.Task(robots=(robot,)))
+    assert not limits.lacks_numba(limits.Task(robots=(robot,), events=True))
+
+
+@pytest.mark.parametrize(
     "command",
     ["validity cubesat --samples 2", "montecarlo cubesat u.toml --runs 2 --duration 1"],
 )
@@ -98,7 +125,8 @@ def test_commands_print_it_before_they_begin(command, tmp_path, monkeypatch, cap
     monkeypatch.chdir(tmp_path)
     assert cli.main(command.split()) == 0
     err = capsys.readouterr().err
-    assert err.splitlines()[0] in (
+    about, _, _ = err.splitlines()[0].partition(";")
+    assert about in (
         "fflin: about 17 min on 1 core",
         "fflin: about 33 min on 1 core",
     )
