@@ -233,6 +233,14 @@ class CampaignPointing(FrozenArrays, html.Reported):
             head.append(
                 f"{self.stopped:,} runs were stopped early; their errors are infinite"
             )
+        starts = self.after[np.isfinite(self.after)]
+        if starts.size and np.ptp(starts):
+            head.append(
+                "errors count from the settling of each run on, so the largest angle of a run that "
+                "settles is at most the accuracy"
+            )
+        elif starts.size:
+            head.append(f"errors count from {starts[0]:.4g} s on")
         head.append(
             "largest error of each run: quantiles over the runs, and the interval of the 95 % "
             f"quantile at {100.0 * self.confidence:g} % confidence"

@@ -126,6 +126,11 @@ def lqg(arguments: Namespace) -> Report:
     assert model is not None  # since it was designed here
     plants = None
     if arguments.vary:
+        if robot.orbit:
+            raise InputError(
+                "--vary needs a robot without an orbit; add --orbit none, and fly the law in the "
+                "orbit with `fflin montecarlo`"
+            )
         ranges = once("--vary", arguments.vary)
         plants = uncertain_plants(design, model, arguments, ranges)
     try:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fflin.base.validation import Array
+from fflin.base.validation import Array, Mask
 
 # Matrices A, B, C, D of a law, or their derivatives.
 Matrices = tuple[Array, Array, Array, Array]
@@ -68,8 +68,8 @@ def static_law(D: Array, dD: Array) -> Law:
 
 def without_unused_states(law: Law) -> Law:
     """Return a law without the states that no output depends on through nonzero entries."""
-    used = law.C.any(axis=0)
-    for _ in range(len(used)):
+    used: Mask = np.asarray(law.C.any(axis=0))
+    for _ in range(law.A.shape[0]):
         used = used | law.A[used].any(axis=0)
     return Law(
         law.A[used][:, used],

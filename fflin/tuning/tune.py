@@ -749,8 +749,8 @@ class _Task:
             "a stable loop" if models == 1 else f"stable loops of all {models} models"
         )
         return (
-            f"none of {starts} starts reached {loop}; give start values (start= or "
-            "fflin.Tunable), more starts, or another structure"
+            f"none of {starts} starts reached {loop}; give another bandwidth= of a PD or PID, "
+            "start values (start= or fflin.Tunable), more starts, or another structure"
         )
 
 

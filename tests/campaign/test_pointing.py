@@ -106,6 +106,7 @@ def test_the_report_states_the_interval_and_fits_the_screen(campaign):
     assert max(map(len, text.splitlines())) <= 80
     value = errors.quantile("absolute angle", 0.95).value
     assert f"{value:.3g}" in text and "at 95 % confidence" in text
+    assert "count from the settling of each run on" in " ".join(text.split())
     card = errors._repr_html_()
     assert f"{value:.3g}" in card and "cubesat" in card
 
@@ -124,6 +125,7 @@ def test_thrusters_report_pulses_and_propellant():
         firings = runs.replay(run).pointing(4.0).firings
         assert errors.thrusters["impulse"][run] == firings.impulse > 0.0
     assert "impulse of the thrusters" in str(errors)
+    assert f"errors count from {errors.after[0]:.4g} s on" in str(errors)
 
 
 @pytest.mark.compiled

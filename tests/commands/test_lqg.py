@@ -169,6 +169,8 @@ def test_vary_refuses_unknown_parameters_and_a_moving_operating_point(write):
     assert "did you mean" in message and "base.mass" in message
     spinning = ("--velocity", "wheel_1=10", "--vary", "base.mass=0.1")
     assert "remove the ranges" in refused("lqg", satellite, *TIMES, *spinning)
+    orbiting = ("--orbit", "600e3", "--vary", "base.mass=0.1")
+    assert "add --orbit none" in refused("lqg", satellite, *TIMES, *orbiting)
 
 
 @pytest.mark.exhaustive

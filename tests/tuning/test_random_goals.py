@@ -84,7 +84,7 @@ def test_a_goal_that_is_called_met_is_met_by_other_robots_of_the_ranges(seed):
     tuned = fflin.tune(uncertain, law, goals, dt=dt, starts=1, steps=60, seed=seed)
     size = len(uncertain.blocks)
     corners = np.array(list(itertools.product((-1.0, 1.0), repeat=size)))
-    draws, _ = uncertain.draws(60, seed=1000 + seed)
+    draws, _ = uncertain.draws(200, seed=1000 + seed)
     largest = np.zeros(1 if dt else 3)
     for deltas in np.vstack((corners, draws)):
         lin = fflin.linearize(uncertain.at(uncertain.values(deltas)))

@@ -131,7 +131,7 @@ def test_no_goal_is_met_that_a_sweep_does_not_meet(robot, dt):
     assert policy.met and policy.examined >= 209
     lft = uncertain.lft()
     corners = np.array(np.meshgrid(*[[-1.0, 1.0]] * 3)).reshape(3, -1).T
-    draws, _ = uncertain.draws(60, seed=99)
+    draws, _ = uncertain.draws(200, seed=99)
     frequencies = np.geomspace(1e-3, 1e2, 2000)
     for deltas in np.vstack((corners, draws)):
         lin = fflin.linearize(uncertain.at(uncertain.values(deltas)))
