@@ -1090,10 +1090,15 @@ def along(robot: fflin.Robot, arguments: Namespace) -> fflin.TrajectoryFeedback:
     regulator = (
         "free",
         "gain",
-        "controller",
         "relative_equilibrium",
         *_POSE,
         *_TARGETS,
+    )
+    refuse(
+        arguments,
+        ("controller",),
+        "on the command line, the gains along a trajectory come from its own design; in Python, "
+        "law.follow(trajectory) follows it with a saved law of measured outputs",
     )
     why = (
         "the trajectory defines the regulator, its target, and the start, "

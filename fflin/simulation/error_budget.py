@@ -93,6 +93,15 @@ _PLATES = ("mean of flat plates", "periodic part of flat plates")
 # Fraction of a motion from which its errors are counted.
 _LATE = 0.5
 
+_GROWING = (
+    "left out: drift of the bias of {}, which the law does not reject, so that its errors grow "
+    "without bound"
+)
+
+# A bias is rejected if it changes the states of the plant by at most this fraction of the states of
+# the law.
+_REJECTED = 1e-6
+
 
 class Contribution(NamedTuple):
     """Contribution of one cause to the errors of a budget.
@@ -146,6 +155,8 @@ class ErrorBudget(FrozenArrays, html.Reported):
     dt, delay : float
         Sampling time of the loop, 0 in continuous time, and delay of its inputs [s].
     robot : str
+    notes : tuple of str
+        Causes that are left out.
 
     Examples
     --------
@@ -169,6 +180,7 @@ class ErrorBudget(FrozenArrays, html.Reported):
     delay: float
     robot: str
     after: float | None = None
+    notes: tuple[str, ...] = ()
 
     def error(self, name: str) -> dict[str, float]:
         """Return {cause: size} of one of the errors `names`, and its total.
@@ -204,7 +216,7 @@ class ErrorBudget(FrozenArrays, html.Reported):
         ]
         if self.after is not None:
             lines.append(f"simulated: errors of the motion from {self.after:.4g} s on")
-        return lines
+        return [*lines, *self.notes]
 
     def _rows(self) -> list[list[str]]:
         """Return the table of the attitude errors."""
@@ -289,7 +301,8 @@ def error_budget(
         White noise {measured signal: size}. In a sampled loop, the size is the standard deviation
         of each sample in the unit of the signal. In continuous time, it is the square root of the
         intensity [unit sqrt(s)]. `StateFeedback` and gains measure the states, other laws the
-        outputs. By default, a sampled law receives the noise that the outputs of `robot` declare.
+        outputs. By default, a sampled law receives the noise, and the drift of the biases, that
+        the outputs of `robot` declare.
     bias : mapping, optional
         Constant errors {measured signal: bias} of sensors.
     disturbance : mapping, optional
@@ -310,7 +323,8 @@ def error_budget(
         Simulated motion whose attitude errors are compared with the budget.
     robot : Robot, optional
         Robot whose field `disturbance` contains further causes, at the attitude of `lin`, and whose
-        outputs may declare noise; the drift of their biases is left out. If `lin` has no lags, the
+        outputs may declare noise and drifting biases. A bias that the law does not reject leads to
+        errors that grow without bound; a note names it instead. If `lin` has no lags, the
         loop has the lags of this robot. The inputs that realise the commands of an `Allocation`
         must have equal lags; different lags are neglected, with an `FflinWarning`. In orbit,
         constants in inertial axes are sinusoids with the rate of the orbit. The drag and the solar
@@ -367,12 +381,10 @@ def error_budget(
     loop = DisturbedLoop(laws, lin, delay, sample, forces)
     acting = [loop.phasor(*key, value) for key, value in phasors.items()]
     acting += loop.plates(plates)
-    causes: list[Contribution] = []
     if noise is None:
-        noise = _declared_noise(policy, lin, robot, loop.dt)
-    for key, values in _given("noise", noise).items():
-        size = _size("noise", key, values)
-        causes.append(loop.measurement_noise(key, size))
+        causes, notes = loop.declared(*_declared_errors(policy, lin, robot, loop.dt))
+    else:
+        causes, notes = loop.declared(_given("noise", noise), {})
     for key, values in _given("bias", bias).items():
         causes.append(loop.bias(key, number(f"bias '{key}'", values)))
     for key, values in _given("disturbance", disturbance).items():
@@ -413,6 +425,7 @@ def error_budget(
         delay=loop.longest_delay,
         robot=lin.robot,
         after=None if motion is None else _start(motion, after),
+        notes=notes,
     )
 
 
@@ -467,28 +480,38 @@ def _sinusoid(key: str, value: object) -> tuple[object, float]:
     return amplitude, 2.0 * math.pi * frequency
 
 
-def _declared_noise(
+def _declared_errors(
     policy: Policy | Gain, lin: LinearModel, robot: Robot | None, sample: float
-) -> dict[str, float]:
-    """Return {output or group: standard deviation} of the noise that a robot's outputs declare."""
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Return the noise, and the drift within 1 s, that the outputs of a robot declare.
+
+    Both are {output or group: standard deviation}.
+    """
     if robot is None or not isinstance(policy, Policy):
-        return {}
+        return {}, {}
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
     errors = declared_errors(policy, state, sample)
     if errors is None:
-        return {}
+        return {}, {}
+    return _in_groups(policy.sensors, errors.noise), _in_groups(
+        policy.sensors, errors.drift
+    )
+
+
+def _in_groups(names: Sequence[str], values: Array) -> dict[str, float]:
+    """Return {name or group: size} of the sizes (ny,) that are not zero."""
     groups: dict[str, dict[str, float]] = {}
-    for name, size in zip(policy.sensors, errors.noise.tolist(), strict=True):
+    for name, size in zip(names, values.tolist(), strict=True):
         groups.setdefault(name.rpartition(".")[0], {})[name] = size
-    noise: dict[str, float] = {}
-    for group, sizes in groups.items():
-        if group and len(set(sizes.values())) == 1:
+    sizes: dict[str, float] = {}
+    for group, members in groups.items():
+        if group and len(set(members.values())) == 1:
             # The name of an output such as base.gyroscope is a group only as a pattern.
             key = f"{group}.*" if "." in group else group
-            noise[key] = next(iter(sizes.values()))
+            sizes[key] = next(iter(members.values()))
         else:
-            noise |= sizes
-    return {name: size for name, size in noise.items() if size}
+            sizes |= members
+    return {name: size for name, size in sizes.items() if size}
 
 
 def _disturbances(
@@ -721,6 +744,22 @@ class DisturbedLoop(ClosedLoop):
         self._kept = np.flatnonzero(kept).tolist()
         return self._kept
 
+    def declared(
+        self, noise: Mapping[str, object], drifts: Mapping[str, float]
+    ) -> tuple[list[Contribution], tuple[str, ...]]:
+        """Return the effects of noise and drifting biases, and notes on biases left out."""
+        causes = [
+            self.measurement_noise(key, _size("noise", key, size))
+            for key, size in noise.items()
+        ]
+        notes = list[str]()
+        for key, size in drifts.items():
+            if self._rejects(key):
+                causes.append(self.drift(key, size))
+            else:
+                notes.append(_GROWING.format(key))
+        return causes, tuple(notes)
+
     def measurement_noise(self, key: str, size: float) -> Contribution:
         """Return the effect of white noise of measured signals."""
         at = self._measured(key)
@@ -732,6 +771,27 @@ class DisturbedLoop(ClosedLoop):
         at = self._measured(key)
         G = size * self._from_measurements()[:, :, at]
         return Contribution(f"bias of {key}", "constant", self._constants(G))
+
+    def _rejects(self, key: str) -> bool:
+        """Return whether constant errors of measured signals leave the states of the plant."""
+        states = np.abs(self._steady(key))
+        limit = _REJECTED * states.max(initial=0.0)
+        return bool(states[:, self._rows].max(initial=0.0) <= limit)
+
+    def drift(self, key: str, size: float) -> Contribution:
+        """Return the effect of biases of measured signals whose changes are white noise.
+
+        `size` is the standard deviation of the change within 1 s. If X b are the steady states for
+        a constant bias b, the states are X b + e. A change w of the bias then changes e by -X w.
+        """
+        later = np.roll(self._steady(key), -1, axis=0)
+        W = size**2 * self.dt * later @ later.mT
+        return Contribution(f"drift of {key}", "noise", self._deviation(W))
+
+    def _steady(self, key: str) -> Array:
+        """Return the steady states (N, n, k) of a sampled loop for unit biases of signals."""
+        G = self._from_measurements()[:, :, self._measured(key)]
+        return steady_states(self.F, G).real
 
     def disturbance(self, key: str, value: object) -> Contribution:
         """Return the effect of constant forces."""

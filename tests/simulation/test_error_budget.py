@@ -688,6 +688,66 @@ def test_a_constant_torque_leaves_a_law_that_estimates_it_without_error():
     assert errors["bias of q_b.x"] == pytest.approx(np.degrees(2e-5), rel=1e-6)
 
 
+def drifting_gyroscope(bias):
+    """Return a satellite, its sampled model, and the law for a gyroscope with this drift."""
+    rates = fflin.Gyroscope("base", bias=bias)
+    robot = fflin.load("cubesat", outputs=[fflin.StarTracker(noise=1e-5), rates])
+    robot = robot.replace(inputs=[fflin.BaseTorque()])
+    lin = fflin.linearize(robot).discretize(0.2)
+    estimator = fflin.kalman(lin, {"omega_b": 1e-10}, {"gyroscope": 1e-10})
+    return robot, lin, fflin.lqg(fflin.lqr(lin), estimator)
+
+
+def test_the_drift_of_a_bias_acts_by_its_step_responses():
+    robot, lin, law = drifting_gyroscope(2e-4)
+    policy = fflin.OutputFeedback(lin, law)
+    budget = fflin.error_budget(policy, lin, robot=robot)
+    drift = budget.error("attitude.y")["drift of base.gyroscope.*"]
+    # All steps of the bias in the past add their responses.
+    kept = [*range(3), *range(6, 9)]
+    x, z = np.zeros(6), np.zeros(len(law.A))
+    bias = np.array([0.0, 0.0, 0.0, 0.0, 1.0, 0.0])
+    power = 0.0
+    for _ in range(4000):
+        power += np.degrees(2.0 * x[1]) ** 2
+        y = lin.C[:, kept] @ x + bias
+        u = law.C @ z
+        z = law.A @ z + law.B @ y
+        x = lin.A[np.ix_(kept, kept)] @ x + lin.B[kept] @ u
+    assert abs(x).max() < 1e-9
+    assert drift == pytest.approx(2e-4 * np.sqrt(lin.dt * power), rel=1e-6)
+    noise = budget.error("attitude.y")["noise of q_b"]
+    assert budget.deviation[1] == pytest.approx(np.hypot(drift, noise), rel=1e-12)
+
+
+@pytest.mark.exhaustive
+def test_the_drift_of_a_bias_acts_on_a_law_at_two_rates():
+    loop = Recursion()
+    outputs = [
+        replace(output, bias=2e-6 if isinstance(output, fflin.Gyroscope) else None)
+        for output in loop.lin._robot.outputs
+    ]
+    robot = loop.lin._robot.replace(outputs=outputs)
+    budget = fflin.error_budget(loop.policy, loop.lin, robot=robot)
+    (drift,) = [x for x in budget.contributions if x.cause.startswith("drift of")]
+    # Columns are the axes of the bias and the samples of the period at which it steps.
+    step = 2e-6 * np.sqrt(loop.lin.dt) * np.repeat(np.eye(6)[:, 3:], 5, axis=1)
+    first = np.tile(np.arange(5), 3)
+    now = iter(range(40_000))
+    responses = loop.run(40_000, 15, lambda: step * (next(now) >= first))
+    variances = np.sum(np.square(responses), axis=(0, 2)) / 5.0
+    assert drift.size[:3] == pytest.approx(np.sqrt(variances), rel=1e-4)
+
+
+def test_the_drift_of_a_bias_that_the_law_does_not_reject_is_named():
+    robot, _, _ = drifting_gyroscope(1e-6)
+    _, lin, law = drifting_gyroscope(None)
+    budget = fflin.error_budget(fflin.OutputFeedback(lin, law), lin, robot=robot)
+    assert [part.cause for part in budget.contributions] == ["noise of q_b"]
+    text = " ".join(str(budget).split())
+    assert "left out: drift of the bias of base.gyroscope.*" in text
+
+
 def test_the_budget_of_a_robot_with_lags_needs_no_input_of_force():
     budgets = []
     for others in ([], [fflin.BaseForce()]):
