@@ -324,9 +324,9 @@ def error_budget(
     robot : Robot, optional
         Robot whose field `disturbance` contains further causes, at the attitude of `lin`, and whose
         outputs may declare noise and drifting biases. A bias that the law does not reject leads to
-        errors that grow without bound; a note names it instead. If `lin` has no lags, the
-        loop has the lags of this robot. The inputs that realise the commands of an `Allocation`
-        must have equal lags; different lags are neglected, with an `FflinWarning`. In orbit,
+        errors that grow without bound; a note names it instead. If `lin` has no lags, the loop has
+        the lags of this robot. The inputs that realise the commands of an `Allocation` must have
+        equal lags; different lags are neglected, with an `FflinWarning`. In orbit,
         constants in inertial axes are sinusoids with the rate of the orbit. The drag and the solar
         pressure on flat plates are those at the attitude of `lin`. In orbit, their periodic part
         has up to 128 harmonics; its amplitude is that of a sinusoid with the same variance.
@@ -493,9 +493,8 @@ def _declared_errors(
     errors = declared_errors(policy, state, sample)
     if errors is None:
         return {}, {}
-    return _in_groups(policy.sensors, errors.noise), _in_groups(
-        policy.sensors, errors.drift
-    )
+    noise = _in_groups(policy.sensors, errors.noise)
+    return noise, _in_groups(policy.sensors, errors.drift)
 
 
 def _in_groups(names: Sequence[str], values: Array) -> dict[str, float]:
@@ -754,10 +753,11 @@ class DisturbedLoop(ClosedLoop):
         ]
         notes = list[str]()
         for key, size in drifts.items():
-            if self._rejects(key):
-                causes.append(self.drift(key, size))
-            else:
+            drift = self._drift(key, size)
+            if drift is None:
                 notes.append(_GROWING.format(key))
+            else:
+                causes.append(drift)
         return causes, tuple(notes)
 
     def measurement_noise(self, key: str, size: float) -> Contribution:
@@ -772,26 +772,22 @@ class DisturbedLoop(ClosedLoop):
         G = size * self._from_measurements()[:, :, at]
         return Contribution(f"bias of {key}", "constant", self._constants(G))
 
-    def _rejects(self, key: str) -> bool:
-        """Return whether constant errors of measured signals leave the states of the plant."""
-        states = np.abs(self._steady(key))
-        limit = _REJECTED * states.max(initial=0.0)
-        return bool(states[:, self._rows].max(initial=0.0) <= limit)
-
-    def drift(self, key: str, size: float) -> Contribution:
+    def _drift(self, key: str, size: float) -> Contribution | None:
         """Return the effect of biases of measured signals whose changes are white noise.
 
         `size` is the standard deviation of the change within 1 s. If X b are the steady states for
         a constant bias b, the states are X b + e. A change w of the bias then changes e by -X w.
+        The result is None if a constant bias changes the states of the plant.
         """
-        later = np.roll(self._steady(key), -1, axis=0)
+        G = self._from_measurements()[:, :, self._measured(key)]
+        steady: Array = steady_states(self.F, G).real
+        sizes = np.abs(steady)
+        limit = _REJECTED * sizes.max(initial=0.0)
+        if sizes[:, self._rows].max(initial=0.0) > limit:
+            return None
+        later = np.roll(steady, -1, axis=0)
         W = size**2 * self.dt * later @ later.mT
         return Contribution(f"drift of {key}", "noise", self._deviation(W))
-
-    def _steady(self, key: str) -> Array:
-        """Return the steady states (N, n, k) of a sampled loop for unit biases of signals."""
-        G = self._from_measurements()[:, :, self._measured(key)]
-        return steady_states(self.F, G).real
 
     def disturbance(self, key: str, value: object) -> Contribution:
         """Return the effect of constant forces."""

@@ -545,7 +545,8 @@ class _Task:
             where = math.nan if found.piece is None else found.piece.where
             hard = measure.goal.hard
             active = is_active(found.value, hard, level)
-            bound, no_bound = math.nan, ""
+            bound = math.nan
+            no_bound = ""
             if uncertain is not None:
                 self.say(f"bound over the whole ranges: {measure.goal.label}")
                 bound, no_bound = uncertain.bound(
