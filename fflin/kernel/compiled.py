@@ -158,12 +158,12 @@ def kernel(module: str, name: str) -> Compiled:
 
 @cache
 def _prepared(module: str, name: str) -> Compiled:
-    from fflin.kernel.machine_code import translated
+    from fflin.kernel.machine_code import optimisation_level, translated
 
     compiled = translated(
         getattr(import_module(f"fflin.kernel.{module}"), name), "compiled"
     )
-    compile = compiled.compile
+    compile = optimisation_level()(compiled.compile)
     if compiled.stats.cache_path is None:
         compiled.compile = partial(_compile_unstored, compile, name)
         return compiled

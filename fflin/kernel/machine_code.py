@@ -21,8 +21,8 @@ processor's registers hold fewer than eight doubles, LLVM splits the value over 
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from functools import cache, partial, wraps
 from types import FunctionType, ModuleType
 from typing import NamedTuple, Protocol, TypeAlias
@@ -31,7 +31,7 @@ import numba
 import numpy as np
 from llvmlite import ir
 from numba import extending
-from numba.core import cgutils
+from numba.core import cgutils, config
 from numba.core.base import BaseContext
 from numba.core.codegen import CodeLibrary, CPUCodeLibrary
 from numba.core.compiler import Compiler
@@ -445,6 +445,11 @@ _DECORATORS = {
 }
 
 
+# LLVM's optimisation level. At level 3, numba's default, the loops take up to twice as long to
+# compile and run as fast.
+_LEVEL = 2
+
+
 class Compiled(Protocol):
     """Function that numba compiles for each set of argument types."""
 
@@ -453,6 +458,17 @@ class Compiled(Protocol):
 
     def __call__(self, *arguments: object) -> None:
         """Run the machine code."""
+
+
+@contextmanager
+def optimisation_level() -> Iterator[None]:
+    """Let LLVM optimise at `_LEVEL` at most, until the context ends."""
+    level = config.OPT
+    config.OPT = min(level, type(level)(_LEVEL))
+    try:
+        yield
+    finally:
+        config.OPT = level
 
 
 @cache
