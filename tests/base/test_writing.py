@@ -275,7 +275,7 @@ for command in json.loads(sys.argv[1]):
 @pytest.mark.process
 def test_a_limit_of_the_size_of_a_file_is_one_line(tmp_path):
     """As where the disk is full; all in one process, which must outlive them."""
-    writers = {**WRITERS, "large.h5": ("sweep", "--random", "2000", "-o")}
+    writers = {**WRITERS, "large.h5": ("sweep", "--random", "300", "-o")}
     commands = [
         [first, "astrobee_arm", *rest, name] for name, (first, *rest) in writers.items()
     ]
@@ -284,11 +284,12 @@ def test_a_limit_of_the_size_of_a_file_is_one_line(tmp_path):
         cwd=tmp_path,
         capture_output=True,
         text=True,
+        env={**os.environ, "NUMBA_DISABLE_JIT": "1"},
     )
     message = [
         line
         for line in done.stderr.splitlines()
-        if not re.search("warning|about .* points|compiling", line)
+        if not re.search("warning|about .* points|compiling|font_manager", line)
     ]
     assert done.returncode == 0 and message[1::2] == ["2"] * len(commands), done.stderr
     for line in message[::2]:

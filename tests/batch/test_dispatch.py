@@ -285,7 +285,7 @@ def test_a_singular_configuration_is_named_by_processes_too(pool):
     robot = singular_at(0.5)
     configurations = fflin.grid(robot, {"slide": np.arange(64) / 64.0})
     with pytest.raises(fflin.SweepError, match=r"32.*'singular'"):
-        fflin.sweep(robot, configurations, chunk=10, executor=pool)
+        fflin.sweep(robot, configurations, chunk=10, executor=pool, engine="python")
 
 
 @pytest.mark.compiled

@@ -34,7 +34,7 @@ def test_a_campaign_flies_as_simulate_does(regulated):
 
 
 @pytest.mark.exhaustive
-def test_a_loop_in_orbit_settles(regulated):
+def test_a_loop_in_orbit_settles(regulated, brief_validity):
     result = fflin.validity(*regulated, samples=2, attitude=20.0)
     assert result.outcomes == ("settled", "settled")
 
