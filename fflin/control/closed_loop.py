@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -113,14 +113,20 @@ class ClosedLoop:
         """Whether `plant` is in continuous time."""
         return not self.dt or self.lin.generator is not None
 
+    @cached_property
+    def _held_plant(self) -> HeldSystem:
+        """The continuous plant with held inputs, without a delay."""
+        A, B = self.plant.A, self.plant.B
+        return HeldSystem(A, B, self.dt, np.zeros(B.shape[1]))
+
     def with_delays(self, delays: Array) -> System:
         """Return the plant in the time of the loop, whose inputs arrive after `delays` (nu,)."""
         if not self.dt:
             return _delayed(self.plant, delays)
         if self.is_continuous_plant:
-            A, B, C, D, *_ = self.plant
             self._require_short(delays)
-            held = HeldSystem(A, B, self.dt, delays)
+            held = self._held_plant.delayed(delays)
+            C, D = self.plant.C, self.plant.D
             return System(*held.sampled(), *held.outputs(C, D))
         if delays.any():
             raise InputError(
@@ -408,8 +414,8 @@ class ClosedLoop:
             more[channel] += extra
             return self.with_delays(more)
         # The output is measured within a sample, and then delayed by whole samples.
-        A, B, C, D, *_ = self.plant
-        held = HeldSystem(A, B, self.dt, delays)
+        C, D = self.plant.C, self.plant.D
+        held = self._held_plant.delayed(delays)
         Ad, Bd = held.sampled()
         Cd, Dd = held.outputs(C, D)
         samples, rest = split(extra, self.dt)

@@ -1,6 +1,10 @@
 """Exact sampling of linear systems whose inputs arrive late."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
+from copy import copy
+from functools import cache
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -70,38 +74,56 @@ class HeldSystem:
         delays: Array,
         hold: Hold = held_exponential,
     ) -> None:
-        self.A, self.B, self.h, self._hold = A, B, h, hold
-        self.delays = [split(float(delay), h) for delay in delays]
+        self.A, self.B, self.h = A, B, h
+
+        @cache
+        def held(time: float) -> tuple[Array, Array]:
+            if not time:
+                return np.eye(len(A)), np.zeros_like(B, dtype=float)
+            return hold(A, B, time)
+
+        self._held = held
+        self._delay(delays)
+
+    def _delay(self, delays: Array) -> None:
+        """Set the delays, and the places of the past commands in the state."""
+        self.delays = [split(float(delay), self.h) for delay in delays]
         counts = [delay.samples for delay in self.delays]
-        ends = len(A) + np.cumsum([0, *counts])
+        ends = len(self.A) + np.cumsum([0, *counts])
         self.first = ends[:-1]
         self.size = int(ends[-1])
+
+    def delayed(self, delays: Array) -> HeldSystem:
+        """Return the same system with other delays (nu,) [s].
+
+        A step that both systems contain is computed once.
+        """
+        other = copy(self)
+        other._delay(delays)
+        return other
 
     def after(self, s: float) -> tuple[Array, Array]:
         """Return the maps of the states (nx, size) and of the commands (nx, nu) to x after s [s].
 
         s is between 0 and h, and counts from a sample.
         """
-        A, B = self.A, self.B
-        nx, nu = B.shape
+        nx, nu = self.B.shape
         of_states = np.zeros((nx, self.size))
         of_commands = np.zeros((nx, nu))
-        of_states[:, :nx], held = self._hold(A, B, s)
+        of_states[:, :nx], held = self._held(s)
         for index, (samples, rest) in enumerate(self.delays):
             if not samples:
                 of_commands[:, index] = held[:, index]
                 continue
-            column = B[:, index : index + 1]
             # The oldest command acts until the time `rest`, and the next command from then on.
             oldest = self.first[index] + samples - 1
-            _, by_oldest = self._hold(A, column, min(rest, s))
-            time_left = max(s - rest, 0.0)
-            transition, by_next = self._hold(A, column, time_left)
-            of_states[:, oldest] = (transition @ by_oldest)[:, 0]
+            _, by_oldest = self._held(min(rest, s))
+            transition, by_next = self._held(max(s - rest, 0.0))
+            of_states[:, oldest] = transition @ by_oldest[:, index]
             if samples == 1:
-                of_commands[:, index] = by_next[:, 0]
+                of_commands[:, index] = by_next[:, index]
             else:
-                of_states[:, oldest - 1] = by_next[:, 0]
+                of_states[:, oldest - 1] = by_next[:, index]
         return of_states, of_commands
 
     def sampled(self) -> tuple[Array, Array]:

@@ -11,7 +11,7 @@ from tests.support.c_code import COMPILERS, needs_compiler, outcome
 pytestmark = [pytest.mark.process, needs_compiler]
 
 LAWS = {"BDot": fflin.BDot(3e4), "RateDamping": fflin.RateDamping(3e-5)}
-SAMPLES = 10_000
+SAMPLES = 2_000
 LIMIT = 0.05  # [A m^2]
 
 
@@ -27,7 +27,7 @@ def satellite():
 
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("kind", LAWS)
-def test_the_code_equals_python_over_ten_thousand_samples(kind, satellite, tmp_path):
+def test_the_code_equals_python_over_two_thousand_samples(kind, satellite, tmp_path):
     law = LAWS[kind]
     folder = fflin.write_c(law, tmp_path, robot=satellite, limits="urdf")
     for compiler in COMPILERS:
@@ -112,7 +112,7 @@ def test_the_robot_must_be_given_and_must_have_magnetorquers(satellite, tmp_path
 
 @pytest.mark.exhaustive
 def test_a_periodic_regulator_repeats_in_the_code(tmp_path):
-    """Ten thousand samples are more than 300 periods of 32 samples."""
+    """Two thousand samples are more than 60 periods of 32 samples."""
     orbit = fflin.CircularOrbit(500e3, inclination=1.2, field="dipole")
     rods = [fflin.Magnetorquer(axis, max=LIMIT) for axis in np.eye(3)]
     robot = fflin.load("cubesat", orbit=orbit, inputs=rods)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import fflin
+from fflin.control.margins import disk_margin_of
 from tests.support.tuning import of_sweep
 
 TORQUE, NOISE = 0.01, 1e-4
@@ -64,8 +65,7 @@ def random_goals(rng):
 def swept_values(policy, goals, lin, dt):
     """Values of the goals in a sweep, without the code of tuning."""
     margin, pointing, command = goals
-    disk = fflin.margins(policy, lin).disk
-    values = [margin.disk / disk]
+    values = [margin.disk / disk_margin_of(policy, lin)]
     if dt:
         return values
     gains = of_sweep(policy, (lin.A, lin.B, lin.C, lin.D), FREQUENCIES)

@@ -157,7 +157,7 @@ def best_scaling(M: Values, d: Array | None = None) -> tuple[float, Array]:
         fell = best[0] - value
         if value < best[0]:
             best = value, y
-        following = value + 0.1 * (t - value)
+        following = value + 0.01 * (t - value)
         if t - value <= _CENTRED * value or following >= t:
             break
         if fell < 0.0:
