@@ -237,8 +237,6 @@ class CampaignJob:
             last = min(plan.times.steps, lanes.SLOTS * plan.times.sample)
             entries["of sensors"] = lanes.noises(plan, len(arguments.law.y), 0, last)[1]
         left: list[object] = [arguments]
-        if plan.plant.constrained is not None:
-            left.append(lanes.constraints_of(plan))
         if is_extended(plan):
             left.append(extension_of(plan))
         while left:  # the arrays and numbers in nested tuples

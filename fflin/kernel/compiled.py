@@ -35,34 +35,18 @@ ENGINES = ("python", "compiled")
 _COMPILED = {
     "advance": "the loop that simulates eight runs at a time",
     "advance_one": "the loop that simulates one run",
-    "advance_constrained": "the loop that simulates eight runs with constraints at a time",
-    "advance_one_constrained": "the loop that simulates one run with constraints",
     "advance_in_orbit": "the loop that simulates eight runs at a time in orbit",
     "advance_one_in_orbit": "the loop that simulates one run in orbit",
-    "advance_constrained_in_orbit": (
-        "the loop that simulates eight runs with constraints at a time in orbit"
-    ),
-    "advance_one_constrained_in_orbit": (
-        "the loop that simulates one run with constraints in orbit"
-    ),
-    "advance_extended": "the loop with lags and flat plates for eight runs at a time",
-    "advance_one_extended": "the loop with lags and flat plates for one run",
-    "advance_extended_constrained": (
+    "advance_extended": (
         "the loop with constraints, lags and flat plates for eight runs at a time"
     ),
-    "advance_one_extended_constrained": (
+    "advance_one_extended": (
         "the loop with constraints, lags and flat plates for one run"
     ),
     "advance_extended_in_orbit": (
-        "the loop with lags and flat plates for eight runs at a time in orbit"
-    ),
-    "advance_one_extended_in_orbit": (
-        "the loop with lags and flat plates for one run in orbit"
-    ),
-    "advance_extended_constrained_in_orbit": (
         "the loop with constraints, lags and flat plates for eight runs at a time in orbit"
     ),
-    "advance_one_extended_constrained_in_orbit": (
+    "advance_one_extended_in_orbit": (
         "the loop with constraints, lags and flat plates for one run in orbit"
     ),
     "derive": "the batch kernel",

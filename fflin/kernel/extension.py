@@ -1,12 +1,13 @@
-"""Lags of actuators and sensors, and flat plates, which only some robots have.
+"""Constraints, lags of actuators and sensors, and flat plates, which only some robots have.
 
-The functions of `kernel.loop` receive an `Extension`, or None for a robot that has neither. numba
-then compiles no code of the extension.
+The functions of `kernel.loop` receive an `Extension`, or None for a robot that has none of them.
+numba then compiles no code of the extension.
 """
 
 from collections import namedtuple
 
 from fflin.kernel import vectors as vec
+from fflin.kernel.constraints import CONSTRAINTS
 from fflin.kernel.orbit import from_inertial_axes
 from fflin.kernel.tree import FLAG, FLAGS, LANED, REALS, Struct
 from fflin.kernel.vectors import Entries, Number, chosen, load, store
@@ -56,14 +57,23 @@ class Plates(
     """
 
 
-class Extension(namedtuple("Extension", "actuators sensors plates")):
-    """Lags of actuators and sensors, and flat plates."""
+class Extension(namedtuple("Extension", "constraints actuators sensors plates")):
+    """Constraints, lags of actuators and sensors, and flat plates.
+
+    The arrays of what a robot does not have are empty.
+    """
 
 
 ACTUATOR_LAG = Struct(ActuatorLag, LANED, rate=REALS, decay=REALS, held=FLAG)
 SENSOR_LAG = Struct(SensorLag, LANED, rate=REALS)
 PLATES = Struct(Plates, REALS, {FLAGS: "two_sided inertial", LANED: "drag sunlight"})
-EXTENSION = Struct(Extension, actuators=ACTUATOR_LAG, sensors=SENSOR_LAG, plates=PLATES)
+EXTENSION = Struct(
+    Extension,
+    constraints=CONSTRAINTS,
+    actuators=ACTUATOR_LAG,
+    sensors=SENSOR_LAG,
+    plates=PLATES,
+)
 
 
 def lag_inputs(lag: ActuatorLag, speed: Entries, u: Entries, stage: int) -> None:

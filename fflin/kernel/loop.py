@@ -13,7 +13,6 @@ from fflin.kernel import constraints as held
 from fflin.kernel import forward
 from fflin.kernel import vectors as vec
 from fflin.kernel.allocation import allocate, write_difference
-from fflin.kernel.constraints import CONSTRAINTS
 from fflin.kernel.extension import EXTENSION, lag_inputs
 from fflin.kernel.forward import MECHANICS, MOMENTUM_REFERENCE, POINT
 from fflin.kernel.orbit import ORBIT
@@ -271,24 +270,11 @@ ARGUMENTS = Struct(
 ARGUMENTS_OF_ONE = ARGUMENTS.with_one_lane()
 
 
-class ConstrainedArguments(namedtuple("ConstrainedArguments", "usual constraints")):
-    """Arguments of `advance_constrained`: the arguments of `advance`, and the constraints."""
+class ExtendedArguments(namedtuple("ExtendedArguments", "usual extension")):
+    """Arguments of `advance_extended`: the arguments of `advance`, and the extension."""
 
 
-CONSTRAINED = Struct(ConstrainedArguments, usual=ARGUMENTS, constraints=CONSTRAINTS)
-CONSTRAINED_OF_ONE = CONSTRAINED.with_one_lane()
-
-
-class ExtendedArguments(namedtuple("ExtendedArguments", "usual constraints extension")):
-    """Arguments of `advance_extended`: the arguments of `advance_constrained`, and the extension.
-
-    Without constraints, `constraints` is empty and is not read.
-    """
-
-
-EXTENDED = Struct(
-    ExtendedArguments, usual=ARGUMENTS, constraints=CONSTRAINTS, extension=EXTENSION
-)
+EXTENDED = Struct(ExtendedArguments, usual=ARGUMENTS, extension=EXTENSION)
 EXTENDED_OF_ONE = EXTENDED.with_one_lane()
 
 
@@ -336,7 +322,7 @@ def _ask(work, robot, orbit, law, extension, channel, point, t, step, stage):
 
 def advance(words, clock, last, every, rows, work):
     """Advance eight runs; `words` are the 64-bit words of `ARGUMENTS`, see `_advance`."""
-    _advance(ARGUMENTS(words), None, None, None, clock, last, every, rows, work)
+    _advance(ARGUMENTS(words), None, None, clock, last, every, rows, work)
 
 
 def advance_one(words, clock, last, every, rows, work):
@@ -345,124 +331,63 @@ def advance_one(words, clock, last, every, rows, work):
     A single run would be slower in eight equal lanes.
     """
     arguments = ARGUMENTS_OF_ONE(words)
-    _advance(arguments, None, None, None, clock, last, every, rows, work)
+    _advance(arguments, None, None, clock, last, every, rows, work)
 
 
-# Only robots with constraints use the next two functions, only robots in orbit the two functions
-# after them, only robots with both the two functions after these, and only robots with lags or flat
-# plates the last eight, so that other robots do not wait until they are compiled.
-
-
-def advance_constrained(words, clock, last, every, rows, work):
-    """Advance eight runs; `words` are the words of `CONSTRAINED`, see `_advance`."""
-    arguments = CONSTRAINED(words)
-    usual, held = arguments.usual, arguments.constraints
-    _advance(usual, None, held, None, clock, last, every, rows, work)
-
-
-def advance_one_constrained(words, clock, last, every, rows, work):
-    """Advance one run; `words` are the words of `CONSTRAINED_OF_ONE`, see `_advance`."""
-    arguments = CONSTRAINED_OF_ONE(words)
-    usual, held = arguments.usual, arguments.constraints
-    _advance(usual, None, held, None, clock, last, every, rows, work)
+# Only robots in orbit use the next two functions, only robots with constraints, lags or flat plates
+# the two functions after them, and only robots with both the last two functions. So other robots
+# need no compilation of the code for orbits and for the extension.
 
 
 def advance_in_orbit(words, clock, last, every, rows, work):
-    """Advance eight runs of a robot in orbit; the arguments are the arguments of `advance`."""
+    """Advance eight runs of a robot in orbit; see `advance`."""
     arguments = ARGUMENTS(words)
-    _advance(arguments, arguments.orbit, None, None, clock, last, every, rows, work)
+    _advance(arguments, arguments.orbit, None, clock, last, every, rows, work)
 
 
 def advance_one_in_orbit(words, clock, last, every, rows, work):
-    """Advance one run of a robot in orbit; the arguments are the arguments of `advance_one`."""
+    """Advance one run of a robot in orbit; see `advance_one`."""
     arguments = ARGUMENTS_OF_ONE(words)
-    _advance(arguments, arguments.orbit, None, None, clock, last, every, rows, work)
-
-
-def advance_constrained_in_orbit(words, clock, last, every, rows, work):
-    """Advance eight runs of a robot with constraints in orbit; see `advance_constrained`."""
-    arguments = CONSTRAINED(words)
-    usual, held = arguments.usual, arguments.constraints
-    _advance(usual, usual.orbit, held, None, clock, last, every, rows, work)
-
-
-def advance_one_constrained_in_orbit(words, clock, last, every, rows, work):
-    """Advance one run of a robot with constraints in orbit; see `advance_one_constrained`."""
-    arguments = CONSTRAINED_OF_ONE(words)
-    usual, held = arguments.usual, arguments.constraints
-    _advance(usual, usual.orbit, held, None, clock, last, every, rows, work)
+    _advance(arguments, arguments.orbit, None, clock, last, every, rows, work)
 
 
 def advance_extended(words, clock, last, every, rows, work):
     """Advance eight runs with an extension; `words` are the words of `EXTENDED`, see `_advance`."""
     arguments = EXTENDED(words)
     usual, extension = arguments.usual, arguments.extension
-    _advance(usual, None, None, extension, clock, last, every, rows, work)
+    _advance(usual, None, extension, clock, last, every, rows, work)
 
 
 def advance_one_extended(words, clock, last, every, rows, work):
     """Advance one run with an extension; `words` are the words of `EXTENDED_OF_ONE`."""
     arguments = EXTENDED_OF_ONE(words)
     usual, extension = arguments.usual, arguments.extension
-    _advance(usual, None, None, extension, clock, last, every, rows, work)
-
-
-def advance_extended_constrained(words, clock, last, every, rows, work):
-    """Advance eight runs of a robot with constraints and an extension; see `advance_extended`."""
-    arguments = EXTENDED(words)
-    usual, extension = arguments.usual, arguments.extension
-    held = arguments.constraints
-    _advance(usual, None, held, extension, clock, last, every, rows, work)
-
-
-def advance_one_extended_constrained(words, clock, last, every, rows, work):
-    """Advance one run of a robot with constraints and an extension; see `advance_one_extended`."""
-    arguments = EXTENDED_OF_ONE(words)
-    usual, extension = arguments.usual, arguments.extension
-    held = arguments.constraints
-    _advance(usual, None, held, extension, clock, last, every, rows, work)
+    _advance(usual, None, extension, clock, last, every, rows, work)
 
 
 def advance_extended_in_orbit(words, clock, last, every, rows, work):
     """Advance eight runs of a robot in orbit with an extension; see `advance_extended`."""
     arguments = EXTENDED(words)
     usual, extension = arguments.usual, arguments.extension
-    _advance(usual, usual.orbit, None, extension, clock, last, every, rows, work)
+    _advance(usual, usual.orbit, extension, clock, last, every, rows, work)
 
 
 def advance_one_extended_in_orbit(words, clock, last, every, rows, work):
     """Advance one run of a robot in orbit with an extension; see `advance_one_extended`."""
     arguments = EXTENDED_OF_ONE(words)
     usual, extension = arguments.usual, arguments.extension
-    _advance(usual, usual.orbit, None, extension, clock, last, every, rows, work)
+    _advance(usual, usual.orbit, extension, clock, last, every, rows, work)
 
 
-def advance_extended_constrained_in_orbit(words, clock, last, every, rows, work):
-    """Advance eight runs with constraints and an extension in orbit; see `advance_extended`."""
-    arguments = EXTENDED(words)
-    usual, extension = arguments.usual, arguments.extension
-    held = arguments.constraints
-    _advance(usual, usual.orbit, held, extension, clock, last, every, rows, work)
-
-
-def advance_one_extended_constrained_in_orbit(words, clock, last, every, rows, work):
-    """Advance one run with constraints and an extension in orbit; see `advance_one_extended`."""
-    arguments = EXTENDED_OF_ONE(words)
-    usual, extension = arguments.usual, arguments.extension
-    held = arguments.constraints
-    _advance(usual, usual.orbit, held, extension, clock, last, every, rows, work)
-
-
-def _advance(arguments, orbit, constraints, extension, clock, last, every, rows, work):
+def _advance(arguments, orbit, extension, clock, last, every, rows, work):
     """Advance all runs to the step `last`, or until one of the runs meets a stop condition.
 
     The function updates the point, the momentum reference, the state of the policy and the state of
     the channel. clock (1,) is the number of finished steps. Before step 0, the initial momentum and
     centre of mass are written into the momentum reference.
 
-    `orbit` is None without an orbit, `constraints` is None for a robot without constraints, and
-    `extension` is None for a robot without lags and flat plates. The code for them is then not
-    compiled.
+    `orbit` is None without an orbit, and `extension` is None for a robot without constraints, lags
+    and flat plates. The code for them is then not compiled.
 
     If `every` is not 0, the function writes a row into `rows` at every step that is a multiple of
     `every`. A row consists of q, nu, u, the reference momentum (6,), the reference centre of mass
@@ -494,12 +419,12 @@ def _advance(arguments, orbit, constraints, extension, clock, last, every, rows,
                 work, robot, orbit, extension, point, t, method.rates, to
             )
             _observe(work, arguments, extension, step, stage)
-            if constraints is not None:
-                _constrain(work, robot, constraints, method, point, stage)
+            if extension is not None:
+                _constrain(work, robot, extension.constraints, method, point, stage)
             if stage == 0:
                 vec.copy(point.u, 0, method.u, 0, len(point.u))
                 if recorded:
-                    at = _record(kept, point, constraints, step * h, rows, at)
+                    at = _record(kept, point, extension, step * h, rows, at)
             if arguments.pushed:
                 weight, moment = method.weights[stage], method.moments[stage]
                 forward.add_wrench(work, robot, orbit, kept, point, weight, moment)
@@ -508,12 +433,12 @@ def _advance(arguments, orbit, constraints, extension, clock, last, every, rows,
                 vec.combine(method.speed, stage, law.filter.rates, law.filter.z)
             forward.configure(work, robot, point.q)
         forward.end_step(kept, h)
-        if constraints is not None:
-            held.close(work, robot, constraints, point)
+        if extension is not None and len(extension.constraints.pair) > 0:
+            held.close(work, robot, extension.constraints, point)
         if arguments.project:
             forward.impose(work, robot, kept, point, (step + 1) * h)
         clock[0] = step + 1
-        if not _continues(arguments, constraints):
+        if not _continues(arguments, extension):
             break
 
 
@@ -541,7 +466,7 @@ def _observe(work, arguments, extension, step, stage):
         observe(work, arguments.robot, law, lag, speed, point, count, stage)
 
 
-def _record(kept, point, constraints, t, rows, at):
+def _record(kept, point, extension, t, rows, at):
     """Write a row into `rows`, and return the index after it."""
     for values in (point.q, point.nu, point.u):
         vec.copy(values, 0, rows, at, len(values))
@@ -550,9 +475,10 @@ def _record(kept, point, constraints, t, rows, at):
     vec.put6(rows, at, momentum)
     vec.put3(rows, at + 6, center)
     at += 9
-    if constraints is not None:
-        vec.copy(constraints.forces, 0, rows, at, len(constraints.forces))
-        at += len(constraints.forces)
+    if extension is not None:
+        forces = extension.constraints.forces
+        vec.copy(forces, 0, rows, at, len(forces))
+        at += len(forces)
     return at
 
 
@@ -567,6 +493,8 @@ def _command(work, arguments, orbit, extension, t, step, stage):
 
 def _constrain(work, robot, constraints, method, point, stage):
     """Correct the accelerations of a stage; keep the forces of the first stage."""
+    if len(constraints.pair) == 0:
+        return
     first = (1 + stage) * len(point.nu)
     held.constrain(work, robot, constraints, point, method.rates, first)
     if stage == 0:
@@ -574,12 +502,12 @@ def _constrain(work, robot, constraints, method, point, stage):
         vec.copy(forces, 0, constraints.forces, 0, len(forces))
 
 
-def _continues(arguments, constraints):
+def _continues(arguments, extension):
     """Return whether no run meets a stop condition at the end of a step."""
     robot, point = arguments.robot, arguments.point
     good = goes_on(arguments.stop, robot.origin, point.q, point.nu)
-    if constraints is not None:
-        good = good and held.independent(constraints)
+    if extension is not None and len(extension.constraints.pair) > 0:
+        good = good and held.independent(extension.constraints)
     return good
 
 

@@ -1,4 +1,4 @@
-"""Lags and flat plates of a plan, as data for the compiled loop."""
+"""Constraints, lags and flat plates of a plan, as data for the compiled loop."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from fflin.control.policy import OutputForm
 from fflin.control.sensors import SensorLag
 from fflin.dynamics.disturbance import Plate
 from fflin.kernel import extension
-from fflin.kernel.tree import empty
+from fflin.kernel.constraints import CONSTRAINTS, Constraints
+from fflin.kernel.tree import batch_tree, empty
 from fflin.robot.disturbance import PLATE, plates_of
 from fflin.simulation.plan import Plan
 from fflin.simulation.plant import Plant
@@ -20,17 +21,35 @@ DRAG, SUNLIGHT = "drag", "sunlight"
 
 
 def is_extended(plan: Plan) -> bool:
-    """Return whether a plan has lags or flat plates."""
+    """Return whether a plan has constraints, lags or flat plates."""
     plant = plan.plant
-    plates = PLATE in plant.robot.disturbance
-    return bool(plant.lags.any()) or plates or _sensor_lag(plan) is not None
+    return (
+        plant.constrained is not None
+        or PLATE in plant.robot.disturbance
+        or bool(plant.lags.any())
+        or _sensor_lag(plan) is not None
+    )
 
 
 def extension_of(plan: Plan) -> extension.Extension:
-    """Return the lags and the flat plates of a plan for the kernel."""
+    """Return the constraints, the lags and the flat plates of a plan for the kernel."""
     return extension.Extension(
-        actuators=_actuators(plan), sensors=_sensors(plan), plates=_plates(plan.plant)
+        constraints=_constraints(plan),
+        actuators=_actuators(plan),
+        sensors=_sensors(plan),
+        plates=_plates(plan.plant),
     )
+
+
+def _constraints(plan: Plan) -> Constraints:
+    """Return the constraints of a plan's robot; empty without constraints."""
+    plant = plan.plant
+    none: Constraints = empty(CONSTRAINTS)
+    if plant.constrained is None:
+        return none
+    tree = batch_tree(plant.robot)
+    assert tree is not None
+    return plant.constrained.in_kernel(tree, len(plan.q))
 
 
 def _sensor_lag(plan: Plan) -> SensorLag | None:

@@ -29,7 +29,7 @@ from fflin.dynamics.orbital import mean_motion
 from fflin.dynamics.state import StateMap
 from fflin.kernel import allocation, forward, loop, orbit, policies
 from fflin.kernel.compiled import compiles, is_kept, kernel
-from fflin.kernel.constraints import CONSTRAINTS, LEAST_FRACTION, Constraints
+from fflin.kernel.constraints import LEAST_FRACTION, Constraints
 from fflin.kernel.limits import Task, lacks_numba, reason_against
 from fflin.kernel.tree import LANES, batch_tree, empty, laid_out, work_space
 from fflin.robot.disturbance import BASE, INERTIAL, UNITS, DisturbanceTerm
@@ -92,8 +92,6 @@ def loop_name(plan: Plan, *, lanes: int) -> str:
     name = "advance_one" if lanes == 1 else "advance"
     if is_extended(plan):
         name += "_extended"
-    if plan.plant.constrained is not None:
-        name += "_constrained"
     return f"{name}_in_orbit" if plan.plant.field else name
 
 
@@ -266,28 +264,20 @@ class LaneLoop:
         plates: dict[str, Array] = {}
         if is_extended(plan):
             extended = loop.EXTENDED_OF_ONE if lanes == 1 else loop.EXTENDED
-            held = empty(CONSTRAINTS)
-            if plan.plant.constrained is not None:
-                held = constraints_of(plan)
-            whole = loop.ExtendedArguments(parts, held, extension_of(plan))
+            whole = loop.ExtendedArguments(parts, extension_of(plan))
             whole, self._words, self._fresh = laid_out(whole, extended)
-            self.parts = whole.usual
+            self.parts, extension = whole
             # The words contain addresses of the arrays of `whole`, which must therefore exist.
             self._extended = whole
             if plan.plant.constrained is not None:
-                self.constraints = whole.constraints
+                self.constraints = extension.constraints
             plates = {
-                DRAG: whole.extension.plates.drag,
-                SUNLIGHT: whole.extension.plates.sunlight,
+                DRAG: extension.plates.drag,
+                SUNLIGHT: extension.plates.sunlight,
             }
-        elif plan.plant.constrained is None:
+        else:
             arguments = loop.ARGUMENTS_OF_ONE if lanes == 1 else loop.ARGUMENTS
             self.parts, self._words, self._fresh = laid_out(parts, arguments)
-        else:
-            both = loop.ConstrainedArguments(parts, constraints_of(plan))
-            constrained = loop.CONSTRAINED_OF_ONE if lanes == 1 else loop.CONSTRAINED
-            both, self._words, self._fresh = laid_out(both, constrained)
-            self.parts, self.constraints = both
         self._work = self._space(self.parts.robot.tree.offsets.size)
         self._advance = kernel("loop", loop_name(plan, lanes=lanes))
         robot, point = self.parts.robot, self.parts.point
@@ -591,15 +581,6 @@ def _recording(
         engine="compiled",
         forces=None if brief or loop.constraints is None else forces,
     )
-
-
-def constraints_of(plan: Plan) -> Constraints:
-    """Return the constraints of a plan's robot for the kernel."""
-    plant = plan.plant
-    tree = batch_tree(plant.robot)
-    assert plant.constrained is not None
-    assert tree is not None
-    return plant.constrained.in_kernel(tree, len(plan.q))
 
 
 def packed(

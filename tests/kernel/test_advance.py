@@ -12,12 +12,11 @@ import pytest
 import fflin
 from fflin.dynamics.constraints import Constraints
 from fflin.kernel import loop
-from fflin.kernel.constraints import CONSTRAINTS
 from fflin.kernel.extension import EXTENSION
 from fflin.kernel.forward import ActuatorFaults, kept_at
 from fflin.kernel.tree import laid_out
 from fflin.simulation.extension import extension_of, is_extended
-from fflin.simulation.lanes import constraints_of, loop_name, noises, packed
+from fflin.simulation.lanes import loop_name, noises, packed
 from fflin.simulation.plan import Plan, SimulationOptions
 from fflin.simulation.plant import Plant
 from fflin.simulation.run import STOPS, go, stop_conditions, stop_of
@@ -70,13 +69,11 @@ def advanced(plan, about=None, every=1, cuts=()):
     point is the initial position of the base. The loop is called again at the steps `cuts`.
     """
     parts = one_lane(laid_out(packed(plan, stop_conditions(plan)), loop.ARGUMENTS)[0])
-    words, held = parts, None
-    if plan.plant.constrained is not None:
-        held = one_lane(laid_out(constraints_of(plan), CONSTRAINTS)[0])
-        words = loop.ConstrainedArguments(parts, held)
+    words, forces = parts, ()
     if is_extended(plan):
         extension = one_lane(laid_out(extension_of(plan), EXTENSION)[0])
-        words = loop.ExtendedArguments(parts, held, extension)
+        words = loop.ExtendedArguments(parts, extension)
+        forces = extension.constraints.forces
     advance = getattr(loop, loop_name(plan, lanes=8))
     point, kept, robot, times = parts.point, parts.reference, parts.robot, plan.times
     mass = plan.plant.robot.mass
@@ -86,9 +83,7 @@ def advanced(plan, about=None, every=1, cuts=()):
         size = len(parts.law.y)
         at, values = noises(plan, size, 0, times.steps)
         parts.law.added.reshape(-1, size)[at] = values
-    width = len(point.q) + len(point.nu) + len(point.u) + 9
-    if held is not None:
-        width += len(held.forces)
+    width = len(point.q) + len(point.nu) + len(point.u) + 9 + len(forces)
     clock, pieces = np.zeros(1, dtype=int), []
     for last in (*cuts, times.steps):
         rows, first = np.zeros((times.steps, width)), clock[0]

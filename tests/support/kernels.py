@@ -11,7 +11,6 @@ _START = """
 import fflin
 free = fflin.load("planar_detumble")
 orbit = {"orbit": 700e3}
-held = {"constraints": [fflin.Weld("base", "link_1")]}
 lags = {"inputs": [fflin.BaseTorque(lag=0.1)]}
 options = {"duration": 0.02, "dt": 0.01, "engine": "compiled"}
 
@@ -27,13 +26,13 @@ def points(**changes):
     fflin.sweep(robot, [robot.neutral()])
 
 """
-_CHANGES = ("", "**orbit", "**held", "**held, **orbit", "**lags", "**lags, **orbit")
+_CHANGES = ("", "**orbit", "**lags", "**lags, **orbit")
 # Each call compiles one loop. Two processes have all loops of eight runs and all loops of one run,
 # which call the same functions.
 _CALLS = [
     f"{loop}({changes})" for changes in _CHANGES for loop in ("eight_runs", "one_run")
 ]
-_CALLS += ["one_run(**held, **lags, **orbit)", "points()", "points(**orbit)"]
+_CALLS += ["points()", "points(**orbit)"]
 
 
 def wanted(selection: str, paths: list[str]) -> bool:
