@@ -245,6 +245,9 @@ class CampaignPointing(FrozenArrays, html.Reported):
             "largest error of each run: quantiles over the runs, and the interval of the 95 % "
             f"quantile at {100.0 * self.confidence:g} % confidence"
         )
+        high = self.quantile(f"absolute {self.axes[-1]}", 0.95)
+        if math.isfinite(high.value) and math.isinf(high.high):
+            head.append("the interval ends at inf, because the runs are too few")
         return head
 
     def _rows(self) -> list[list[str]]:

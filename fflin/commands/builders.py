@@ -745,16 +745,11 @@ def loop_of(
             ("negative_feedback",),
             "only --controller has a sign of the feedback",
         )
+    if arguments.trajectory and arguments.controller:
+        return _following(robot, arguments), settings
     if arguments.trajectory or arguments.schedule or arguments.periodic:
-        design = robot_of_design(robot, bool(arguments.allocate))
-        tracking = along(design, arguments)
-        if offset := once("--offset", arguments.offset):
-            settings["q0"], settings["v0"] = tracking.beside(offset)
-        elif tracking.trajectory.period:
-            settings["q0"], settings["v0"] = _start_beside(robot, tracking, arguments)
-        if arguments.allocate:
-            return fflin.Allocation(tracking, design), settings
-        return tracking, settings
+        policy, start = _tracking(robot, arguments)
+        return policy, settings | start
     refuse(
         arguments,
         ("offset", "hold", "motion", "period"),
@@ -790,6 +785,42 @@ def loop_of(
         # A model in independent states does not predict a motion.
         settings["linear"] = lin
     return policy, settings
+
+
+def _tracking(
+    robot: fflin.Robot, arguments: Namespace
+) -> tuple[fflin.Policy, dict[str, Any]]:
+    """Return the policy with own gains along a trajectory, and its start for `simulate`."""
+    design = robot_of_design(robot, bool(arguments.allocate))
+    tracking = along(design, arguments)
+    start: dict[str, Any] = {}
+    if offset := once("--offset", arguments.offset):
+        start["q0"], start["v0"] = tracking.beside(offset)
+    elif tracking.trajectory.period:
+        start["q0"], start["v0"] = _start_beside(robot, tracking, arguments)
+    if arguments.allocate:
+        return fflin.Allocation(tracking, design), start
+    return tracking, start
+
+
+def _following(robot: fflin.Robot, arguments: Namespace) -> fflin.Policy:
+    """Return the law of --controller along the trajectory of --trajectory."""
+    start = ("offset", "joint", "rpy", "position", "velocity")
+    refuse(
+        arguments,
+        (*start, *_POSE, *_TARGETS),
+        "the trajectory defines the start and the target",
+    )
+    names = (*_WEIGHTS, "gain", "reduce", "mpc", "free", "schedule", "periodic")
+    refuse(arguments, names, "--controller replaces the regulator and its options")
+    trajectory = fflin.Trajectory.load(
+        arguments.trajectory, robot, hold=arguments.hold, frame=arguments.frame
+    )
+    compensator = _compensator_of(arguments)
+    design = robot_of_design(robot, arguments.allocate, compensator)
+    lin = model_to_regulate(design, arguments, *point_of(design, arguments, "target_"))
+    policy = _output_feedback(arguments, lin, compensator).follow(trajectory)
+    return policy if design is robot else fflin.Allocation(policy, design)
 
 
 def detumbling_law(arguments: Namespace) -> fflin.BDot | fflin.RateDamping | None:
@@ -1097,8 +1128,8 @@ def along(robot: fflin.Robot, arguments: Namespace) -> fflin.TrajectoryFeedback:
     refuse(
         arguments,
         ("controller",),
-        "on the command line, the gains along a trajectory come from its own design; in Python, "
-        "law.follow(trajectory) follows it with a saved law of measured outputs",
+        "the gains along a periodic motion come from its own design; with --trajectory, a law from "
+        "a file follows a trajectory",
     )
     why = (
         "the trajectory defines the regulator, its target, and the start, "

@@ -314,9 +314,9 @@ ABOUT: dict[str, str] = {
     "gain": "use the gain in FILE, which `fflin lqr` saved, and regulate to the operating point "
     "for which the gain was designed",
     "controller": "use a linear controller K with positive feedback, u - u0 = K (y - y0), about "
-    f"the target. FILE ({_SAVED}) contains the law of `fflin lqg` or `fflin tune`, or the matrices "
-    "A, B, C and D of the controller and, if the controller is sampled, its sample time dt or Ts. "
-    "--output defines y",
+    f"the target or along --trajectory. FILE ({_SAVED}) contains the law of `fflin lqg` or `fflin "
+    "tune`, or the matrices A, B, C and D of the controller and, if the controller is sampled, its "
+    "sample time dt or Ts. --output defines y",
     "negative-feedback": "apply the controller of --controller with negative feedback, u - u0 = -K "
     "(y - y0)",
     "mpc": "use model predictive control (MPC) with the limits of the robot; MPC requires --sample",

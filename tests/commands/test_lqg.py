@@ -94,6 +94,35 @@ def test_the_law_of_the_command_is_the_design_in_python_and_is_flown(write):
     assert line in out and line in run("lqg", satellite, *TIMES)[1]
 
 
+@pytest.mark.exhaustive
+def test_a_saved_law_follows_a_trajectory(write):
+    satellite = write(TORQUE, TRACKER, GYROSCOPE)
+    assert run("lqg", satellite, *TIMES, "-o", "law.npz")[0] == 0
+    slew = ("--target-rpy", 20, 0, 0, "--duration", 30, "--knots", 11)
+    free = [word for name in ("r_b", "v_b") for word in ("--free-end", name)]
+    assert run("plan", satellite, *slew, *free, "-o", "slew.npz")[0] == 0
+    flight = ("--trajectory", "slew.npz", "--controller", "law.npz")
+    times = ("--duration", 40, "--dt", 0.05, "--no-noise")
+    code, out, err = run("simulate", satellite, *flight, *times, "-o", "flown.npz")
+    assert (code, err) == (0, ""), out
+    robot = fflin.load(satellite)
+    slewed = fflin.Trajectory.load("slew.npz", robot)
+    law = fflin.OutputFeedback(design(robot)[0], fflin.Compensator.load("law.npz"))
+    options = {"duration": 40.0, "dt": 0.05, "limits": "urdf", "noise": 0.0}
+    motion = fflin.simulate(robot, law.follow(slewed), **options)
+    flown = fflin.Motion.load("flown.npz")
+    assert np.abs(flown.q - motion.q).max() < 1e-12
+    # The attitude is held after the end. The filter still learns the constant torque.
+    assert motion.q[-1, 3] == pytest.approx(np.sin(np.radians(10.0)), abs=1e-3)
+    start = refused("simulate", satellite, *flight, "--rpy", 1, 0, 0)
+    assert "the trajectory defines the start" in start
+    weights = refused("simulate", satellite, *flight, "--sample", 1)
+    assert "--controller replaces the regulator" in weights
+    assert "--trajectory" in refused(
+        "simulate", satellite, "--periodic", 9, *flight[2:]
+    )
+
+
 def test_the_table_states_the_standard_deviations_of_the_filter(write):
     satellite = write(TORQUE, TRACKER, GYROSCOPE)
     _, out, _ = run(

@@ -56,11 +56,6 @@ def test_a_plan_begins_at_the_trajectory_of_a_file(tmp_path):
     assert "missing.csv" in refused(*command, "--guess", "missing.csv")
 
 
-def test_a_saved_law_along_a_trajectory_is_refused_with_the_way_in_python():
-    files = ("--trajectory", "slew.npz", "--controller", "law.npz")
-    assert "law.follow(trajectory)" in refused("simulate", ROBOT, *files)
-
-
 WHEELS = """
 [[input]]
 type = "reaction_wheel"
