@@ -837,10 +837,9 @@ def _periodic_back(
 
     with stabilised(traj):
         P = _rough_cost(traj.t, coefficients)
-        # This sweep finds the times at which the solution is accurate. The doubling is repeated
-        # with the maps between these times, so that it agrees with a sweep to machine precision.
-        times, _ = riccati.solve_back(coefficients, traj.t, P)
-        maps = periodic_riccati.interval_maps(coefficients, times)
+        # This sweep finds the times between which the maps are accurate. The doubling is repeated
+        # with these maps, so that it agrees with a sweep to machine precision.
+        times, maps = riccati.accurate_maps(coefficients, traj.t, P)
         P = periodic_riccati.periodic_cost(
             periodic_riccati.over_period(iter(maps[::-1]))
         )

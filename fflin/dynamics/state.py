@@ -594,9 +594,17 @@ class Actuation:
         """Write the columns of magnetorquers; `data` must contain the Jacobians of the joints."""
         local = pin.ReferenceFrame.LOCAL
         for joint, index, axis in self.torquers:
-            torque = np.cross(axis, data.oMi[joint].rotation.T @ flux)
+            x, y, z = axis
+            flux_x, flux_y, flux_z = data.oMi[joint].rotation.T.dot(flux)
+            torque = np.array(
+                (
+                    y * flux_z - z * flux_y,
+                    z * flux_x - x * flux_z,
+                    x * flux_y - y * flux_x,
+                )
+            )
             J = pin.getJointJacobian(self._model, data, joint, local)
-            columns[:, index] = self.state.forces(J[names.PIN_ANGULAR].T @ torque)
+            columns[:, index] = self.state.forces(torque.dot(J[names.PIN_ANGULAR]))
 
     def in_base_axes(self, chart: Chart, u: Array) -> Array:
         """Return the inputs u (.., nu) with all torques and forces on the base in base axes."""

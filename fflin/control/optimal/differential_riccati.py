@@ -137,6 +137,25 @@ def _intervals(at: Callable[[Array], Array], knots: Array) -> list[_Interval]:
     ]
 
 
+def _halves(at: Callable[[Array], Array], interval: _Interval) -> list[_Interval]:
+    """Return both halves of an interval, whose transitions are known, as intervals."""
+    start, end, (_, early_half, late_half), (at_start, at_end) = interval
+    knots = np.linspace(start, end, 5)
+    middle = float(knots[2])
+    h = np.diff(knots)
+    early_times = knots[:-1] + GAUSS[0] * h
+    late_times = knots[:-1] + GAUSS[1] * h
+    coefficients = at(np.concatenate((early_times, late_times, [middle])))
+    quarters = transitions(coefficients[:, :4], coefficients[:, 4:8], h).swapaxes(0, 1)
+    at_middle = coefficients[:, 8]
+    first = np.array((early_half, quarters[0], quarters[1]))
+    second = np.array((late_half, quarters[2], quarters[3]))
+    return [
+        (start, middle, first, np.array((at_start, at_middle))),
+        (middle, end, second, np.array((at_middle, at_end))),
+    ]
+
+
 def solve_back(
     at: Callable[[Array], Array], knots: Array, P: Array
 ) -> tuple[Array, Array]:
@@ -146,12 +165,34 @@ def solve_back(
     raise `LinAlgError`.
     """
     times, values = [float(knots[-1])], [P]
+    for time, value, _ in _steps_back(at, knots, P):
+        times.append(time)
+        values.append(value)
+    return np.array(times[::-1]), np.array(values[::-1])
+
+
+def accurate_maps(
+    at: Callable[[Array], Array], knots: Array, P: Array
+) -> tuple[Array, Array]:
+    """Return the times of `solve_back`, and T, G and W (k, 3, nx, nx) between successive times."""
+    times, maps = [float(knots[-1])], list[Array]()
+    for time, _, transition in _steps_back(at, knots, P):
+        times.append(time)
+        maps.append(transition)
+    return np.array(times[::-1]), np.array(maps[::-1])
+
+
+def _steps_back(
+    at: Callable[[Array], Array], knots: Array, P: Array
+) -> Iterator[tuple[float, Array, Array]]:
+    """Yield the time, P and the transitions T, G and W of each accurate step, the latest first."""
+    count = 0
     for last in range(len(knots) - 1, 0, -_BATCH):
         # Intervals still to be integrated; the latest interval is the last entry.
         pending = _intervals(at, knots[max(last - _BATCH, 0) : last + 1])
         while pending:
-            start, end, (whole, early, late), (at_start, at_end) = pending.pop()
-            P = values[-1]
+            interval = pending.pop()
+            start, end, (whole, early, late), (at_start, at_end) = interval
             middle = 0.5 * (start + end)
             error = math.inf
             # The coefficients of a long step may be indefinite, because beta in (10.3) is negative.
@@ -168,13 +209,14 @@ def solve_back(
                 # safe, a quarter is assumed in both cases.
                 error = 0.25 * max(_apart(double, single), _apart(half, between))
             if error <= _ACCURACY:
-                times += [middle, start]
-                values += [half, double]
-            elif len(times) > _KNOTS_LIMIT or not start < middle < end:
+                yield middle, half, late
+                yield start, double, early
+                P = double
+                count += 2
+            elif count >= _KNOTS_LIMIT or not start < middle < end:
                 raise np.linalg.LinAlgError("P changes too fast")
             else:
-                pending += _intervals(at, np.array((start, middle, end)))
-    return np.array(times[::-1]), np.array(values[::-1])
+                pending += _halves(at, interval)
 
 
 def samples_back(

@@ -153,7 +153,7 @@ def _summed(loop: Array, defect: Array) -> Array:
 
 
 def interval_maps(at: Callable[[Array], Array], times: Array) -> Array:
-    """Return T, G and W (k, 3, nx, nx) between successive times, as `solve_back` computes them."""
+    """Return T, G and W (k, 3, nx, nx) between successive times."""
     maps = list[Array]()
     for first in range(0, len(times) - 1, _BATCH):
         knots = times[first : first + _BATCH + 1]
