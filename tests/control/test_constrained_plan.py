@@ -5,6 +5,7 @@ import pinocchio as pin
 import pytest
 
 import fflin
+from fflin.control.optimal import plan_search
 from fflin.dynamics.closure import Closure
 from tests.support.constrained import Build, at
 from tests.support.marks import exhaustive
@@ -105,7 +106,7 @@ def test_a_mast_deploys_within_limits_and_a_regulator_tracks_it(mast):
     motion = fflin.plan(
         *(robot, (goal, None), 20.0),
         q0=robot.neutral(),
-        knots=9,
+        knots=6,
         limits={"qdot_m.slider": 0.0065, "tau_m": 3.0},
     )
     assert max(off(robot, motion)) < 1e-9
@@ -113,7 +114,7 @@ def test_a_mast_deploys_within_limits_and_a_regulator_tracks_it(mast):
     slider = motion.v[:, robot.joint("slider").idx_v]
     assert np.abs(slider).max() == pytest.approx(0.0065, rel=0.01)
     along = fflin.linearize_trajectory(robot, motion)
-    schedule = fflin.tvlqr(along, sample=0.25)
+    schedule = fflin.tvlqr(along, sample=0.5)
     rates = {"omega_b.z": 1e-3, "v_b.x": 1e-3}
     q0, v0 = fflin.closed(robot, motion.q[0], fflin.velocity(robot, rates))
     flown = fflin.simulate(robot, schedule, q0=q0, v0=v0, engine="python")
@@ -124,19 +125,20 @@ def test_a_mast_deploys_within_limits_and_a_regulator_tracks_it(mast):
 
 
 @pytest.mark.exhaustive
-def test_two_arms_move_the_target_that_they_hold():
+def test_two_arms_move_the_target_that_they_hold(monkeypatch):
+    monkeypatch.setattr(plan_search, "_MOST", 10)  # it need not be a minimum
     robot = fflin.load("grasped_target")
     fflin.closed(robot, robot.neutral())
-    grid = fflin.grid(robot, {"left_1": [0.1]}, joints={"left_2": -0.1})
+    grid = fflin.grid(robot, {"left_1": [0.02]}, joints={"left_2": -0.02})
     goal = fflin.sweep(robot, grid).q[0]
-    motion = fflin.plan(robot, (goal, None), 20.0, q0=robot.neutral(), knots=5)
+    motion = fflin.plan(robot, (goal, None), 9.0, q0=robot.neutral(), knots=4)
     assert max(off(robot, motion)) < 1e-9
     assert motion.residual.max() < 1e-6
     assert (motion.q[-1] == goal).all() and not motion.v[-1].any()
-    schedule = fflin.tvlqr(fflin.linearize_trajectory(robot, motion), sample=5.0)
+    schedule = fflin.tvlqr(fflin.linearize_trajectory(robot, motion), sample=3.0)
     flown = fflin.simulate(robot, schedule, q0=motion.q[0], engine="python")
     way = pin.difference(robot.model, flown.q[-1], goal)
-    assert np.abs(way).max() < 1e-4
+    assert np.abs(way).max() < 2e-5
 
 
 @pytest.mark.exhaustive

@@ -83,15 +83,15 @@ def test_a_turn_in_the_least_time_takes_all_there_is(cube):
     robot, inertia = cube
     least = 2.0 * np.sqrt(inertia / 1e-3)
     goal = turned(robot, 1.0)
-    motion = fflin.plan(robot, (goal, None), 1.001 * least, knots=101)
+    motion = fflin.plan(robot, (goal, None), 1.001 * least, knots=41)
     u = motion.u[:-1, 2]
     assert np.abs(u).max() <= 1e-3
-    assert (np.abs(u) >= 1e-3 * (1 - 1e-6)).sum() >= 90 and (
+    assert (np.abs(u) >= 1e-3 * (1 - 1e-6)).sum() >= 36 and (
         np.diff(np.sign(u)) != 0
     ).sum() == 1
     assert missed(robot, motion, goal) < 1e-6
     with any_wording(), pytest.raises(fflin.InputError, match=r"omega_b.z .*0\.00\d+"):
-        fflin.plan(robot, (goal, None), 0.99 * least)
+        fflin.plan(robot, (goal, None), 0.99 * least, knots=21)
     # At half the time the turn that is reached is a quarter or less.
     with (
         any_wording(),
@@ -150,8 +150,9 @@ def test_a_tumble_ends_within_limits(hold):
 
 
 @pytest.mark.exhaustive
-def test_a_planned_motion_is_simulated(servicer, tmp_path):
+def test_a_planned_motion_is_simulated(servicer, tmp_path, monkeypatch):
     """The simulator under the same inputs ends where the plan does; the file says hold and axes."""
+    monkeypatch.setattr(plan_search, "_MOST", 5)  # it need not be a minimum
     robot, v, goal = servicer
     motion = fflin.plan(robot, (goal, None), 20.0, v0=v, knots=41, limits=None)
     dt = motion.t[1]
@@ -177,11 +178,11 @@ def test_a_planned_motion_is_simulated(servicer, tmp_path):
 
 @pytest.mark.exhaustive
 def test_joints_keep_within_their_speeds_and_travels():
-    moving = ("joint_1", "joint_3", "joint_4")
+    moving = ("joint_1", "joint_4")
     locked = [f"joint_{i}" for i in range(1, 8) if f"joint_{i}" not in moving]
     robot = fflin.load("servicer_7dof", lock=["panel_*", *locked])
     goal = turned(robot, 0.5, (1, 0, 0), {"joint_1": 1.5, "joint_4": -1.0})
-    options = {"knots": 21, "limits": ["urdf", {"tau_b": 60.0, "F_b": 40.0}]}
+    options = {"knots": 11, "limits": ["urdf", {"tau_b": 60.0, "F_b": 40.0}]}
     motion = fflin.plan(robot, (goal, None), 10.0, **options)
     speeds = np.abs(motion.v[:, 6:])
     assert (speeds <= robot.model.velocityLimit[6:] + 1e-6).all()
@@ -319,8 +320,9 @@ def test_the_values_nearest_to_their_limits_are_printed(one_joint):
 
 
 @pytest.mark.exhaustive
-def test_a_light_arm_keeps_its_speeds_between_knots():
+def test_a_light_arm_keeps_its_speeds_between_knots(monkeypatch):
     """Held for 2 s, its torques take light joints far beyond their speeds and back."""
+    monkeypatch.setattr(plan_search, "_MOST", 20)  # it need not be a minimum
     # The same slew with 41 knots is on the page of the guide about tracking.
     lock = ["panel_*", "joint_1", "joint_3", "joint_5"]
     robot = fflin.load("servicer_7dof", lock=lock, limits={"tau_b": 60.0, "F_b": 40.0})
@@ -705,7 +707,10 @@ def largest_change_of_momentum(robot, motion):
 
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("free", [FREE_OF_JOINTS, []])
-def test_a_plan_of_joint_torques_finds_loops_that_rotate_the_base(loop, pitched, free):
+def test_a_plan_of_joint_torques_finds_loops_that_rotate_the_base(
+    loop, pitched, free, monkeypatch
+):
+    monkeypatch.setattr(plan_search, "_MOST", 15)  # it need not be a minimum
     robot, _ = loop
     with any_wording():
         motion = fflin.plan(
@@ -719,7 +724,8 @@ def test_a_plan_of_joint_torques_finds_loops_that_rotate_the_base(loop, pitched,
 
 
 @pytest.mark.exhaustive
-def test_loops_add_to_the_rotation_by_the_conserved_momentum(loop):
+def test_loops_add_to_the_rotation_by_the_conserved_momentum(loop, monkeypatch):
+    monkeypatch.setattr(plan_search, "_MOST", 15)  # it need not be a minimum
     robot, _ = loop
     v0 = fflin.velocity(robot, {"omega_b.y": 0.02, "joint_1": 0.05})
     goal = turned(robot, -0.2, (0.0, 1.0, 0.0))
