@@ -118,6 +118,15 @@ def logarithmic(
     getattr(axes, f"set_{axis}lim")(min(low, -0.5 * least), max(high, 0.5 * least))
 
 
+def figure_file(path: str | Path | None) -> Path | None:
+    """Return the path of a figure; raise `FileError` if its ending is not one of FORMATS."""
+    if path is None:
+        return None
+    target = as_path(path)
+    check_ending(target, FORMATS)
+    return target
+
+
 @contextmanager
 def drawing(
     path: str | Path | None, width: float, height: float, axes: object = None
@@ -126,9 +135,7 @@ def drawing(
 
     If `axes` are given, the figure is a subfigure that takes the place of these axes in a grid.
     """
-    target = None if path is None else as_path(path)
-    if target is not None:
-        check_ending(target, FORMATS)
+    target = figure_file(path)
     require_matplotlib()
     import matplotlib
 

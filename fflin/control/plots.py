@@ -15,6 +15,7 @@ from fflin.base.figures import (
     Figure,
     cycle,
     drawing,
+    figure_file,
     legend_below,
     letters_of,
     logarithmic,
@@ -409,6 +410,7 @@ def plot_loops(
             f"policy has type {type(policy).__name__}, expected a linear policy, such as a "
             "StateFeedback, or a Gain, as from fflin.lqr"
         )
+    figure_file(path)
     if isinstance(policy, Gain) and lin is None and not delay and sample is None:
         return _plot_gain(policy, path, axes)
     if lin is None:

@@ -5,6 +5,7 @@ import pytest
 
 import fflin
 from fflin.base.errors import InputError
+from fflin.control import plots
 from fflin.control.margins import closed_loop, margins_at_once
 from fflin.control.plots import critical_phases, loop_responses, phase_of, smooth
 from fflin.control.policy import FunctionPolicy
@@ -151,3 +152,12 @@ def test_the_line_of_a_report_has_the_margins_of_all_inputs(satellite, how):
     assert together.gain == pytest.approx(margins.gain, rel=1e-9)
     assert together.phase == pytest.approx(margins.phase, rel=1e-9)
     assert margins_at_once(law, 15.0, 0.25).disk == 0.0
+
+
+def test_an_unknown_format_is_refused_before_the_loop_is_computed(
+    satellite, monkeypatch
+):
+    monkeypatch.setattr(plots, "closed_loop", None)
+    _, law = satellite
+    with pytest.raises(fflin.FileError, match="ends in"):
+        fflin.plot_loops(law, "loops.txt")

@@ -11,7 +11,7 @@ from fflin.control.margins import disk_margin_of
 from tests.support.tuning import of_sweep
 
 TORQUE, NOISE = 0.01, 1e-4
-FREQUENCIES = np.geomspace(1e-3, 1e3, 2000)
+FREQUENCIES = np.geomspace(1e-3, 1e3, 800)
 
 
 def random_satellite(rng):
@@ -76,15 +76,15 @@ def swept_values(policy, goals, lin, dt):
 
 
 @pytest.mark.exhaustive
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(4))
 def test_a_goal_that_is_called_met_is_met_by_other_robots_of_the_ranges(seed):
     rng = np.random.default_rng(seed)
     uncertain, law, goals = random_plant(rng), random_law(rng), random_goals(rng)
     dt = rng.uniform(0.05, 0.3) if seed % 4 == 3 else None
-    tuned = fflin.tune(uncertain, law, goals, dt=dt, starts=1, steps=60, seed=seed)
+    tuned = fflin.tune(uncertain, law, goals, dt=dt, starts=1, steps=15, seed=seed)
     size = len(uncertain.blocks)
     corners = np.array(list(itertools.product((-1.0, 1.0), repeat=size)))
-    draws, _ = uncertain.draws(200, seed=1000 + seed)
+    draws, _ = uncertain.draws(60, seed=1000 + seed)
     largest = np.zeros(1 if dt else 3)
     for deltas in np.vstack((corners, draws)):
         lin = fflin.linearize(uncertain.at(uncertain.values(deltas)))
@@ -130,8 +130,7 @@ def contradicting(factor, hard=False):
 
 
 @pytest.mark.exhaustive
-@pytest.mark.parametrize("hard", [False, True])
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize(("seed", "hard"), [(0, False), (1, True), (2, False)])
 def test_goals_hold_if_they_are_relaxed_by_the_least_factor_but_not_by_less(seed, hard):
     lin = fflin.linearize(random_satellite(np.random.default_rng(seed)))
     law = fflin.LowPass((0.5, 30.0), order=2) * fflin.PD("q_b", "tau_b", shared=True)
