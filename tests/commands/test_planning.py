@@ -38,7 +38,7 @@ def test_a_plan_is_followed(tmp_path):
 def test_a_plan_begins_at_the_trajectory_of_a_file(tmp_path):
     """From a plan, the search needs fewer iterations; the file is not overwritten."""
     locked = ("--lock", "joint_2", "--lock", "joint_3")
-    target = ("--target-joint", "joint_1=0.3", "--duration", 20, "--knots", 11)
+    target = ("--target-joint", "joint_1=0.3", "--duration", 20, "--knots", 6)
     command = ("plan", ROBOT, *locked, *target, "--limit", "tau_m=0.5")
     guess, iterations, efforts = (), [], []
     for name in ("first.csv", "again.csv"):

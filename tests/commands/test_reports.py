@@ -22,7 +22,10 @@ COMMANDS = {
     "lqr": ((), r"\d+ poles, slowest decay \S+ 1/s, smallest damping ratio"),
     "sensitivity": ((), "changes A and B most"),
     "uncertain": (("--vary", "base.mass=0.2"), r"1 parameter"),
-    "simulate": (("--rpy", 5, 0, 0), "settled after .*; saturated inputs: none"),
+    "simulate": (
+        ("--rpy", 5, 0, 0, "--dt", 0.05),
+        "settled after .*; saturated inputs: none",
+    ),
     "validity": (("--samples", 3), "within 10 %"),
     "init": (("--force", "-o", "own.toml"), r"run: fflin simulate own\.toml"),
 }

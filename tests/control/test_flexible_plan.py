@@ -68,7 +68,7 @@ def test_a_mode_that_is_too_fast_for_the_knots_is_named(tmp_path):
 
 
 @pytest.mark.exhaustive
-@pytest.mark.parametrize(("frequency", "angle"), [(0.35, 30), (1.1, 5), (0.35, 120)])
+@pytest.mark.parametrize(("frequency", "angle"), [(1.1, 5), (0.35, 120)])
 def test_a_slew_of_a_flexible_satellite_ends_at_rest_and_is_tracked(
     tmp_path, frequency, angle
 ):
