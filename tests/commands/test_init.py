@@ -250,7 +250,7 @@ def test_a_robot_file_stands_wherever_a_robot_does(sat):
 
 
 @pytest.mark.compiled
-def test_validity_takes_a_robot_file(sat):
+def test_validity_takes_a_robot_file(sat, brief_validity):
     code, out, _ = run("validity", "sat.toml", "--samples", 2, cwd=sat)
     assert code == 0 and "of 2" in out
 
