@@ -10,11 +10,11 @@ import fflin
 from fflin.linear.check import References
 from tests.support.random_robots import random_case
 
-# Seeds of the robots of each test: few robots by default, and 505 in all tests.
+# Seeds of the robots of each test: few robots by default, and 205 in all tests.
 SEEDS = [range(first, first + 5) for first in range(0, 10, 5)]
 SEEDS += [
-    pytest.param(range(first, first + 45), marks=pytest.mark.exhaustive)
-    for first in range(10, 505, 45)
+    pytest.param(range(first, first + 39), marks=pytest.mark.exhaustive)
+    for first in range(10, 205, 39)
 ]
 
 
