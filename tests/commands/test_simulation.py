@@ -464,7 +464,7 @@ def test_a_controller_from_a_file_closes_the_loop(tmp_path, dt):
         "--output",
         "joints",
         "--dt",
-        0.02,
+        0.05,
     )
     options = (
         *options,
@@ -485,7 +485,7 @@ def test_a_controller_from_a_file_closes_the_loop(tmp_path, dt):
     )
     policy = fflin.LinearController(controller, lin)
     again = fflin.simulate(
-        robot, policy, q0=motion.q[0], duration=motion.t[-1], dt=0.02
+        robot, policy, q0=motion.q[0], duration=motion.t[-1], dt=0.05
     )
     assert np.abs(again.x - motion.x).max() < 1e-9
     (tmp_path / "u.toml").write_text("[dispersions]\nq_b = 0.01\n'*.sensor' = 1e-4\n")

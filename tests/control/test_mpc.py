@@ -308,7 +308,7 @@ def test_along_a_trajectory_without_limits_it_is_the_schedule(planned):
         first = np.linalg.solve(m.H, -m.g)[:9]
         assert first == pytest.approx(-K @ e, abs=1e-9 * np.abs(K @ e).max())
     q0, v0 = policy.beside({"pitch": 3.0, "q_m": 0.05})
-    options = {"q0": q0, "v0": v0, "duration": 24.0, "dt": 0.05}
+    options = {"q0": q0, "v0": v0, "duration": 21.0, "dt": 0.1}
     one, other = (fflin.simulate(robot, item, **options) for item in (policy, schedule))
     assert one.q == pytest.approx(other.q, abs=1e-9) and one.tracked
     assert one.prediction == pytest.approx(other.prediction, abs=1e-9)
