@@ -9,6 +9,7 @@ from collections import namedtuple
 
 import numpy as np
 
+from fflin.base.validation import Array
 from fflin.kernel import constraints as held
 from fflin.kernel import forward
 from fflin.kernel import vectors as vec
@@ -27,7 +28,16 @@ from fflin.kernel.policies import (
     read_state,
 )
 from fflin.kernel.tree import FLAG, FLAGS, INDICES, LANED, REAL, REALS, WHOLE, Struct
-from fflin.kernel.vectors import Entries, angle, below, chosen, load, root, store
+from fflin.kernel.vectors import (
+    Entries,
+    angle,
+    below,
+    chosen,
+    compiled_as,
+    load,
+    root,
+    store,
+)
 
 
 class Wheels(
@@ -94,13 +104,19 @@ def clipped(value, low, high):
     return chosen(high, value, high, value)
 
 
-def limit(channel: Channel, u: Entries) -> None:
-    """Saturate the commands u at the limits of the channel."""
+def _limit_by_loop(channel, u):
+    """Compute `limit` in compiled code."""
     for index in range(len(channel.low)):
         value = clipped(
             load(u, index), load(channel.low, index), load(channel.high, index)
         )
         store(u, index, value)
+
+
+@compiled_as(_limit_by_loop)
+def limit(channel: Channel, u: Array) -> None:
+    """Saturate the commands u at the limits of the channel."""
+    np.clip(u, channel.low, channel.high, out=u)
 
 
 def is_asked(channel: Channel, step: int) -> bool:
@@ -111,7 +127,7 @@ def is_asked(channel: Channel, step: int) -> bool:
     return channel.sample == 0 or step % channel.sample == 0
 
 
-def transmit(channel: Channel, step: int, nu: Entries, u: Entries) -> None:
+def transmit(channel: Channel, step: int, nu: Entries, u: Array) -> None:
     """Replace the command u by the inputs that act in a step.
 
     The command is read only in steps in which the policy is evaluated (`is_asked`). nu contains the
