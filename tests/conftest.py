@@ -82,7 +82,10 @@ def pytest_configure(config):
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
-    """Mark what some machines skip, so that a run with more programs can repeat it."""
+    """Mark tests that have a skipif condition.
+
+    .ci/run repeats them after it has installed the programs that some of them need.
+    """
     for item in items:
         if item.get_closest_marker("skipif"):
             item.add_marker("conditional")

@@ -247,7 +247,13 @@ class CampaignPointing(FrozenArrays, html.Reported):
         )
         high = self.quantile(f"absolute {self.axes[-1]}", 0.95)
         if math.isfinite(high.value) and math.isinf(high.high):
-            head.append("the interval ends at inf, because the runs are too few")
+            # The largest of N values is below the quantile with the probability 0.95^N.
+            tail = (1.0 - self.confidence) / 2.0
+            enough = math.floor(math.log(tail) / math.log(0.95)) + 1
+            cause = f"fewer than {enough} runs do not bound the 95 % quantile"
+            if len(self) >= enough:
+                cause = f"{self.stopped:,} runs were stopped"
+            head.append(f"the interval ends at inf, because {cause}")
         return head
 
     def _rows(self) -> list[list[str]]:

@@ -790,7 +790,7 @@ def loop_of(
 def _tracking(
     robot: fflin.Robot, arguments: Namespace
 ) -> tuple[fflin.Policy, dict[str, Any]]:
-    """Return the policy with own gains along a trajectory, and its start for `simulate`."""
+    """Return the policy with gains designed along a trajectory, and its start for `simulate`."""
     design = robot_of_design(robot, bool(arguments.allocate))
     tracking = along(design, arguments)
     start: dict[str, Any] = {}
@@ -811,8 +811,14 @@ def _following(robot: fflin.Robot, arguments: Namespace) -> fflin.Policy:
         (*start, *_POSE, *_TARGETS),
         "the trajectory defines the start and the target",
     )
-    names = (*_WEIGHTS, "gain", "reduce", "mpc", "free", "schedule", "periodic")
-    refuse(arguments, names, "--controller replaces the regulator and its options")
+    other_laws = ("gain", "reduce", "mpc", "free", "bdot", "rate_damping")
+    refuse(
+        arguments,
+        (*_WEIGHTS, *other_laws),
+        "--controller replaces the regulator and its options",
+    )
+    other_motions = ("schedule", "periodic", "period", "motion", "relative_equilibrium")
+    refuse(arguments, other_motions, "the law follows the trajectory of --trajectory")
     trajectory = fflin.Trajectory.load(
         arguments.trajectory, robot, hold=arguments.hold, frame=arguments.frame
     )
@@ -1128,8 +1134,8 @@ def along(robot: fflin.Robot, arguments: Namespace) -> fflin.TrajectoryFeedback:
     refuse(
         arguments,
         ("controller",),
-        "the gains along a periodic motion come from its own design; with --trajectory, a law from "
-        "a file follows a trajectory",
+        "--schedule and --periodic have gains of their own; with --trajectory, a law from a file "
+        "follows a trajectory",
     )
     why = (
         "the trajectory defines the regulator, its target, and the start, "

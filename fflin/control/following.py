@@ -20,7 +20,7 @@ from fflin.control.trajectory_end import resting_end
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.coordinates import Frame
 from fflin.dynamics.outputs import Measuring
-from fflin.dynamics.state import StateMap, selection
+from fflin.dynamics.state import Actuation, StateMap, selection
 from fflin.linear.fit import require_fit
 from fflin.linear.model import LinearModel
 from fflin.linear.trajectory import Trajectory, refuse_periodic
@@ -295,14 +295,22 @@ class Following(Policy):
 def _with_inputs_of(lin: LinearModel, trajectory: Trajectory) -> Trajectory:
     """Return a trajectory with the inputs of a model; inputs that it lacks are zero.
 
-    For example, a plan for wheels alone becomes a plan for wheels and a base torque.
+    For example, a plan for wheels alone becomes a plan for wheels and a base torque, and the
+    thrusts of a plan become a base torque and a base force.
     """
     robot = lin._robot
     names = trajectory.actuation.names
     known = lin.input_names
-    if robot is None or names == known or not set(names) <= set(known):
+    if robot is None or names == known:
         return trajectory
-    u = trajectory.u @ selection(names, known)
+    frame = trajectory.frame
+    if set(names) <= set(known):
+        u = trajectory.u @ selection(names, known)
+    else:
+        same_forces = _same_forces(trajectory, robot)
+        if same_forces is None:
+            return trajectory
+        u, frame = trajectory.u_base @ same_forces.T, "local"
     return Trajectory(
         robot,
         trajectory.t,
@@ -310,8 +318,34 @@ def _with_inputs_of(lin: LinearModel, trajectory: Trajectory) -> Trajectory:
         trajectory.v,
         u,
         hold=trajectory.hold,
-        frame=trajectory.frame,
+        frame=frame,
     )
+
+
+def _same_forces(trajectory: Trajectory, robot: Robot) -> Array | None:
+    """Return the matrix from the inputs of a trajectory to inputs of a robot with the same forces.
+
+    The inputs are in base axes. Return None if no inputs of the robot exert these forces, or if the
+    matrix differs between the knots, because a thruster moves relative to the base.
+    """
+    given, wanted = trajectory.actuation, Actuation(StateMap(robot))
+    if given.torquers or wanted.torquers or len(given.fixed) != len(wanted.fixed):
+        return None
+    data = robot.create_data()
+    matrix: Array | None = None
+    for q in trajectory.q:
+        columns = given.columns(data, q)
+        inputs = wanted.columns(data, q)
+        at_knot, *_ = np.linalg.lstsq(inputs, columns, rcond=None)
+        error = np.abs(inputs @ at_knot - columns).max()
+        if matrix is None:
+            matrix = at_knot
+        if (
+            max(error, np.abs(at_knot - matrix).max())
+            > _ROUNDING * np.abs(columns).max()
+        ):
+            return None
+    return matrix
 
 
 def _with_sensors(

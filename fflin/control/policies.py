@@ -168,7 +168,8 @@ class PointLaw(Feedback):
         ----------
         trajectory : Trajectory
             Trajectory for the same states, inputs and outputs as the model of the law, such as the
-            result of `plan`. It may lack springs without motors, and inputs.
+            result of `plan`. It may lack springs without motors, and inputs. Thrusts become the
+            base torque and the base force of the model.
 
         Returns
         -------

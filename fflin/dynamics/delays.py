@@ -86,7 +86,7 @@ class HeldSystem:
         self._delay(delays)
 
     def _delay(self, delays: Array) -> None:
-        """Set the delays, and the places of the past commands in the state."""
+        """Set the delays, and the indices of the past commands in the state."""
         self.delays = [split(float(delay), self.h) for delay in delays]
         counts = [delay.samples for delay in self.delays]
         ends = len(self.A) + np.cumsum([0, *counts])

@@ -38,16 +38,16 @@ _COMPILED = {
     "advance_in_orbit": "the loop that simulates eight runs at a time in orbit",
     "advance_one_in_orbit": "the loop that simulates one run in orbit",
     "advance_extended": (
-        "the loop with constraints, lags and flat plates for eight runs at a time"
+        "the loop with constraints, lags or flat plates for eight runs at a time"
     ),
     "advance_one_extended": (
-        "the loop with constraints, lags and flat plates for one run"
+        "the loop with constraints, lags or flat plates for one run"
     ),
     "advance_extended_in_orbit": (
-        "the loop with constraints, lags and flat plates for eight runs at a time in orbit"
+        "the loop with constraints, lags or flat plates for eight runs at a time in orbit"
     ),
     "advance_one_extended_in_orbit": (
-        "the loop with constraints, lags and flat plates for one run in orbit"
+        "the loop with constraints, lags or flat plates for one run in orbit"
     ),
     "derive": "the batch kernel",
     "derive_in_orbit": "the batch kernel in orbit",

@@ -60,7 +60,7 @@ class Plates(
 class Extension(namedtuple("Extension", "constraints actuators sensors plates")):
     """Constraints, lags of actuators and sensors, and flat plates.
 
-    The arrays of what a robot does not have are empty.
+    The arrays of an absent part are empty.
     """
 
 

@@ -35,6 +35,7 @@ from numba.core import cgutils, config
 from numba.core.base import BaseContext
 from numba.core.codegen import CodeLibrary, CPUCodeLibrary
 from numba.core.compiler import Compiler
+from numba.core.compiler_lock import global_compiler_lock
 from numba.core.dispatcher import _CompileStats
 from numba.core.typeconv import Conversion
 from numba.core.typing import BaseContext as TypingContext
@@ -462,13 +463,17 @@ class Compiled(Protocol):
 
 @contextmanager
 def optimisation_level() -> Iterator[None]:
-    """Let LLVM optimise at `_LEVEL` at most, until the context ends."""
-    level = config.OPT
-    config.OPT = min(level, type(level)(_LEVEL))
-    try:
-        yield
-    finally:
-        config.OPT = level
+    """Let LLVM optimise at `_LEVEL` at most, until the context ends.
+
+    The level belongs to the process, so other threads must not compile meanwhile.
+    """
+    with global_compiler_lock:
+        level = config.OPT
+        config.OPT = min(level, type(level)(_LEVEL))
+        try:
+            yield
+        finally:
+            config.OPT = level
 
 
 @cache

@@ -34,9 +34,9 @@ def test_a_campaign_flies_as_simulate_does(regulated):
 
 
 @pytest.mark.exhaustive
-def test_a_loop_in_orbit_settles(regulated, brief_validity):
-    result = fflin.validity(*regulated, samples=2, attitude=20.0)
-    assert result.outcomes == ("settled", "settled")
+def test_a_loop_in_orbit_settles(regulated):
+    result = fflin.validity(*regulated, samples=1, attitude=20.0)
+    assert result.outcomes == ("settled",)
 
 
 @pytest.mark.compiled

@@ -108,9 +108,11 @@ def test_the_report_states_the_interval_and_fits_the_screen(campaign):
     value = errors.quantile("absolute angle", 0.95).value
     assert f"{value:.3g}" in text and "at 95 % confidence" in text
     assert "count from the settling of each run on" in " ".join(text.split())
-    # Nine runs do not bound the 95 % quantile.
     assert math.isinf(errors.quantile("absolute angle", 0.95).high)
-    assert "the runs are too few" in text
+    assert "fewer than 72 runs" in text
+    for runs in (71, 72):
+        bound = intervals.quantile(np.arange(1.0 * runs), 0.95, 0.95).high
+        assert math.isinf(bound) == (runs < 72)
     card = errors._repr_html_()
     assert f"{value:.3g}" in card and "cubesat" in card
 

@@ -34,6 +34,10 @@ frame = "base"
 noise = { angle_random_walk = 0.1 }
 bias = { bias_instability = 5.0 }
 """
+POSITION = """[[output]]
+type = "base_pose"
+noise = 1e-3
+"""
 LATE = "sample = 0.5\ndelay = 0.25\n"
 TIMES = ("--sample", 0.25, "--delay", 0.25)
 
@@ -121,6 +125,32 @@ def test_a_saved_law_follows_a_trajectory(write):
     assert "--trajectory" in refused(
         "simulate", satellite, "--periodic", 9, *flight[2:]
     )
+    for option in (("--period", 5), ("--motion", "free"), ("--bdot", 1.0)):
+        assert option[0] in refused("simulate", satellite, *flight, *option)
+
+
+@pytest.mark.exhaustive
+def test_a_saved_law_of_base_torque_follows_a_plan_of_thrusts(write):
+    text = ""
+    for x, y in ((0, 1), (1, 2), (2, 0)):
+        for arm in (0.1, -0.1):
+            for sign in (1.0, -1.0):
+                position = (arm * np.eye(3)[x]).tolist()
+                direction = (sign * np.eye(3)[y]).tolist()
+                text += '[[input]]\ntype = "thruster"\nframe = "base"\nmax = 0.1\n'
+                text += f"position = {position}\ndirection = {direction}\n"
+    satellite = write(text, '[[output]]\ntype = "base"\nnoise = 1e-4\n', GYROSCOPE)
+    code, _, err = run("lqg", satellite, "--sample", 0.25, "-o", "law.npz")
+    assert code == 0, err
+    slew = ("--target-rpy", 5, 0, 0, "--duration", 30, "--knots", 11)
+    code, _, err = run("plan", satellite, *slew, "-o", "slew.npz")
+    assert code == 0, err
+    flight = ("--trajectory", "slew.npz", "--controller", "law.npz", "--no-noise")
+    times = ("--duration", 35, "--dt", 0.05, "-o", "flown.npz")
+    code, _, err = run("simulate", satellite, *flight, *times)
+    assert code == 0, err
+    end = fflin.Motion.load("flown.npz").q[-1]
+    assert end[3] == pytest.approx(np.sin(np.radians(2.5)), abs=1e-3)
 
 
 def test_the_table_states_the_standard_deviations_of_the_filter(write):

@@ -86,6 +86,39 @@ def test_the_feedforward_is_the_mean_input_of_each_sample():
             assert result == pytest.approx(expected, abs=2e-5 * np.abs(inputs).max())
 
 
+def test_planned_thrusts_are_followed_as_the_wrench_that_they_exert():
+    thrusters = [
+        item
+        for item in fflin.load_inputs("cubesat")
+        if isinstance(item, fflin.Thruster)
+    ]
+    robot = fflin.load("cubesat", inputs=thrusters)
+    design = robot.replace(inputs=(fflin.BaseTorque(), fflin.BaseForce()))
+    lin = fflin.linearize(design).discretize(0.5)
+    law = fflin.StateFeedback(lin, fflin.lqr(lin))
+    times = np.arange(4.0)
+    still = np.tile(robot.neutral(), (4, 1))
+    thrusts = np.random.default_rng(3).random((4, len(thrusters)))
+    planned = fflin.Trajectory(robot, times, still, np.zeros((4, robot.nv)), thrusts)
+    followed = law.follow(planned)
+    # The arm of each thruster, by hand; the base of this robot is a single body.
+    wrench = np.zeros((4, 6))
+    for thrust, item in zip(thrusts.T, thrusters, strict=True):
+        force = np.outer(thrust, item.direction) / np.linalg.norm(item.direction)
+        wrench[:, :3] += np.cross(item.position, force)
+        wrench[:, 3:] += force
+    assert followed.trajectory.u == pytest.approx(wrench, abs=1e-12)
+    assert np.abs(wrench).min() > 1e-4
+    # One thruster does not exert what a plan of base torque needs.
+    one = fflin.linearize(robot.replace(inputs=thrusters[:1])).discretize(0.5)
+    alone = fflin.StateFeedback(one, np.zeros((1, 12)))
+    torque = fflin.Trajectory(
+        design, times, still, np.zeros((4, robot.nv)), np.ones((4, 6))
+    )
+    with pytest.raises(fflin.FflinError, match="lacks the input"):
+        alone.follow(torque)
+
+
 @pytest.mark.exhaustive
 def test_a_law_holds_any_attitude_as_it_holds_its_point():
     """Errors are relative to the base of the trajectory, so the motion is the same but rotated."""

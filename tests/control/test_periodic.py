@@ -101,7 +101,7 @@ def test_constant_models_give_the_solution_of_the_algebraic_equation(sampled):
 @pytest.mark.exhaustive
 def test_few_knots_give_the_continuous_solution_of_a_fast_loop():
     satellite = fflin.load("cubesat_magnetic")
-    # The loop decays ten times within an interval of 16.
+    # One of 16 intervals lasts about ten time constants of the loop.
     cost = np.diag((0.06, 0.06, 0.02, 0, 0, 0, 1e-3, 1e-3, 2e-5, 0, 0, 0)), 0.1
     costs = [
         fflin.tvlqr(fflin.linearize_orbit(satellite, steps=n), *cost, "periodic").P[0]

@@ -138,7 +138,7 @@ def _intervals(at: Callable[[Array], Array], knots: Array) -> list[_Interval]:
 
 
 def _halves(at: Callable[[Array], Array], interval: _Interval) -> list[_Interval]:
-    """Return both halves of an interval, whose transitions are known, as intervals."""
+    """Split an interval into halves, and reuse their known transitions."""
     start, end, (_, early_half, late_half), (at_start, at_end) = interval
     knots = np.linspace(start, end, 5)
     middle = float(knots[2])
