@@ -310,7 +310,8 @@ def _with_inputs_of(lin: LinearModel, trajectory: Trajectory) -> Trajectory:
         same_forces = _same_forces(trajectory, robot)
         if same_forces is None:
             return trajectory
-        u, frame = trajectory.u_base @ same_forces.T, "local"
+        u = trajectory.u_base @ same_forces.T
+        frame = "local"
     return Trajectory(
         robot,
         trajectory.t,
@@ -328,7 +329,8 @@ def _same_forces(trajectory: Trajectory, robot: Robot) -> Array | None:
     The inputs are in base axes. Return None if no inputs of the robot exert these forces, or if the
     matrix differs between the knots, because a thruster moves relative to the base.
     """
-    given, wanted = trajectory.actuation, Actuation(StateMap(robot))
+    given = trajectory.actuation
+    wanted = Actuation(StateMap(robot))
     if given.torquers or wanted.torquers or len(given.fixed) != len(wanted.fixed):
         return None
     data = robot.create_data()

@@ -164,22 +164,20 @@ def solve_back(
     The function `at` returns the coefficients (3, k, nx, nx) at times (k,). If P changes too fast,
     raise `LinAlgError`.
     """
-    times, values = [float(knots[-1])], [P]
-    for time, value, _ in _steps_back(at, knots, P):
-        times.append(time)
-        values.append(value)
-    return np.array(times[::-1]), np.array(values[::-1])
+    steps = [*_steps_back(at, knots, P)][::-1]
+    times = [time for time, _, _ in steps]
+    values = [value for _, value, _ in steps]
+    return np.array([*times, knots[-1]]), np.array([*values, P])
 
 
 def accurate_maps(
     at: Callable[[Array], Array], knots: Array, P: Array
 ) -> tuple[Array, Array]:
     """Return the times of `solve_back`, and T, G and W (k, 3, nx, nx) between successive times."""
-    times, maps = [float(knots[-1])], list[Array]()
-    for time, _, transition in _steps_back(at, knots, P):
-        times.append(time)
-        maps.append(transition)
-    return np.array(times[::-1]), np.array(maps[::-1])
+    steps = [*_steps_back(at, knots, P)][::-1]
+    times = [time for time, _, _ in steps]
+    maps = [transition for _, _, transition in steps]
+    return np.array([*times, knots[-1]]), np.array(maps)
 
 
 def _steps_back(
